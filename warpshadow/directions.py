@@ -1,0 +1,73 @@
+"""Cells of the sphere of directions: Q directions, each standing for a solid angle of 4π/Q, in compact chunks of 16."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+CHUNK = 16
+"""Directions that are culled together."""
+
+
+def check_count(name: str, count: int) -> None:
+    """Raise ValueError unless ``count`` is a positive multiple of 16."""
+    if count <= 0 or count % CHUNK:
+        raise ValueError(f"{name}: got {count!r}, expected a positive multiple of {CHUNK}")
+
+
+@functools.cache
+def fibonacci(count: int) -> np.ndarray:
+    """Fibonacci directions z = 1 − (2i+1)/Q, φ = π(1+√5)(i+½), ordered so that each run of 16 is compact.
+
+    Args:
+        count: Number of directions Q, a multiple of 16.
+
+    Returns:
+        Unit vectors, float64 of shape [Q, 3], not writable.
+    """
+    check_count("count", count)
+    i = np.arange(count)
+    z = 1 - (2 * i + 1) / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * (i + 0.5)
+    radius = np.sqrt(1 - z**2)
+    directions = compact_order(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1))
+    directions.flags.writeable = False
+    return directions
+
+
+def compact_order(directions: np.ndarray) -> np.ndarray:
+    """Reorder directions [Q, 3] by recursive bisection along their longest extent, down to chunks of 16."""
+    chunks = len(directions) // CHUNK
+    if chunks <= 1:
+        return directions
+    _, axes = np.linalg.eigh(np.cov(directions.T))
+    ordered = directions[np.argsort(directions @ axes[:, -1], kind="stable")]
+    middle = chunks // 2 * CHUNK
+    return np.concatenate([compact_order(ordered[:middle]), compact_order(ordered[middle:])])
+
+
+def cell_radius(count: int) -> float:
+    """Angular radius ρ = 2/√Q of a disc with a cell's solid angle [rad]."""
+    return 2 / np.sqrt(count)
+
+
+class ChunkCones(NamedTuple):
+    """The cone around each chunk: axes [chunk, 3], cosine and sine of the half-angle [chunk].
+
+    A half-angle that culls nothing is given as an axis of zero length with cosine 0 and sine 1.
+    """
+
+    axes: np.ndarray
+    cosine: np.ndarray
+    sine: np.ndarray
+
+
+def chunk_cones(directions: np.ndarray) -> ChunkCones:
+    """Bound every run of 16 directions [Q, 3] with a cone."""
+    chunks = directions.reshape(-1, CHUNK, 3)
+    axes = chunks.mean(axis=1)
+    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
+    cosine = np.einsum("cqx,cx->cq", chunks, axes).min(axis=1)
+    is_wide = cosine < np.cos(np.radians(80))
+    cosine = np.where(is_wide, 0.0, cosine)
+    return ChunkCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))

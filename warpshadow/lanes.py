@@ -1,0 +1,97 @@
+"""Lanes: how one thread works on several receivers at once.
+
+Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
+a thread owns a *group* of receivers and holds each quantity as one vector with a lane for every receiver: 16 lanes on
+a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …]; only scratch is [batch,
+group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+
+MODULE_OPTIONS = {"max_unroll": 1}
+"""Options of modules whose kernels loop over lanes: unrolled, such loops take ten times as long to compile."""
+
+
+def lane_count(device: wp.DeviceLike) -> int:
+    """Receivers of one thread: a vector register's worth on a CPU, one on a GPU."""
+    return 16 if wp.get_device(device).is_cpu else 1
+
+
+def group_count(vertex_count: int, lanes: int) -> int:
+    """Groups, and so threads, that ``vertex_count`` receivers take."""
+    return -(-vertex_count // lanes)
+
+
+@functools.cache
+def lane_type(lanes: int) -> type:
+    """Vector of float32 with a lane for each receiver of a thread."""
+    return wp.types.vector(length=lanes, dtype=wp.float32)
+
+
+class LaneFunctions(NamedTuple):
+    """Kernel functions on lanes that Warp's vectors lack."""
+
+    load: wp.Function
+    load_rows: wp.Function
+    store_rows: wp.Function
+    store_columns: wp.Function
+    sqrt: wp.Function
+
+
+@functools.cache
+def lane_functions(lanes: int) -> LaneFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane = lane_type(lanes)
+
+    @wp.func
+    def load(values: wp.array(dtype=wp.vec3), group: int):
+        """The x, y and z of a group's vectors."""
+        last = values.shape[0] - 1
+        x = Lane()
+        y = Lane()
+        z = Lane()
+        for lane in range(lanes):
+            value = values[wp.min(group * lanes + lane, last)]
+            x[lane] = value[0]
+            y[lane] = value[1]
+            z[lane] = value[2]
+        return x, y, z
+
+    @wp.func
+    def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
+        """scratch[k] = rows[the group's vertices, k]."""
+        last = rows.shape[0] - 1
+        for k in range(rows.shape[1]):
+            value = Lane()
+            for lane in range(lanes):
+                value[lane] = rows[wp.min(group * lanes + lane, last), k]
+            scratch[k] = value
+
+    @wp.func
+    def store_columns(
+        scratch: wp.array(dtype=Lane), begin: int, count: int, group: int, rows: wp.array2d(dtype=wp.float32)
+    ):
+        """rows[the group's vertices, k] = scratch[k] for ``count`` columns k from ``begin`` on."""
+        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+            vertex = group * lanes + lane
+            for k in range(begin, begin + count):
+                rows[vertex, k] = scratch[k][lane]
+
+    @wp.func
+    def store_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the group's vertices, k] = scratch[k]."""
+        store_columns(scratch, 0, rows.shape[1], group, rows)
+
+    @wp.func
+    def sqrt(value: Lane):
+        """Square root of each lane."""
+        root = Lane()
+        for lane in range(lanes):
+            root[lane] = wp.sqrt(value[lane])
+        return root
+
+    return LaneFunctions(load, load_rows, store_rows, store_columns, sqrt)

@@ -1,0 +1,350 @@
+"""Distant light: equirectangular environment maps, what they project to, and maps made from a formula.
+
+Pixel (row, col) of a map of H × 2H looks along θ = π(row+½)/H, φ = 2π(col+½)/W,
+
+    d = (sin φ sin θ, cos θ, −cos φ sin θ),
+
+in a right-handed world with y up: the center of the map is +z, and a quarter further left is +x (Mitsuba's convention).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow import check, sh
+from warpshadow.image import ImageError, read_image, srgb_to_linear, write_image
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
+
+# Degrees about +y that turn a map of the convention into ours, and so what its center shows.
+CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
+
+
+class CellMoments(NamedTuple):
+    """Where in its cell the light comes from: mean directions [direction, 3] and spreads [radians], [direction]."""
+
+    directions: np.ndarray
+    spreads: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class EnvironmentMap:
+    """Light from infinitely far away, as an equirectangular map, validated; the array is a read-only copy.
+
+    Args:
+        radiance: Linear RGB, finite and not negative, float32, shape [height, 2·height, 3].
+    Raises:
+        ImageError: for another shape or aspect, or NaN, Inf or negative values.
+    """
+
+    radiance: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        """Copy, convert and validate the pixels."""
+        with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
+            radiance = np.array(self.radiance, dtype=np.float32, order="C")
+        _check_aspect(radiance)
+        bad = _bad_values(radiance)
+        if bad.any():
+            row, col, channel = np.argwhere(bad)[0]
+            raise ImageError(
+                f"radiance: got {bad.sum()} NaN, Inf or negative values (first at row {row}, column {col}, channel "
+                f"{channel}: {radiance[row, col, channel]}), expected finite values of 0 or more; "
+                "sanitize='zero' or 'neighbors' repairs them on reading"
+            )
+        radiance.setflags(write=False)
+        object.__setattr__(self, "radiance", radiance)
+
+    @classmethod
+    def read(
+        cls,
+        path: str | Path,
+        *,
+        sanitize: str | None = None,
+        part: str | int | None = None,
+        convention: str = "mitsuba",
+    ) -> EnvironmentMap:
+        """Read a map; gray becomes RGB and alpha is dropped.
+
+        Args:
+            path: An .exr or .hdr file, or any other that :func:`warpshadow.image.read_image` reads.
+            sanitize: What becomes of NaN, Inf and negative values: None raises, "zero" makes them 0, "neighbors" the
+                mean of the good values of the channel among the eight pixels around, spreading inward.
+            part: Name or index of the part of a multi-part OpenEXR file.
+            convention: Which way the center of the file looks and, in a right-handed world with y up, the right quarter:
+                "mitsuba", "openexr" and "usd" (DomeLight): +z, then -x;
+                "blender" (exported with y up) and "three.js": +x, then +z;
+                "debevec" (light probe gallery, HDRShop): -z, then +x.
+        Raises:
+            ImageError: for what is not a usable map; cube maps are named as such.
+        """
+        check.choice("sanitize", sanitize, [None, "zero", "neighbors"])
+        check.choice("convention", convention, CONVENTIONS)
+        pixels = read_image(path, part=part)
+        pixels = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
+        try:
+            _check_aspect(pixels)
+            if sanitize:
+                pixels = _sanitized(pixels, sanitize)
+            return cls(pixels).rotated(CONVENTIONS[convention])
+        except ImageError as error:
+            raise ImageError(f"{path}: {error}") from error
+
+    @classmethod
+    def constant(cls, rgb: float | Sequence[float] = 1.0, height: int = 16) -> EnvironmentMap:
+        """Make a map of the same radiance everywhere, one number or RGB."""
+        return cls(np.broadcast_to(np.asarray(rgb, np.float32), (height, 2 * height, 3)))
+
+    def write(self, path: str | Path) -> None:
+        """Write an OpenEXR file of float32 RGB."""
+        if Path(path).suffix.lower() != ".exr":
+            raise ImageError(f"{path}: got extension {Path(path).suffix!r}, expected .exr, which holds radiance unclipped")
+        write_image(path, self.radiance)
+
+    def rotated(self, degrees: float) -> EnvironmentMap:
+        """Turn the light about +y, counter-clockwise seen from above: +90 takes what is at +z to +x.
+
+        Whole pixels are exact; between them columns are interpolated linearly. Either way the energy is kept.
+        """
+        check.finite("degrees", np.float64(degrees))
+        width = self.radiance.shape[1]
+        shift = -degrees / 360 * width % width
+        if abs(shift - round(shift)) < 1e-6:  # 90 degrees computed from an angle are still whole pixels
+            shift = round(shift)
+        whole, fraction = divmod(shift, 1)
+        rolled = np.roll(self.radiance, int(whole), axis=1)
+        if fraction:
+            rolled = (1 - fraction) * rolled + fraction * np.roll(rolled, 1, axis=1)
+        return EnvironmentMap(rolled)
+
+    def scaled(self, factor: float | Sequence[float]) -> EnvironmentMap:
+        """Multiply the radiance by one factor, or by one for each of R, G, B."""
+        return EnvironmentMap(self.radiance * np.asarray(factor, dtype=np.float32))
+
+    def directions(self) -> np.ndarray:
+        """Unit vectors to the pixel centers, float32, shape [height, width, 3]."""
+        return sh.equirectangular_directions(len(self.radiance)).astype(np.float32)
+
+    def solid_angles(self) -> np.ndarray:
+        """Solid angle of one pixel of each row [sr], exact, float64, shape [height]; all pixels sum to 4π."""
+        return sh.pixel_solid_angles(len(self.radiance))
+
+    def sh(self, order: int) -> np.ndarray:
+        """Project onto spherical harmonics.
+
+        Args:
+            order: Number of bands n.
+
+        Returns:
+            Coefficients, index l² + l + m, float32, shape [order², 3].
+        """
+        return sh.project_map(self.radiance, order).astype(np.float32)
+
+    def cells(self, directions: np.ndarray) -> np.ndarray:
+        """Gather the light of the cells around directions: every pixel belongs to the nearest one.
+
+            L_q = Q/4π ∫_cell L dω,    so that Σ_q (4π/Q) L_q = ∫ L dω
+
+        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
+        much smaller than a cell are split.
+
+        Args:
+            directions: Unit vectors, shape [direction, 3].
+
+        Returns:
+            Radiance, float32, shape [direction, 3].
+        """
+        energy, _ = self._cell_integrals(directions)
+        return (energy * (len(energy) / (4 * np.pi))).astype(np.float32)
+
+    def cell_moments(self, directions: np.ndarray) -> CellMoments:
+        """Find where in its cell the light comes from: a sun wants its own direction, not the cell's.
+
+        Args:
+            directions: Unit vectors, shape [direction, 3].
+
+        Returns:
+            Per cell the mean direction, weighted with luminance, and its spread: the half-angle of the evenly bright
+            cap whose mean vector is as long, so 0 for a point and about 2/√Q for an evenly bright cell. A dark cell
+            gets its own direction and the spread of a cap of 4π/Q.
+        """
+        energy, moment = self._cell_integrals(directions)
+        power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
+        lit = length > 0
+        mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
+        concentration = np.where(lit, length / np.where(lit, power, 1), 1 - 1 / len(energy))
+        spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
+        return CellMoments(mean.astype(np.float32), spreads.astype(np.float32))
+
+    def _cell_integrals(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Over every cell, ∫ L dω [direction, RGB] and ∫ luminance d dω [direction, 3], float64."""
+        directions = np.asarray(directions, dtype=np.float64)
+        check.shape("directions", directions.shape, ("direction", 3))
+        if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+            raise ValueError("directions: expected at least one, all unit vectors")
+        count, height = len(directions), len(self.radiance)
+        split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
+        weights, columns = sh.pixel_solid_angles(height * split), directions.astype(np.float32).T
+        integrals = np.zeros((6, count))
+        for row, towards in enumerate(sh.equirectangular_directions(height * split)):
+            owner = np.argmax(towards.astype(np.float32) @ columns, axis=1)
+            power = weights[row] * np.repeat(self.radiance[row // split], split, axis=0).astype(np.float64)
+            values = np.concatenate([power, (power @ LUMINANCE)[:, None] * towards], axis=1)
+            for integral, value in zip(integrals, values.T, strict=True):
+                integral += np.bincount(owner, value, minlength=count)
+        return integrals[:3].T, integrals[3:].T
+
+    def statistics(self) -> dict[str, object]:
+        """Measure the map, in plain numbers: radiance (mean over the sphere), its integral, and how peaked it is."""
+        height, width, _ = self.radiance.shape
+        weights = np.repeat(self.solid_angles(), width)
+        pixels = self.radiance.reshape(-1, 3).astype(np.float64)
+        luminance = pixels @ LUMINANCE
+        integral = weights @ pixels
+        order = np.argsort(-luminance, kind="stable")
+        power = np.cumsum((luminance * weights)[order])
+        brightest = np.interp(0.01 * 4 * np.pi, np.cumsum(weights[order]), power)
+        return {
+            "width": width,
+            "height": height,
+            "min_radiance": pixels.min(axis=0).tolist(),
+            "max_radiance": pixels.max(axis=0).tolist(),
+            "mean_radiance": (integral / (4 * np.pi)).tolist(),
+            "integral": integral.tolist(),
+            "brightest_direction": self.directions().reshape(-1, 3)[order[0]].tolist(),
+            "brightest_percent_share": float(brightest / power[-1]) if power[-1] > 0 else 0.0,
+        }
+
+
+def _check_aspect(pixels: np.ndarray) -> None:
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise ImageError(f"radiance: got shape {pixels.shape}, expected [height, 2·height, 3]")
+    height, width, _ = pixels.shape
+    if width != 2 * height:
+        is_cube = (width, height) in [(width, 6 * width), (6 * height, height)] or 3 * max(pixels.shape) == 4 * min(
+            width, height
+        )
+        cube = ", which looks like a cube map" if is_cube else ""
+        raise ImageError(
+            f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
+        )
+
+
+def _bad_values(radiance: np.ndarray) -> np.ndarray:
+    return ~(np.isfinite(radiance) & (radiance >= 0))
+
+
+def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
+    """Replace NaN, Inf and negative values."""
+    bad = _bad_values(radiance)
+    values = np.where(bad, 0, radiance)
+    if how == "zero" or not bad.any():
+        return values
+    if bad.all(axis=(0, 1)).any():
+        raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
+    good = (~bad).astype(np.float32)
+    while (good == 0).any():
+        total, count = _around(values * good), _around(good)
+        fill = (good == 0) & (count > 0)
+        values = np.where(fill, total / np.maximum(count, 1), values)
+        good = np.maximum(good, fill)
+    return values
+
+
+def _around(image: np.ndarray) -> np.ndarray:
+    """Sum over each pixel and the eight around it; columns wrap around, rows end at the poles."""
+    across = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
+    padded = np.pad(across, ((1, 1), (0, 0), (0, 0)))
+    return padded[:-2] + padded[1:-1] + padded[2:]
+
+
+# ---------------------------------------------------------------------------------------------- maps from a formula
+
+
+def draw_test_map(height: int = 256) -> EnvironmentMap:
+    """Draw a map that shows which way is which: a color for each half-axis, a grid every 15°, and labels."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = 2 * height
+    towards = sh.equirectangular_directions(height)
+    axis = np.abs(towards).argmax(axis=-1)
+    negative = np.take_along_axis(towards, axis[..., None], axis=-1)[..., 0] < 0
+    colors = np.array([[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]])
+    picture = Image.fromarray(colors[axis, negative.astype(int)].astype(np.uint8))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=height / 7)
+    for step in range(24):
+        draw.line([(step * width / 24, 0), (step * width / 24, height)], fill=(60, 60, 60))
+        draw.line([(0, step * height / 12), (width, step * height / 12)], fill=(60, 60, 60))
+    labels = [("−Z", 0, 0.5), ("+X", 0.25, 0.5), ("+Z", 0.5, 0.5), ("−X", 0.75, 0.5), ("−Z", 1, 0.5)]
+    labels += [(text, quarter / 4, row) for text, row in (("+Y", 0.09), ("−Y", 0.91)) for quarter in range(5)]
+    for text, u, v in labels:
+        draw.text((u * width, v * height), text, fill="white", font=font, anchor="mm", stroke_width=2, stroke_fill="black")
+    return EnvironmentMap(srgb_to_linear(np.asarray(picture) / 255))
+
+
+def synthetic_sky(
+    sun_direction: Sequence[float] = (0.5, 0.7, 0.2),
+    *,
+    sun_strength: float = 3.0,
+    sun_radius: float = 1.5,
+    ground_albedo: float = 0.2,
+    height: int = 256,
+) -> EnvironmentMap:
+    """Make a clear daylight sky with a sun, over a diffuse ground.
+
+    The unit is what the sky alone does: its irradiance on the ground is π in luminance, so white ground looks 1. The sky
+    is the CIE standard clear sky (ISO 15469, type 12), blue with a pale haze at the horizon; the sun reddens as it
+    sinks. The ground has the radiance that the sky and the sun give it.
+
+    Args:
+        sun_direction: Direction to the sun, of any length, shape [3]; below the horizon there is no sun.
+        sun_strength: Irradiance of the sun on a surface that faces it, as a multiple of π.
+        sun_radius: Angular radius [degrees], at least half a pixel (the real sun's is 0.27).
+        ground_albedo: Reflectance of the ground.
+        height: Rows of the map.
+    """
+    check.finite("sun_direction", np.asarray(sun_direction, np.float64))
+    check.shape("sun_direction", np.shape(sun_direction), (3,))
+    if not np.any(sun_direction):
+        raise ValueError("sun_direction: got a zero vector, expected a direction")
+    sun = np.array(sun_direction, dtype=np.float64) / np.linalg.norm(sun_direction)
+    towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
+    up = towards[..., 1]
+    above = up > 0
+    sun_angle = np.arccos(np.clip(towards @ sun, -1, 1))
+
+    sun_color = _sunlight(max(sun[1], 0.0))
+    glow = 1 + 10 * (np.exp(-3 * sun_angle) - np.exp(-1.5 * np.pi)) + 0.45 * np.cos(sun_angle) ** 2
+    gradation = 1 - np.exp(-0.32 / np.maximum(up, 1e-3))
+    haze = np.exp(-5 * np.maximum(up, 0))[..., None]
+    near_sun = haze * np.exp(-2 * sun_angle)[..., None]
+    color = (1 - haze) * _chroma([0.22, 0.45, 1.0]) + haze * _chroma([0.75, 0.88, 1.0])
+    color = (1 - near_sun) * color + near_sun * sun_color
+    sky = (above * glow * gradation)[..., None] * color
+    sky *= np.pi / np.sum(sky @ LUMINANCE * np.maximum(up, 0) * weights)
+
+    pixel = np.pi / height
+    radius = max(np.radians(sun_radius), pixel / 2)
+    disc = np.clip((radius + pixel / 2 - sun_angle) / pixel, 0, 1)
+    disc *= above * np.pi * sun_strength / np.sum(disc * weights)
+
+    on_ground = np.pi + np.sum(disc * np.maximum(up, 0) * weights) * sun_color
+    ground = np.where(above[..., None], 0, ground_albedo / np.pi * on_ground)
+    return EnvironmentMap(sky + disc[..., None] * sun_color + ground)
+
+
+def _chroma(rgb: Sequence[float]) -> np.ndarray:
+    """The color at luminance 1."""
+    return np.array(rgb) / (LUMINANCE @ rgb)
+
+
+def _sunlight(elevation_sine: float) -> np.ndarray:
+    """Color of the sun through the air mass of Kasten and Young (1989), at luminance 1."""
+    degrees = np.degrees(np.arcsin(elevation_sine))
+    air_mass = 1 / (elevation_sine + 0.50572 * (degrees + 6.07995) ** -1.6364)
+    return _chroma(np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass))  # Rayleigh at 610, 550, 465 nm and thin haze

@@ -1,0 +1,521 @@
+"""Triangle meshes: files, primitives and vertex normals.
+
+Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals. Vertices
+keep the order they have in the file. Texture coordinates have their origin at the lower left of the image, v up.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+
+
+class MeshError(ValueError):
+    """A mesh, or a mesh file, that cannot be used; the message says what is wrong and where."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh on the host, validated; its arrays are read-only copies.
+
+    Args:
+        positions: Vertex positions [scene units], float32, shape [vertex, 3].
+        faces: Indices of positions, counter-clockwise seen from outside, int32, shape [face, 3].
+        uvs: Texture coordinates, origin at the lower left of the image, float32, shape [uv, 2], or None.
+        uv_faces: Indices of uvs, int32, shape [face, 3], or None.
+        name: What messages call the mesh.
+    Raises:
+        MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
+    """
+
+    positions: np.ndarray = field(repr=False)
+    faces: np.ndarray = field(repr=False)
+    uvs: np.ndarray | None = field(default=None, repr=False)
+    uv_faces: np.ndarray | None = field(default=None, repr=False)
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        """Copy, convert and validate the arrays."""
+        self._set("positions", _coordinates("positions", self.positions, 3, "vertex"))
+        self._set("faces", _indices("faces", self.faces, len(self.positions), "vertex"))
+        if (self.uvs is None) != (self.uv_faces is None):
+            given, missing = ("uv_faces", "uvs") if self.uvs is None else ("uvs", "uv_faces")
+            raise MeshError(f"{missing}: got None although {given} are given, expected both or neither")
+        if self.uvs is not None:
+            self._set("uvs", _coordinates("uvs", self.uvs, 2, "uv"))
+            self._set("uv_faces", _indices("uv_faces", self.uv_faces, len(self.uvs), "uv"))
+            if len(self.uv_faces) != len(self.faces):
+                raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {len(self.faces)}, one for each face")
+
+    def _set(self, name: str, array: np.ndarray) -> None:
+        array.setflags(write=False)
+        object.__setattr__(self, name, array)
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, referenced by a face or not."""
+        return len(self.positions)
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles."""
+        return len(self.faces)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around the vertices that faces refer to, each shape [3]."""
+        used = self.positions[np.unique(self.faces)]
+        return used.min(axis=0), used.max(axis=0)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of the arrays, in hexadecimal; the name does not count."""
+        digest = hashlib.sha256()
+        for array in (self.positions, self.faces, self.uvs, self.uv_faces):
+            digest.update(b"none" if array is None else str(array.shape).encode() + array.tobytes())
+        return digest.hexdigest()
+
+    def transformed(
+        self,
+        *,
+        rotation: np.ndarray | None = None,
+        translation: np.ndarray | None = None,
+        scale: float | np.ndarray = 1.0,
+    ) -> Mesh:
+        """Scale, then rotate, then translate; a transform that mirrors also turns the faces over.
+
+        Args:
+            rotation: Matrix that multiplies column vectors, shape [3, 3]; the identity by default.
+            translation: Offset [scene units], shape [3]; none by default.
+            scale: One factor, or one for each axis, shape [3].
+        Returns:
+            A new mesh with the same uvs and name.
+        """
+        rotation = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        translation = np.zeros(3) if translation is None else np.asarray(translation, np.float64)
+        check.shape("rotation", rotation.shape, (3, 3))
+        check.shape("translation", translation.shape, (3,))
+        part = _Part(self.positions, self.faces, self.uvs, self.uv_faces)
+        moved = _move(part, rotation * np.broadcast_to(scale, 3), translation)
+        return replace(self, positions=moved.positions, faces=moved.faces, uv_faces=moved.uv_faces)
+
+    def write(self, path: str | Path) -> None:
+        """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""
+        path = Path(path)
+        if path.suffix.lower() != ".obj":
+            raise MeshError(f"{path}: got extension {path.suffix!r}, expected .obj")
+        lines = ["v {:.9g} {:.9g} {:.9g}".format(*position) for position in self.positions.tolist()]
+        if self.uvs is None:
+            lines += ["f {} {} {}".format(*face) for face in (self.faces + 1).tolist()]
+        else:
+            lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]
+            corners = np.stack([self.faces, self.uv_faces], axis=-1).reshape(-1, 6) + 1
+            lines += ["f {}/{} {}/{} {}/{}".format(*corner) for corner in corners.tolist()]
+        path.write_text("\n".join(lines) + "\n")
+
+
+def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:
+    """Copy to float32 [item, width]; MeshError when empty, of another shape, or not finite."""
+    with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
+        values = np.array(values, dtype=np.float32, order="C")
+    if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
+        raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{name}: got NaN or Inf at {len(bad)} of {len(values)} (first at {item} {bad[0]}: {values[bad[0]].tolist()}), "
+            "expected finite float32 numbers"
+        )
+    return values
+
+
+def _indices(name: str, faces: np.ndarray, count: int, item: str) -> np.ndarray:
+    """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face")
+    if not np.issubdtype(faces.dtype, np.integer):
+        raise MeshError(f"{name}: got {faces.dtype}, expected integers")
+    bad = np.argwhere((faces < 0) | (faces >= count))
+    if len(bad):
+        face, corner = bad[0]
+        raise MeshError(
+            f"{name}: got {len(bad)} indices out of range (first at face {face}: {item} {faces[face, corner]}), "
+            f"expected 0 to {count - 1}"
+        )
+    return np.array(faces, dtype=np.int32, order="C")
+
+
+# ---------------------------------------------------------------------------------------------------------- files
+
+
+class _Part(NamedTuple):
+    """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates."""
+
+    positions: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray | None = None
+    uv_faces: np.ndarray | None = None
+    welded: int = 0
+    remark: str = ""
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read an OBJ, PLY, STL, GLB/glTF or USD file as one mesh.
+
+    Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes of a
+    scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), vertices that are duplicated
+    only for a uv (same position, and same normal where the file stores normals) share the first one's faces, so
+    that a seam does not break the shading; files without uvs are taken as they are. A USD stage is read at its
+    earliest time, with z-up turned to y-up; subdivision surfaces are read as their control cage. uvs are kept only
+    when every face has them.
+
+    Args:
+        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
+    Returns:
+        The mesh, named after the file.
+    Raises:
+        MeshError: for what is not such a file, or holds no usable triangles.
+        FileNotFoundError: when the file does not exist.
+        ImportError: for USD without the package usd-core.
+    Warns:
+        Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and when uvs are dropped.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise MeshError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such mesh file")
+    try:
+        parts = [part for part in reader(path) if len(part.positions)]
+        mesh, remarks = _concatenate(parts, path.stem)
+    except (MeshError, ImportError) as error:
+        raise type(error)(f"{path}: {error}") from error
+    except Exception as error:  # the readers of other libraries raise anything on a damaged file
+        raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
+    if remarks:
+        warnings.warn(f"{path}: {', '.join(remarks)}", stacklevel=2)
+    return mesh
+
+
+def _concatenate(parts: list[_Part], name: str) -> tuple[Mesh, list[str]]:
+    """Join parts into one mesh and remark on what may surprise."""
+    if not any(len(part.faces) for part in parts):
+        raise MeshError(
+            f"faces: got none ({sum(len(part.positions) for part in parts)} vertices), expected at least one triangle"
+        )
+    textured = [part.uvs is not None for part in parts]
+    uvs = uv_faces = None
+    if all(textured):
+        uvs, uv_faces = _stack([part.uvs for part in parts], [part.uv_faces for part in parts])
+    mesh = Mesh(*_stack([part.positions for part in parts], [part.faces for part in parts]), uvs, uv_faces, name)
+
+    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
+    counts = {
+        "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
+        "duplicate faces": mesh.face_count - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)),
+        "unreferenced vertices": mesh.vertex_count
+        - len(np.unique(mesh.faces))
+        - sum(part.welded for part in parts),
+    }
+    remarks = [f"{count} {what}" for what, count in counts.items() if count]
+    remarks += [part.remark for part in parts if part.remark]
+    if any(textured) and not all(textured):
+        remarks.append(f"uvs dropped because {textured.count(False)} of {len(parts)} parts have none")
+    return mesh, remarks
+
+
+def _stack(values: list[np.ndarray], faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate values, and faces with their indices moved along."""
+    offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
+    return np.concatenate(values), np.concatenate([f + offset for f, offset in zip(faces, offsets, strict=True)])
+
+
+def _move(part: _Part, linear: np.ndarray, translation: np.ndarray) -> _Part:
+    """Apply x ↦ linear x + translation; a mirroring turns the faces over."""
+    positions = part.positions.astype(np.float64) @ linear.T + translation
+    part = part._replace(positions=positions.astype(np.float32))
+    return _turned_over(part) if np.linalg.det(linear) < 0 else part
+
+
+def _turned_over(part: _Part) -> _Part:
+    """Reverse the winding of every face."""
+    return part._replace(
+        faces=part.faces[:, ::-1], uv_faces=None if part.uv_faces is None else part.uv_faces[:, ::-1]
+    )
+
+
+def _fan(corner_counts: np.ndarray) -> np.ndarray:
+    """Corner numbers [triangle, 3] of the fans that triangulate consecutive polygons."""
+    if (corner_counts < 3).any():
+        polygon = np.flatnonzero(corner_counts < 3)[0]
+        raise MeshError(f"faces: got {corner_counts[polygon]} corners at face {polygon}, expected 3 or more")
+    triangle_counts = corner_counts - 2
+    first = np.repeat(np.cumsum(corner_counts) - corner_counts, triangle_counts)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(triangle_counts) - triangle_counts, triangle_counts)
+    return np.stack([first, first + step + 1, first + step + 2], axis=1)
+
+
+def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+    """Let faces refer to the first of the vertices that agree in all attributes."""
+    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
+    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first[group.reshape(-1)][faces]
+
+
+def _read_obj(path: Path) -> list[_Part]:
+    """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
+    positions, uvs, corners, uv_corners, corner_counts = [], [], [], [], []
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.split("\n"), start=1):
+        try:
+            match line.partition("#")[0].split():
+                case ["v", x, y, z, *_]:
+                    positions.append((float(x), float(y), float(z)))
+                case ["vt", u, *rest]:
+                    uvs.append((float(u), float(rest[0]) if rest else 0.0))
+                case ["f", *tokens]:
+                    corner_counts.append(len(tokens))
+                    for token in tokens:
+                        vertex, _, others = token.partition("/")
+                        corners.append(_obj_index(vertex, len(positions)))
+                        if uv := others.partition("/")[0]:
+                            uv_corners.append(_obj_index(uv, len(uvs)))
+                case ["v" | "vt", *coordinates]:
+                    raise ValueError(f"{len(coordinates)} coordinates are too few")
+        except ValueError as error:
+            raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
+    faces = _fan(np.array(corner_counts, dtype=np.int64))
+    part = _Part(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
+    if not uv_corners:
+        return [part]
+    if len(uv_corners) < len(corners):
+        missing = len(corners) - len(uv_corners)
+        return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
+    return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
+
+
+def _obj_index(token: str, count: int) -> int:
+    """Zero-based index of a one-based one, or of one that counts back from the last item so far."""
+    index = int(token)
+    return index + count if index < 0 else index - 1
+
+
+def _read_trimesh(path: Path) -> list[_Part]:
+    """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
+    import trimesh
+
+    if path.suffix.lower() == ".gltf":
+        json.loads(path.read_bytes())  # on bad JSON trimesh would read a model.gltf beside the file instead
+    scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, geometry = scene.graph[node]
+        shape = scene.geometry[geometry]
+        if isinstance(shape, trimesh.Trimesh):
+            parts.append(_move(_trimesh_part(shape), transform[:3, :3], transform[:3, 3]))
+    return parts
+
+
+def _trimesh_part(shape) -> _Part:
+    """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
+    positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
+    corner_uvs = _ply_corner_uvs(shape)
+    if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
+        return _Part(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3))
+    uvs = getattr(shape.visual, "uv", None)
+    if uvs is None:
+        return _Part(positions, faces)
+    # Normals in the cache come from the file; `shape.vertex_normals` would compute missing ones, which differ at seams.
+    normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
+    welded = _weld(faces, positions, *normals)
+    return _Part(positions, welded, uvs, faces, len(np.unique(faces)) - len(np.unique(welded)))
+
+
+def _ply_corner_uvs(shape) -> np.ndarray | None:
+    """The uvs [corner, 2] of a PLY file that stores them with faces, which trimesh would average over vertices."""
+    data = shape.metadata.get("_ply_raw", {}).get("face", {}).get("data", {})
+    names = data.dtype.names or () if isinstance(data, np.ndarray) else data
+    if "texcoord" not in names:
+        return None
+    uvs = data["texcoord"]  # binary files hold [count, values], ASCII files the values alone
+    return np.asarray(uvs["f1"] if getattr(uvs.dtype, "names", None) else uvs).reshape(-1, 2)
+
+
+def _read_usd(path: Path) -> list[_Part]:
+    """Read the visible meshes of a USD stage in world space, y up."""
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError:
+        raise ImportError("USD needs the package usd-core: pip install usd-core") from None
+
+    stage = Usd.Stage.Open(str(path))
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    to_y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if z_up else np.eye(3)
+    parts = []
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        mesh = UsdGeom.Mesh(prim)
+        if (
+            mesh
+            and mesh.ComputeVisibility(time) != UsdGeom.Tokens.invisible
+            and mesh.ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+        ):
+            world = np.array(transforms.GetLocalToWorldTransform(prim))  # multiplies row vectors
+            part = _usd_part(mesh, UsdGeom.PrimvarsAPI(prim), time)
+            parts.append(_move(part, to_y_up @ world[:3, :3].T, to_y_up @ world[3, :3]))
+    return parts
+
+
+def _usd_part(mesh, primvars, time) -> _Part:
+    """Take the arrays of a UsdGeom.Mesh, polygons triangulated, in its own space."""
+    positions = np.array(mesh.GetPointsAttr().Get(time) or [], dtype=np.float32).reshape(-1, 3)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], dtype=np.int64)
+    corner_counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
+    if corner_counts.sum() != len(corners):
+        raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
+    faces = _fan(corner_counts)
+    part = _Part(positions, corners[faces])
+    st = primvars.GetPrimvar("st")
+    uv_items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
+    if st.HasValue() and st.GetInterpolation() in uv_items:
+        uvs = np.array(st.Get(time), dtype=np.float32)
+        indices = np.array(st.GetIndices(time) if st.IsIndexed() else np.arange(len(uvs)))
+        part = part._replace(uvs=uvs, uv_faces=indices[uv_items[st.GetInterpolation()]][faces])
+    return _turned_over(part) if mesh.GetOrientationAttr().Get() == "leftHanded" else part
+
+
+_READERS: dict[str, Callable[[Path], list[_Part]]] = {
+    ".obj": _read_obj,
+    **dict.fromkeys([".ply", ".stl", ".glb", ".gltf"], _read_trimesh),
+    **dict.fromkeys([".usd", ".usda", ".usdc", ".usdz"], _read_usd),
+}
+
+
+# ----------------------------------------------------------------------------------------------------- primitives
+
+
+def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, int] = 64) -> Mesh:
+    """Make a grid in the plane y = 0, centered at the origin, facing +y.
+
+    Args:
+        size: Edge length along x and z [scene units], one for both or a pair.
+        segments: Quads along x and z, one count for both or a pair; each quad is two triangles.
+    Returns:
+        The mesh; u runs along +x, v along -z, both from 0 to 1.
+    """
+    size_x, size_z = np.broadcast_to(size, 2).tolist()
+    columns, rows = np.broadcast_to(segments, 2).tolist()
+    if not (0 < size_x < np.inf and 0 < size_z < np.inf):
+        raise MeshError(f"size: got {size}, expected positive numbers")
+    if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
+        raise MeshError(f"segments: got {segments}, expected positive integers")
+    v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
+    positions = np.stack([(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1)
+    corner = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
+    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
+    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    return Mesh(positions, faces, uvs, faces, "plane")
+
+
+def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
+    """Make a sphere around the origin from an icosahedron whose faces are split in four, without uvs.
+
+    Args:
+        radius: Distance of the vertices from the origin [scene units].
+        subdivisions: Number of splits s, 0 to 8: 10·4ˢ + 2 vertices and 20·4ˢ faces.
+    """
+    if not 0 < radius < np.inf:
+        raise MeshError(f"radius: got {radius}, expected a positive number")
+    if subdivisions not in range(9):
+        raise MeshError(f"subdivisions: got {subdivisions}, expected an integer from 0 to 8")
+    # The twelve corners are the cyclic shifts of (0, ±1, ±golden); neighbors are 2 apart.
+    golden = (1 + 5**0.5) / 2
+    corners = np.array([(0, y, z * golden) for y in (-1, 1) for z in (-1, 1)])
+    positions = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
+    near = np.isclose(np.linalg.norm(positions[:, None] - positions, axis=-1), 2)
+    triples = [(a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]]
+    faces = np.array([t if np.linalg.det(positions[list(t)]) > 0 else t[::-1] for t in triples])
+    for _ in range(subdivisions):
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
+        edges, middle = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = middle.reshape(-1, 3).T + len(positions)
+        a, b, c = faces.T
+        positions = np.concatenate([positions, positions[edges].mean(axis=1)])
+        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+        positions /= np.linalg.norm(positions, axis=1, keepdims=True)
+    return Mesh(positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere")
+
+
+# -------------------------------------------------------------------------------------------------------- normals
+
+
+@wp.kernel
+def _sum_face_normals(
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    # out
+    sums: wp.array2d(dtype=wp.vec3),
+):
+    """A thread adds the normal of one face, as long as twice its area, to its three vertices."""
+    batch, face = wp.tid()
+    i, j, k = faces[face][0], faces[face][1], faces[face][2]
+    origin = positions[batch, i]
+    normal = wp.cross(positions[batch, j] - origin, positions[batch, k] - origin)
+    wp.atomic_add(sums, batch, i, normal)
+    wp.atomic_add(sums, batch, j, normal)
+    wp.atomic_add(sums, batch, k, normal)
+
+
+@wp.kernel
+def _normalize(
+    # in
+    sums: wp.array2d(dtype=wp.vec3),
+    # out
+    normals: wp.array2d(dtype=wp.vec3),
+):
+    """A thread normalizes one vertex; zero stays zero, with a zero gradient."""
+    batch, vertex = wp.tid()
+    normals[batch, vertex] = wp.normalize(sums[batch, vertex])
+
+
+def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
+    """Compute unit vertex normals, faces weighted by their area.
+
+        n_v = normalize(Σ_{faces at v} (x_j − x_i) × (x_k − x_i))
+
+    On a GPU the sum's order, so its last bits, may differ between runs unless ``wp.config.deterministic`` asks otherwise.
+
+    Args:
+        positions: Vertex positions [scene units], vec3, shape [batch, vertex].
+        faces: Vertex indices, counter-clockwise seen from outside, vec3i, shape [face].
+    Returns:
+        Normals, vec3, shape [batch, vertex]; zero where the faces have no area or the vertex has no face.
+    Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
+    """
+    device, requires_grad = positions.device, positions.requires_grad
+    sums = wp.zeros(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+    normals = wp.empty(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+    wp.launch(
+        _sum_face_normals,
+        dim=(positions.shape[0], faces.shape[0]),
+        inputs=[positions, faces],
+        outputs=[sums],
+        device=device,
+    )
+    wp.launch(_normalize, dim=positions.shape, inputs=[sums], outputs=[normals], device=device)
+    return normals

@@ -1,0 +1,554 @@
+"""Rasterize triangles: which face a pixel sees, where on it, and what an attribute is worth there.
+
+Pixels and clip space are those of `warpshadow.camera`. Coverage is decided in integers, so it is exact and the same on
+every device: vertices snap to 1/4096 pixel, a pixel belongs to the face that holds its center, and a center on an edge
+belongs to one of the two faces that share it (the top-left rule). Both sides of a face are drawn. Of the faces over a
+pixel the nearest wins; of equally near ones, that of the lowest index.
+
+Coverage has no derivative. Barycentrics are recomputed from the face of each pixel, so they do.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import warp as wp
+
+from warpshadow import check
+
+MAX_SIZE = 1 << 15
+"""Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
+
+# Fixed-point pixel positions have 12 fractional bits and, with sign, 29 bits in all. So edge coefficients have at most 30
+# bits, their products with positions 59, and their sums fit 64.
+_ONE = 1 << 12
+_HALF = _ONE // 2
+_SHIFT = 12
+_LIMIT = 1 << 28
+_WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind the eye or beyond the limit
+
+# Boxes at least this wide have each row trimmed to the span inside the edges; below, testing every pixel is faster.
+_TRIM_WIDTH = 8
+
+# On CUDA the rows of a face are dealt to this many threads, so that no thread draws a huge face alone.
+_CUDA_STRIPS = 16
+
+_INT32_MASK = (1 << 32) - 1
+
+_Edge = wp.types.vector(length=3, dtype=wp.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """What each pixel sees.
+
+    Args:
+        face_ids: Index of the visible face, -1 where there is none, int32, shape [batch, height, width].
+        barycentrics: Perspective-correct weights of the face's three vertices, non-negative with sum 1, zero where
+            there is no face, vec3, shape [batch, height, width].
+    """
+
+    face_ids: wp.array
+    barycentrics: wp.array
+
+
+@wp.kernel(enable_backward=False)
+def _snap(
+    # in
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    # out
+    corners: wp.array2d(dtype=wp.vec2i),
+    depths: wp.array2d(dtype=float),
+    faults: wp.array(dtype=int),
+):
+    """One thread owns one vertex: its fixed-point pixel position and its depth z/w."""
+    instance, vertex = wp.tid()
+    p = clip_positions[instance, vertex]
+    if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2]) and wp.isfinite(p[3])):
+        wp.atomic_add(faults, 0, 1)
+    corner = wp.vec2i(_WILD, _WILD)
+    depth = float(0.0)
+    if p[3] > 0.0:
+        inverse = wp.float64(1.0) / wp.float64(p[3])
+        x = (wp.float64(p[0]) * inverse + wp.float64(1.0)) * wp.float64(width * _HALF)
+        y = (wp.float64(p[1]) * inverse + wp.float64(1.0)) * wp.float64(height * _HALF)
+        if wp.max(wp.abs(x), wp.abs(y)) < wp.float64(_LIMIT):
+            corner = wp.vec2i(int(wp.rint(x)), int(wp.rint(y)))
+            depth = p[2] / p[3]
+    corners[instance, vertex] = corner
+    depths[instance, vertex] = depth
+
+
+@wp.func
+def _edge(a: wp.vec2i, b: wp.vec2i):
+    """Line through two snapped vertices: E(x, y) = e0 x + e1 y + e2, positive on the right of a -> b as seen on screen."""
+    x = wp.int64(a[1] - b[1])
+    y = wp.int64(b[0] - a[0])
+    return _Edge(x, y, -(x * wp.int64(a[0]) + y * wp.int64(a[1])))
+
+
+@wp.func
+def _pixel_homogeneous(p: wp.vec4, width: int, height: int):
+    """Clip position to homogeneous fixed-point pixel coordinates."""
+    w = wp.float64(p[3])
+    x = (wp.float64(p[0]) + w) * wp.float64(width * _HALF)
+    y = (wp.float64(p[1]) + w) * wp.float64(height * _HALF)
+    return wp.vec3d(x, y, w)
+
+
+@wp.func
+def _wild_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec2i):
+    """Line of an edge with a vertex behind the eye or far away.
+
+    In homogeneous coordinates the line is a x b, wherever its ends are. It is rounded to integers, made to pass through
+    an end that has a snapped position, and computed in one order of a and b, so that both faces of the edge get the same.
+    """
+    if a_corner[0] != _WILD and b_corner[0] != _WILD:
+        return _edge(a_corner, b_corner)
+    swap = a[0] > b[0] or (a[0] == b[0] and (a[1] > b[1] or (a[1] == b[1] and a[2] > b[2])))
+    line = wp.where(swap, wp.cross(b, a), wp.cross(a, b))
+    sign = wp.where(swap, wp.int64(-1), wp.int64(1))
+    slope = wp.max(wp.abs(line[0]), wp.abs(line[1]))
+    # The point of the line that is nearest to the origin; the line misses the screen if that is far.
+    offset = wp.float64(0.0)
+    if slope > wp.float64(0.0):
+        line = line / slope
+        offset = line[2] / (line[0] * line[0] + line[1] * line[1])
+    anchor_x = wp.int64(0)
+    anchor_y = wp.int64(0)
+    if a_corner[0] != _WILD:
+        anchor_x = wp.int64(a_corner[0])
+        anchor_y = wp.int64(a_corner[1])
+    elif b_corner[0] != _WILD:
+        anchor_x = wp.int64(b_corner[0])
+        anchor_y = wp.int64(b_corner[1])
+    elif slope == wp.float64(0.0) or wp.abs(offset) > wp.float64(_LIMIT):
+        return _Edge(wp.int64(0), wp.int64(0), sign * wp.int64(wp.sign(line[2])))
+    else:
+        anchor_x = wp.int64(wp.rint(-line[0] * offset))
+        anchor_y = wp.int64(wp.rint(-line[1] * offset))
+    x = sign * wp.int64(wp.rint(line[0] * wp.float64(_LIMIT)))
+    y = sign * wp.int64(wp.rint(line[1] * wp.float64(_LIMIT)))
+    return _Edge(x, y, -(x * anchor_x + y * anchor_y))
+
+
+@wp.func
+def _first_pixel(fixed: int):
+    """Least pixel index whose center is not before a fixed-point position."""
+    return (fixed + (_HALF - 1)) >> _SHIFT
+
+
+@wp.func
+def _at_pixel_centers(edge: _Edge, sign: wp.int64):
+    """Edge function of pixel indices instead of positions, non-negative exactly on the pixels inside.
+
+    Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight below it.
+    """
+    x = sign * edge[0]
+    y = sign * edge[1]
+    at_origin = sign * edge[2] + (x + y) * wp.int64(_HALF)
+    if not (x > wp.int64(0) or (x == wp.int64(0) and y > wp.int64(0))):
+        at_origin -= wp.int64(1)
+    return _Edge(x * wp.int64(_ONE), y * wp.int64(_ONE), at_origin)
+
+
+@wp.func
+def _trim(span: wp.vec2i, step: wp.int64, value: wp.int64):
+    """Shrink a span of columns to where an edge function may be non-negative, a column to spare on either side."""
+    if step == wp.int64(0):
+        return span
+    root = -wp.float64(value) / wp.float64(step)
+    column = int(wp.clamp(root, wp.float64(-2.0), wp.float64(MAX_SIZE)))
+    if step > wp.int64(0):
+        return wp.vec2i(wp.max(span[0], column - 1), span[1])
+    return wp.vec2i(span[0], wp.min(span[1], column + 1))
+
+
+@wp.func
+def _tame_plane(a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, area: wp.int64, depth_a: float, depth_b: float, depth_c: float):
+    """Depth of a face as a linear function of pixel indices: plane0 column + plane1 row + plane2."""
+    scale = wp.float64(_ONE) / wp.float64(area)
+    ab = wp.float64(depth_b - depth_a) * scale
+    ac = wp.float64(depth_c - depth_a) * scale
+    x = ab * wp.float64(c[1] - a[1]) - ac * wp.float64(b[1] - a[1])
+    y = ac * wp.float64(b[0] - a[0]) - ab * wp.float64(c[0] - a[0])
+    column = wp.float64(a[0] - _HALF) / wp.float64(_ONE)
+    row = wp.float64(a[1] - _HALF) / wp.float64(_ONE)
+    return wp.vec3d(x, y, wp.float64(depth_a) - x * column - y * row)
+
+
+@wp.func
+def _wild_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
+    """`_tame_plane` for a face with vertices behind the eye or far away."""
+    ab = wp.cross(a, b)
+    plane = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * ab) / wp.dot(ab, c)
+    half = wp.float64(_HALF)
+    one = wp.float64(_ONE)
+    return wp.vec3d(plane[0] * one, plane[1] * one, plane[2] + (plane[0] + plane[1]) * half)
+
+
+@wp.func
+def _outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
+    """Whether all of a face lies beyond one side of the view frustum."""
+    return (
+        (a[0] > a[3] and b[0] > b[3] and c[0] > c[3])
+        or (a[0] < -a[3] and b[0] < -b[3] and c[0] < -c[3])
+        or (a[1] > a[3] and b[1] > b[3] and c[1] > c[3])
+        or (a[1] < -a[3] and b[1] < -b[3] and c[1] < -c[3])
+        or (a[2] > a[3] and b[2] > b[3] and c[2] > c[3])
+        or (a[2] <= 0.0 and b[2] <= 0.0 and c[2] <= 0.0)
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _cover(
+    # in
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    corners: wp.array2d(dtype=wp.vec2i),
+    depths: wp.array2d(dtype=float),
+    faces: wp.array(dtype=wp.vec3i),
+    width: int,
+    height: int,
+    strip_count: int,
+    # out
+    keys: wp.array3d(dtype=wp.int64),
+    faults: wp.array(dtype=int),
+):
+    """One thread owns every strip_count-th row of one face: it offers the face to the pixels that the face covers.
+
+    A pixel keeps the largest key: nearest depth above, lowest face below. Zero is the background.
+    """
+    instance, face, strip = wp.tid()
+    i = faces[face][0]
+    j = faces[face][1]
+    k = faces[face][2]
+    if wp.min(i, wp.min(j, k)) < 0 or wp.max(i, wp.max(j, k)) >= corners.shape[1]:
+        if strip == 0:
+            wp.atomic_add(faults, 1, 1)
+        return
+    a = corners[instance, i]
+    b = corners[instance, j]
+    c = corners[instance, k]
+    wild = a[0] == _WILD or b[0] == _WILD or c[0] == _WILD
+
+    left = int(0)
+    right = width - 1
+    top = int(0)
+    bottom = height - 1
+    if not wild:
+        left = wp.max(left, _first_pixel(wp.min(a[0], wp.min(b[0], c[0]))))
+        right = wp.min(right, _first_pixel(wp.max(a[0], wp.max(b[0], c[0])) + 1) - 1)
+        top = wp.max(top, _first_pixel(wp.min(a[1], wp.min(b[1], c[1]))))
+        bottom = wp.min(bottom, _first_pixel(wp.max(a[1], wp.max(b[1], c[1])) + 1) - 1)
+    if left > right or top > bottom:
+        return
+
+    edge_a = _edge(b, c)
+    edge_b = _edge(c, a)
+    edge_c = _edge(a, b)
+    plane = wp.vec3d()
+    farthest = wp.float64(-wp.inf)
+    nearest = wp.float64(wp.inf)
+    sign = wp.int64(1)
+    if wild:
+        clip_a = clip_positions[instance, i]
+        clip_b = clip_positions[instance, j]
+        clip_c = clip_positions[instance, k]
+        if _outside(clip_a, clip_b, clip_c):
+            return
+        pixel_a = _pixel_homogeneous(clip_a, width, height)
+        pixel_b = _pixel_homogeneous(clip_b, width, height)
+        pixel_c = _pixel_homogeneous(clip_c, width, height)
+        volume = wp.dot(wp.cross(pixel_a, pixel_b), pixel_c)
+        if volume == wp.float64(0.0):
+            return
+        sign = wp.where(volume > wp.float64(0.0), wp.int64(1), wp.int64(-1))
+        edge_a = _wild_edge(pixel_b, pixel_c, b, c)
+        edge_b = _wild_edge(pixel_c, pixel_a, c, a)
+        edge_c = _wild_edge(pixel_a, pixel_b, a, b)
+        z = wp.vec3d(wp.float64(clip_a[2]), wp.float64(clip_b[2]), wp.float64(clip_c[2]))
+        plane = _wild_plane(pixel_a, pixel_b, pixel_c, z)
+    else:
+        area = edge_c[0] * wp.int64(c[0]) + edge_c[1] * wp.int64(c[1]) + edge_c[2]
+        if area == wp.int64(0):
+            return
+        sign = wp.where(area > wp.int64(0), wp.int64(1), wp.int64(-1))
+        depth_a = depths[instance, i]
+        depth_b = depths[instance, j]
+        depth_c = depths[instance, k]
+        plane = _tame_plane(a, b, c, area, depth_a, depth_b, depth_c)
+        # Rounding must not carry the depth of a sliver beyond that of its vertices.
+        farthest = wp.float64(wp.min(depth_a, wp.min(depth_b, depth_c)))
+        nearest = wp.float64(wp.max(depth_a, wp.max(depth_b, depth_c)))
+    edge_a = _at_pixel_centers(edge_a, sign)
+    edge_b = _at_pixel_centers(edge_b, sign)
+    edge_c = _at_pixel_centers(edge_c, sign)
+
+    low = wp.int64(_INT32_MASK) - wp.int64(face)
+    for row in range(top + strip, bottom + 1, strip_count):
+        y = wp.int64(row)
+        in_a = edge_a[1] * y + edge_a[2]
+        in_b = edge_b[1] * y + edge_b[2]
+        in_c = edge_c[1] * y + edge_c[2]
+        span = wp.vec2i(left, right)
+        if right - left >= _TRIM_WIDTH:
+            span = _trim(span, edge_a[0], in_a)
+            span = _trim(span, edge_b[0], in_b)
+            span = _trim(span, edge_c[0], in_c)
+        x = wp.int64(span[0])
+        in_a += edge_a[0] * x
+        in_b += edge_b[0] * x
+        in_c += edge_c[0] * x
+        depth_of_row = plane[1] * wp.float64(row) + plane[2]
+        for column in range(span[0], span[1] + 1):
+            if (in_a | in_b | in_c) >= wp.int64(0):
+                depth = float(wp.clamp(plane[0] * wp.float64(column) + depth_of_row, farthest, nearest))
+                if depth > 0.0 and depth <= 1.0:
+                    key = (wp.int64(wp.cast(depth, wp.int32)) << wp.int64(32)) | low
+                    if key > keys[instance, row, column]:
+                        wp.atomic_max(keys, instance, row, column, key)
+            in_a += edge_a[0]
+            in_b += edge_b[0]
+            in_c += edge_c[0]
+
+
+@wp.kernel(enable_backward=False)
+def _resolve(
+    # in
+    keys: wp.array(dtype=wp.int64),
+    # out
+    face_ids: wp.array(dtype=wp.int32),
+):
+    """One thread owns one pixel: the face in its key, and -1 for the key zero."""
+    pixel = wp.tid()
+    face_ids[pixel] = ~wp.int32(keys[pixel])
+
+
+# Pixel kernels run over flat images: on a CPU, splitting an index into instance, row and column takes as long as the rest.
+@wp.func
+def _instance(pixel: int, pixels_per_instance: int, instance_count: int):
+    """Instance of a pixel, without the division where there is only one."""
+    instance = int(0)
+    if instance_count > 1:
+        instance = pixel / pixels_per_instance
+    return instance
+
+
+@wp.kernel
+def _barycentrics(
+    # in
+    face_ids: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    # out
+    barycentrics: wp.array(dtype=wp.vec3),
+):
+    """One thread owns one pixel; barycentrics are zero before.
+
+    In clip space, seen from the eye, the weights are the volumes that the ray of the pixel spans with two vertices each.
+    That holds for vertices behind the eye, too, so no clipping is needed. Positions are taken relative to the ray: two
+    coordinates of each vertex suffice, and nothing cancels when a face is small.
+    """
+    pixel = wp.tid()
+    face = face_ids[pixel]
+    if face >= 0:
+        instance = _instance(pixel, width * height, clip_positions.shape[0])
+        corners = faces[face]
+        a = clip_positions[instance, corners[0]]
+        b = clip_positions[instance, corners[1]]
+        c = clip_positions[instance, corners[2]]
+        row = pixel / width
+        column = pixel - row * width
+        row -= instance * height
+        x = float(2 * column + 1) / float(width) - 1.0
+        y = float(2 * row + 1) / float(height) - 1.0
+        ax = a[0] - x * a[3]
+        ay = a[1] - y * a[3]
+        bx = b[0] - x * b[3]
+        by = b[1] - y * b[3]
+        cx = c[0] - x * c[3]
+        cy = c[1] - y * c[3]
+        volume_a = bx * cy - by * cx
+        volume_b = cx * ay - cy * ax
+        volume_c = ax * by - ay * bx
+        # A center may lie outside of the face by what the vertices moved when they snapped.
+        side = wp.sign(volume_a + volume_b + volume_c)
+        weight_a = wp.max(side * volume_a, 0.0)
+        weight_b = wp.max(side * volume_b, 0.0)
+        weight_c = wp.max(side * volume_c, 0.0)
+        total = weight_a + weight_b + weight_c
+        if total > 0.0:
+            barycentrics[pixel] = wp.vec3(weight_a / total, weight_b / total, weight_c / total)
+        else:
+            # Edge-on, drawn only because its vertices snapped.
+            barycentrics[pixel] = wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
+
+
+@functools.cache
+def _interpolation(dtype: type):
+    """Kernel of `interpolate` for attributes of one dtype."""
+
+    @wp.kernel(module="unique")
+    def interpolate(
+        # in
+        face_ids: wp.array(dtype=wp.int32),
+        barycentrics: wp.array(dtype=wp.vec3),
+        faces: wp.array(dtype=wp.vec3i),
+        attributes: wp.array2d(dtype=dtype),
+        pixels_per_instance: int,
+        # out
+        image: wp.array(dtype=dtype),
+    ):
+        """One thread owns one pixel; the image is zero before."""
+        pixel = wp.tid()
+        face = face_ids[pixel]
+        if face >= 0:
+            instance = _instance(pixel, pixels_per_instance, attributes.shape[0])
+            corners = faces[face]
+            weights = barycentrics[pixel]
+            image[pixel] = (
+                weights[0] * attributes[instance, corners[0]]
+                + weights[1] * attributes[instance, corners[1]]
+                + weights[2] * attributes[instance, corners[2]]
+            )
+
+    return interpolate
+
+
+def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:
+    """Find the face that each pixel sees, and where on that face.
+
+    A face is drawn where it holds a pixel's center, however small it is, where 0 < z <= w (between the near plane and
+    infinity); a face without area draws nothing.
+
+    Args:
+        clip_positions: Vertices in clip space (`warpshadow.camera.to_clip`), vec4, shape [batch, vertex].
+        faces: Vertex indices, vec3i, shape [face].
+        width: Image width [pixels], at most 32768.
+        height: Image height [pixels], at most 32768.
+    Returns:
+        Fragments. Distances along the view are ``interpolate(fragments, faces, w)``.
+    Raises:
+        ValueError: naming the argument; so for NaN or Inf positions and for indices of no vertex. (Reading the two
+            counts back waits for the device. While a CUDA graph is captured that cannot be, and nothing is checked.)
+    Differentiable: barycentrics in clip_positions, but where they are clamped to 0 because snapping put the pixel just outside of
+        the face. Not: face_ids.
+    """
+    for name, size in (("width", width), ("height", height)):
+        if not 1 <= size <= MAX_SIZE:
+            raise ValueError(f"{name}: got {size!r}, expected 1 to {MAX_SIZE} pixels")
+    face_ids = _visible_faces(clip_positions, faces, width, height)
+    return Fragments(face_ids, barycentrics(face_ids, faces, clip_positions))
+
+
+def barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) -> wp.array:
+    """Find where on its face each pixel's center lies.
+
+    Args:
+        face_ids: Visible face or -1, int32, shape [batch, height, width].
+        faces: Vertex indices, vec3i, shape [face].
+        clip_positions: Vertices in clip space, vec4, shape [batch, vertex].
+    Returns:
+        Perspective-correct weights of the face's three vertices, vec3, shape [batch, height, width].
+    Differentiable: clip_positions. Not: face_ids.
+    """
+    device = clip_positions.device
+    weights = wp.zeros(face_ids.shape, dtype=wp.vec3, device=device, requires_grad=clip_positions.requires_grad)
+    _, height, width = face_ids.shape
+    wp.launch(
+        _barycentrics,
+        dim=face_ids.size,
+        inputs=[face_ids.flatten(), faces, clip_positions, width, height],
+        outputs=[weights.flatten()],
+        device=device,
+    )
+    return weights
+
+
+def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> wp.array:
+    """Interpolate an attribute of the vertices over the pixels, perspective-correct.
+
+    Args:
+        fragments: What each pixel sees.
+        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology of the
+            same mesh (uv_faces), face by face.
+        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute]; batch may be 1 and then
+            serves every instance.
+    Returns:
+        Image, dtype of the attributes, shape [batch, height, width], zero where there is no face.
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    Differentiable: attributes, barycentrics of the fragments.
+    """
+    face_ids = fragments.face_ids
+    check.shape("attributes", attributes.shape, ("batch", "attribute"))
+    if attributes.shape[0] not in (1, face_ids.shape[0]):
+        raise ValueError(f"attributes: got a batch of {attributes.shape[0]}, expected 1 or {face_ids.shape[0]}")
+    if getattr(attributes.dtype, "_wp_scalar_type_", attributes.dtype) is not wp.float32:
+        raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
+    image = wp.zeros(
+        face_ids.shape,
+        dtype=attributes.dtype,
+        device=face_ids.device,
+        requires_grad=attributes.requires_grad or fragments.barycentrics.requires_grad,
+    )
+    wp.launch(
+        _interpolation(attributes.dtype),
+        dim=face_ids.size,
+        inputs=[
+            face_ids.flatten(),
+            fragments.barycentrics.flatten(),
+            faces,
+            attributes,
+            face_ids.shape[1] * face_ids.shape[2],
+        ],
+        outputs=[image.flatten()],
+        device=face_ids.device,
+    )
+    return image
+
+
+def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> wp.array:
+    """Index of the nearest face over each pixel, -1 where there is none, int32, shape [batch, height, width]."""
+    device = clip_positions.device
+    batch_count, vertex_count = clip_positions.shape
+    corners = wp.empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
+    depths = wp.empty((batch_count, vertex_count), dtype=float, device=device)
+    keys = wp.zeros((batch_count, height, width), dtype=wp.int64, device=device)
+    face_ids = wp.empty((batch_count, height, width), dtype=wp.int32, device=device)
+    faults = wp.zeros(2, dtype=int, device=device)
+    strip_count = _CUDA_STRIPS if device.is_cuda else 1
+    wp.launch(
+        _snap,
+        dim=clip_positions.shape,
+        inputs=[clip_positions, width, height],
+        outputs=[corners, depths, faults],
+        device=device,
+        record_tape=False,
+    )
+    wp.launch(
+        _cover,
+        dim=(batch_count, faces.shape[0], strip_count),
+        inputs=[clip_positions, corners, depths, faces, width, height, strip_count],
+        outputs=[keys, faults],
+        device=device,
+        record_tape=False,
+    )
+    wp.launch(
+        _resolve,
+        dim=keys.size,
+        inputs=[keys.flatten()],
+        outputs=[face_ids.flatten()],
+        device=device,
+        record_tape=False,
+    )
+    if not device.is_capturing:
+        bad_vertex_count, bad_face_count = faults.numpy().tolist()
+        if bad_vertex_count:
+            raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
+        if bad_face_count:
+            raise ValueError(f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}")
+    return face_ids

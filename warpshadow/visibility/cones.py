@@ -1,0 +1,60 @@
+"""The cone of directions that a sphere blocks, as a receiver sees it: on, inside and far from the sphere.
+
+A sphere of radius r at distance D blocks the half-angle θ, sin θ = r/D. Receivers on a mesh lie on and inside the
+spheres that stand in for it, so the rule goes on, C¹, where that formula ends:
+
+    D ≥ 1.01 r      exact, c = cos θ = √(1 − r²/D²)
+    r … 1.01 r      a cubic that meets it in value and slope and takes c to 0 (θ = 90°) with slope 0 at D = r
+    D < r           a hemisphere, c = 0
+    D < r/4         the sphere fades out, since at its center it has no direction
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow.lanes import lane_functions, lane_type
+
+BLEND = 0.01
+"""The exact formula ends at D = (1 + BLEND) r."""
+
+FADE = 0.25
+"""The sphere fades out from D = FADE·r to its center."""
+
+_SINE2 = (1 + BLEND) ** -2  # where the blend begins: sin²θ, cos θ, and d(cos θ)/d(D/r) times the blend's width
+_COSINE = np.sqrt(1 - _SINE2)
+_RISE = BLEND * (1 + BLEND) ** -3 / _COSINE
+
+
+@functools.cache
+def cone_function(lanes: int) -> wp.Function:
+    """Make the kernel function of a group of receivers: the offset to a sphere's center and its radius → its cone.
+
+    It returns lanes of: the direction's x, y, z; cos θ; sin²θ (accurate for tiny spheres, where 1 − cos²θ is not);
+    the weight in [0, 1] that fades the sphere out near its center.
+    """
+    Lane = lane_type(lanes)
+    sqrt = lane_functions(lanes).sqrt
+    SINE2 = wp.constant(float(_SINE2))
+    COSINE = wp.constant(float(_COSINE))
+    RISE = wp.constant(float(_RISE))
+
+    @wp.func
+    def cone(dx: Lane, dy: Lane, dz: Lane, radius: float):
+        distance2 = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
+        distance2 = wp.max(distance2, Lane(1.0e-37))  # a receiver at the center: direction 0, weight 0
+        distance = sqrt(distance2)
+        inverse = wp.cw_div(Lane(1.0), distance)
+        sine2 = wp.min(wp.cw_mul(radius * inverse, radius * inverse), Lane(SINE2))
+        # the blend's cubic is 0 inside the sphere and _COSINE from 1.01 r on, so that sums need no cases
+        t = wp.min(wp.max((distance / radius - Lane(1.0)) / BLEND, Lane(0.0)), Lane(1.0))
+        t2 = wp.cw_mul(t, t)
+        blend = wp.cw_mul(t2, Lane(3.0 * COSINE - RISE) + (RISE - 2.0 * COSINE) * t)
+        cosine = sqrt(Lane(1.0) - sine2) + (blend - Lane(COSINE))
+        sine2 = sine2 + (Lane(COSINE * COSINE) - wp.cw_mul(blend, blend))
+        near = wp.min(distance / (FADE * radius), Lane(1.0))
+        weight = wp.cw_mul(wp.cw_mul(near, near), Lane(3.0) - 2.0 * near)
+        return wp.cw_mul(dx, inverse), wp.cw_mul(dy, inverse), wp.cw_mul(dz, inverse), cosine, sine2, weight
+
+    return cone
