@@ -15,22 +15,24 @@ import numpy as np
 
 
 class ImageError(ValueError):
-    """A picture, or a picture file, that cannot be used; the message says what was found and what is accepted."""
+    """A picture, or a file of one, that cannot be used; the message says what was found and is accepted."""
 
 
 def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
     """Read a picture as linear values.
 
-    OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer that has
-    them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG and JPEG: gray or RGB,
-    with or without alpha, taken for sRGB.
+    OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
+    that has them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG, JPEG:
+    gray or RGB, with or without alpha, taken for sRGB.
 
     Args:
         path: A .exr, .hdr, .pic, .png, .jpg or .jpeg file.
         part: Name or index of the part of a multi-part OpenEXR file; the first by default.
         max_pixels: Refuse larger pictures, judged by the header before any pixel is read.
+
     Returns:
         float32 [height, width, channel] with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGB, alpha) channels.
+
     Raises:
         ImageError: for what is not such a file, is truncated, deep, too large, or has other channels.
         FileNotFoundError: when the file does not exist.
@@ -53,10 +55,11 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
     """Write a picture of linear values; the file appears complete or not at all.
 
     Args:
-        path: A .exr file (float32, ZIP compressed, any values), or a .png, .jpg or .jpeg file (8-bit sRGB; values
-            are clipped to [0, 1], alpha is not sRGB encoded).
-        pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 (RGB, alpha) channels;
-            JPEG has no alpha.
+        path: A .exr file (float32, ZIP compressed, any values), or a .png, .jpg or .jpeg file (8-bit sRGB;
+            values are clipped to [0, 1], alpha is not sRGB encoded).
+        pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 (RGB, alpha)
+            channels; JPEG has no alpha.
+
     Raises:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
     """
@@ -69,7 +72,9 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
-        raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
+        raise ImageError(
+            f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]"
+        )
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
     unfinished.touch()  # a missing folder is an ordinary FileNotFoundError
     try:
@@ -86,7 +91,7 @@ def _check_size(width: int, height: int, max_pixels: int) -> None:
         raise ImageError(f"got {width} x {height} pixels, expected 1 to {max_pixels} (see max_pixels)")
 
 
-# -------------------------------------------------------------------------------------------------------- OpenEXR
+# ---------------------------------------------------------------------------------------------------- OpenEXR
 
 
 def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
@@ -101,11 +106,14 @@ def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray
         raise ImageError("got deep pixels, expected flat ones (scanline or tiled)")
     for candidate in parts:  # the library reads them all
         lower, upper = candidate.header["dataWindow"]
-        _check_size(*(np.subtract(upper, lower, dtype=np.int64) + 1).tolist(), max_pixels)
+        width, height = (np.subtract(upper, lower, dtype=np.int64) + 1).tolist()
+        _check_size(width, height, max_pixels)
     header = {channel.name: channel for channel in parts[chosen].header["channels"]}
     names = _find_channels(list(header))
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in header.values()):
-        raise ImageError(f"got subsampled channels among {', '.join(header)}, expected all at full resolution")
+        raise ImageError(
+            f"got subsampled channels among {', '.join(header)}, expected all at full resolution"
+        )
 
     try:
         complete = OpenEXR.File(str(path), separate_channels=True).parts
@@ -123,11 +131,13 @@ def _find_part(names: list[str], part: str | int | None) -> int:
         return part
     if part in names:
         return names.index(part)
-    raise ImageError(f"got part {part!r}, expected 0 to {len(names) - 1} or one of {', '.join(map(repr, names))}")
+    raise ImageError(
+        f"got part {part!r}, expected 0 to {len(names) - 1} or one of {', '.join(map(repr, names))}"
+    )
 
 
 def _find_channels(names: list[str]) -> list[str]:
-    """Names of the color channels, then alpha, of the unnamed layer or else of the only layer that has color."""
+    """Names of the color channels, then alpha, of the unnamed layer or else of the only one with color."""
     colors = {}
     for layer in {name.rpartition(".")[0] for name in names}:
         prefix = f"{layer}." if layer else ""
@@ -139,7 +149,8 @@ def _find_channels(names: list[str]) -> list[str]:
     if len(colors) == 1:
         return colors.popitem()[1]
     raise ImageError(
-        f"got channels {', '.join(names)} ({len(colors)} layers with color), expected R, G, B or Y, in one layer"
+        f"got channels {', '.join(names)} ({len(colors)} layers with color), "
+        "expected R, G, B or Y, in one layer"
     )
 
 
@@ -151,13 +162,13 @@ def _write_exr(path: Path, pixels: np.ndarray) -> None:
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels}).write(str(path))
 
 
-# ------------------------------------------------------------------------------------------------------- Radiance
+# --------------------------------------------------------------------------------------------------- Radiance
 
 _RESOLUTION = re.compile(rb"([+-])([XY]) +(\d+) +([+-])([XY]) +(\d+)\s*")
 
 
-def _read_radiance(path: Path, part: None, max_pixels: int) -> np.ndarray:
-    """Read RGBE: Ward, "Real Pixels", Graphics Gems II, and the file format notes of the Radiance distribution."""
+def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    """Read RGBE: Ward, "Real Pixels", Graphics Gems II, and the file format notes of Radiance."""
     with path.open("rb") as file:
         if not file.readline(80).startswith((b"#?RADIANCE", b"#?RGBE")):
             raise ImageError("not a Radiance file: it does not start with #?RADIANCE or #?RGBE")
@@ -165,7 +176,9 @@ def _read_radiance(path: Path, part: None, max_pixels: int) -> np.ndarray:
         while line := file.readline(4096).strip():
             key, _, value = line.partition(b"=")
             if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-                raise ImageError(f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe")
+                raise ImageError(
+                    f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe"
+                )
             if key in (b"EXPOSURE", b"COLORCORR"):  # the product of all, already multiplied into the pixels
                 exposure *= _positive_numbers(key, value)
         resolution = _RESOLUTION.fullmatch(line := file.readline(80))
@@ -196,11 +209,15 @@ def _positive_numbers(key: bytes, value: bytes) -> np.ndarray:
 
 
 def _decode_rgbe(data: bytes, line_count: int, width: int) -> np.ndarray:
-    """Decode scanlines, each flat or run-length encoded in the old or new style, to uint8 [line, pixel, 4]."""
+    """Decode scanlines, each flat or run-length encoded in the old or new way, to uint8 [line, pixel, 4]."""
     lines = np.empty((line_count, width, 4), dtype=np.uint8)
     start = 0
     for line in range(line_count):
-        is_new_style = 8 <= width < 32768 and data[start : start + 2] == b"\2\2" and data[start + 2 : start + 3] < b"\x80"
+        is_new_style = (
+            8 <= width < 32768
+            and data[start : start + 2] == b"\2\2"
+            and data[start + 2 : start + 3] < b"\x80"
+        )
         decode = _decode_planes if is_new_style else _decode_pixels
         try:
             lines[line], start = decode(data, start, width)
@@ -227,7 +244,7 @@ def _decode_planes(data: bytes, start: int, width: int) -> tuple[np.ndarray, int
 
 
 def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int]:
-    """Decode a flat or old-style line: (1, 1, 1, n) repeats the pixel before, n 256 times more for each in a row."""
+    """Decode a flat or old-style line: (1, 1, 1, n) repeats a pixel n times, a second in a row 256 n."""
     pixels = np.frombuffer(data, dtype=np.uint8, offset=start, count=min(width, (len(data) - start) // 4) * 4)
     pixels = pixels.reshape(-1, 4)
     index = np.arange(len(pixels))
@@ -241,7 +258,7 @@ def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int
     return pixels[np.repeat(source[:used], counts[:used])], start + 4 * used
 
 
-# --------------------------------------------------------------------------------------------------- PNG and JPEG
+# ----------------------------------------------------------------------------------------------- PNG and JPEG
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -251,10 +268,12 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode linear values in [0, 1] as sRGB (IEC 61966-2-1), in the precision of the argument."""
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    )
 
 
-def _read_pillow(path: Path, part: None, max_pixels: int) -> np.ndarray:
+def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
     from PIL import Image
 
     try:
@@ -310,7 +329,10 @@ def _write_pillow(path: Path, pixels: np.ndarray) -> None:
     encoded[..., :3] = linear_to_srgb(encoded[..., :3])
     codes = np.floor(encoded * 255 + 0.5).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
-    picture.save(path, **({"quality": 95, "subsampling": 0} if is_jpeg else {}))
+    if is_jpeg:
+        picture.save(path, quality=95, subsampling=0)
+    else:
+        picture.save(path)
 
 
 _READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {

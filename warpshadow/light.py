@@ -4,7 +4,7 @@ Pixel (row, col) of a map of H × 2H looks along θ = π(row+½)/H, φ = 2π(col
 
     d = (sin φ sin θ, cos θ, −cos φ sin θ),
 
-in a right-handed world with y up: the center of the map is +z, and a quarter further left is +x (Mitsuba's convention).
+in a right-handed world with y up (Mitsuba's convention): the center of the map is +z, the left quarter +x.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 
 
 
 class CellMoments(NamedTuple):
-    """Where in its cell the light comes from: mean directions [direction, 3] and spreads [radians], [direction]."""
+    """Where in a cell light comes from: mean directions [direction, 3] and spreads [direction] in radians."""
 
     directions: np.ndarray
     spreads: np.ndarray
@@ -38,6 +38,7 @@ class EnvironmentMap:
 
     Args:
         radiance: Linear RGB, finite and not negative, float32, shape [height, 2·height, 3].
+
     Raises:
         ImageError: for another shape or aspect, or NaN, Inf or negative values.
     """
@@ -53,8 +54,8 @@ class EnvironmentMap:
         if bad.any():
             row, col, channel = np.argwhere(bad)[0]
             raise ImageError(
-                f"radiance: got {bad.sum()} NaN, Inf or negative values (first at row {row}, column {col}, channel "
-                f"{channel}: {radiance[row, col, channel]}), expected finite values of 0 or more; "
+                f"radiance: got {bad.sum()} NaN, Inf or negative values (first at row {row}, column {col}, "
+                f"channel {channel}: {radiance[row, col, channel]}), expected finite values of 0 or more; "
                 "sanitize='zero' or 'neighbors' repairs them on reading"
             )
         radiance.setflags(write=False)
@@ -73,13 +74,14 @@ class EnvironmentMap:
 
         Args:
             path: An .exr or .hdr file, or any other that :func:`warpshadow.image.read_image` reads.
-            sanitize: What becomes of NaN, Inf and negative values: None raises, "zero" makes them 0, "neighbors" the
-                mean of the good values of the channel among the eight pixels around, spreading inward.
+            sanitize: What becomes of NaN, Inf and negative values: None raises, "zero" makes them 0,
+                "neighbors" the mean of the good values among the eight pixels around, spreading inward.
             part: Name or index of the part of a multi-part OpenEXR file.
-            convention: Which way the center of the file looks and, in a right-handed world with y up, the right quarter:
+            convention: Where the center of the file and its right quarter look, in a world with y up:
                 "mitsuba", "openexr" and "usd" (DomeLight): +z, then -x;
                 "blender" (exported with y up) and "three.js": +x, then +z;
                 "debevec" (light probe gallery, HDRShop): -z, then +x.
+
         Raises:
             ImageError: for what is not a usable map; cube maps are named as such.
         """
@@ -103,7 +105,9 @@ class EnvironmentMap:
     def write(self, path: str | Path) -> None:
         """Write an OpenEXR file of float32 RGB."""
         if Path(path).suffix.lower() != ".exr":
-            raise ImageError(f"{path}: got extension {Path(path).suffix!r}, expected .exr, which holds radiance unclipped")
+            raise ImageError(
+                f"{path}: got extension {Path(path).suffix!r}, expected .exr, which holds radiance unclipped"
+            )
         write_image(path, self.radiance)
 
     def rotated(self, degrees: float) -> EnvironmentMap:
@@ -111,7 +115,7 @@ class EnvironmentMap:
 
         Whole pixels are exact; between them columns are interpolated linearly. Either way the energy is kept.
         """
-        check.finite("degrees", np.float64(degrees))
+        check.finite("degrees", np.asarray(degrees, np.float64))
         width = self.radiance.shape[1]
         shift = -degrees / 360 * width % width
         if abs(shift - round(shift)) < 1e-6:  # 90 degrees computed from an angle are still whole pixels
@@ -150,8 +154,8 @@ class EnvironmentMap:
 
             L_q = Q/4π ∫_cell L dω,    so that Σ_q (4π/Q) L_q = ∫ L dω
 
-        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
-        much smaller than a cell are split.
+        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that
+        are not much smaller than a cell are split.
 
         Args:
             directions: Unit vectors, shape [direction, 3].
@@ -169,9 +173,9 @@ class EnvironmentMap:
             directions: Unit vectors, shape [direction, 3].
 
         Returns:
-            Per cell the mean direction, weighted with luminance, and its spread: the half-angle of the evenly bright
-            cap whose mean vector is as long, so 0 for a point and about 2/√Q for an evenly bright cell. A dark cell
-            gets its own direction and the spread of a cap of 4π/Q.
+            Per cell the mean direction, weighted with luminance, and its spread: the half-angle of the evenly
+            bright cap whose mean vector is as long, so 0 for a point and about 2/√Q for an even cell. A dark
+            cell gets its own direction and the spread of a cap of 4π/Q.
         """
         energy, moment = self._cell_integrals(directions)
         power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
@@ -200,7 +204,7 @@ class EnvironmentMap:
         return integrals[:3].T, integrals[3:].T
 
     def statistics(self) -> dict[str, object]:
-        """Measure the map, in plain numbers: radiance (mean over the sphere), its integral, and how peaked it is."""
+        """Measure the radiance (mean over the sphere), its integral and its peak, in plain numbers."""
         height, width, _ = self.radiance.shape
         weights = np.repeat(self.solid_angles(), width)
         pixels = self.radiance.reshape(-1, 3).astype(np.float64)
@@ -226,12 +230,12 @@ def _check_aspect(pixels: np.ndarray) -> None:
         raise ImageError(f"radiance: got shape {pixels.shape}, expected [height, 2·height, 3]")
     height, width, _ = pixels.shape
     if width != 2 * height:
-        is_cube = (width, height) in [(width, 6 * width), (6 * height, height)] or 3 * max(pixels.shape) == 4 * min(
-            width, height
-        )
+        faces_or_crosses = [(6, 1), (1, 6), (4, 3), (3, 4)]
+        is_cube = any(width * down == height * across for across, down in faces_or_crosses)
         cube = ", which looks like a cube map" if is_cube else ""
         raise ImageError(
-            f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
+            f"radiance: got {width} x {height} pixels{cube}, "
+            "expected an equirectangular map, twice as wide as high"
         )
 
 
@@ -246,7 +250,9 @@ def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
     if how == "zero" or not bad.any():
         return values
     if bad.all(axis=(0, 1)).any():
-        raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
+        raise ImageError(
+            "radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by"
+        )
     good = (~bad).astype(np.float32)
     while (good == 0).any():
         total, count = _around(values * good), _around(good)
@@ -263,7 +269,7 @@ def _around(image: np.ndarray) -> np.ndarray:
     return padded[:-2] + padded[1:-1] + padded[2:]
 
 
-# ---------------------------------------------------------------------------------------------- maps from a formula
+# ---------------------------------------------------------------------------------------- maps from a formula
 
 
 def draw_test_map(height: int = 256) -> EnvironmentMap:
@@ -274,16 +280,26 @@ def draw_test_map(height: int = 256) -> EnvironmentMap:
     towards = sh.equirectangular_directions(height)
     axis = np.abs(towards).argmax(axis=-1)
     negative = np.take_along_axis(towards, axis[..., None], axis=-1)[..., 0] < 0
-    colors = np.array([[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]])
+    colors = np.array(
+        [[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]]
+    )
     picture = Image.fromarray(colors[axis, negative.astype(int)].astype(np.uint8))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=height / 7)
     for step in range(24):
         draw.line([(step * width / 24, 0), (step * width / 24, height)], fill=(60, 60, 60))
         draw.line([(0, step * height / 12), (width, step * height / 12)], fill=(60, 60, 60))
-    labels = [("−Z", 0, 0.5), ("+X", 0.25, 0.5), ("+Z", 0.5, 0.5), ("−X", 0.75, 0.5), ("−Z", 1, 0.5)]
-    labels += [(text, quarter / 4, row) for text, row in (("+Y", 0.09), ("−Y", 0.91)) for quarter in range(5)]
+    labels = [("-Z", 0, 0.5), ("+X", 0.25, 0.5), ("+Z", 0.5, 0.5), ("-X", 0.75, 0.5), ("-Z", 1, 0.5)]
+    labels += [(text, quarter / 4, row) for text, row in (("+Y", 0.09), ("-Y", 0.91)) for quarter in range(5)]
     for text, u, v in labels:
-        draw.text((u * width, v * height), text, fill="white", font=font, anchor="mm", stroke_width=2, stroke_fill="black")
+        draw.text(
+            (u * width, v * height),
+            text,
+            fill="white",
+            font=font,
+            anchor="mm",
+            stroke_width=2,
+            stroke_fill="black",
+        )
     return EnvironmentMap(srgb_to_linear(np.asarray(picture) / 255))
 
 
@@ -297,9 +313,9 @@ def synthetic_sky(
 ) -> EnvironmentMap:
     """Make a clear daylight sky with a sun, over a diffuse ground.
 
-    The unit is what the sky alone does: its irradiance on the ground is π in luminance, so white ground looks 1. The sky
-    is the CIE standard clear sky (ISO 15469, type 12), blue with a pale haze at the horizon; the sun reddens as it
-    sinks. The ground has the radiance that the sky and the sun give it.
+    The unit is what the sky alone does: its irradiance on the ground is π in luminance; white ground looks 1.
+    The sky is the CIE standard clear sky (ISO 15469, type 12), blue with a pale haze at the horizon; the sun
+    reddens as it sinks. The ground is as bright as sky and sun make it, and fades into the haze.
 
     Args:
         sun_direction: Direction to the sun, of any length, shape [3]; below the horizon there is no sun.
@@ -322,7 +338,7 @@ def synthetic_sky(
     glow = 1 + 10 * (np.exp(-3 * sun_angle) - np.exp(-1.5 * np.pi)) + 0.45 * np.cos(sun_angle) ** 2
     gradation = 1 - np.exp(-0.32 / np.maximum(up, 1e-3))
     haze = np.exp(-5 * np.maximum(up, 0))[..., None]
-    near_sun = haze * np.exp(-2 * sun_angle)[..., None]
+    near_sun = np.exp(-3 * sun_angle)[..., None]
     color = (1 - haze) * _chroma([0.22, 0.45, 1.0]) + haze * _chroma([0.75, 0.88, 1.0])
     color = (1 - near_sun) * color + near_sun * sun_color
     sky = (above * glow * gradation)[..., None] * color
@@ -334,8 +350,10 @@ def synthetic_sky(
     disc *= above * np.pi * sun_strength / np.sum(disc * weights)
 
     on_ground = np.pi + np.sum(disc * np.maximum(up, 0) * weights) * sun_color
-    ground = np.where(above[..., None], 0, ground_albedo / np.pi * on_ground)
-    return EnvironmentMap(sky + disc[..., None] * sun_color + ground)
+    distance_haze = np.exp(np.minimum(20 * up, 0))[..., None]
+    horizon = sky[height // 2 - 1]
+    ground = (1 - distance_haze) * (ground_albedo / np.pi * on_ground) + distance_haze * horizon
+    return EnvironmentMap(np.where(above[..., None], sky + disc[..., None] * sun_color, ground))
 
 
 def _chroma(rgb: Sequence[float]) -> np.ndarray:
@@ -347,4 +365,6 @@ def _sunlight(elevation_sine: float) -> np.ndarray:
     """Color of the sun through the air mass of Kasten and Young (1989), at luminance 1."""
     degrees = np.degrees(np.arcsin(elevation_sine))
     air_mass = 1 / (elevation_sine + 0.50572 * (degrees + 6.07995) ** -1.6364)
-    return _chroma(np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass))  # Rayleigh at 610, 550, 465 nm and thin haze
+    return _chroma(
+        np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass)
+    )  # Rayleigh at 610, 550, 465 nm and thin haze

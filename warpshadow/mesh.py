@@ -1,7 +1,8 @@
 """Triangle meshes: files, primitives and vertex normals.
 
-Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals. Vertices
-keep the order they have in the file. Texture coordinates have their origin at the lower left of the image, v up.
+Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals.
+Vertices keep the order they have in the file. Texture coordinates have their origin at the lower left of the
+image, v up.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +35,7 @@ class Mesh:
         uvs: Texture coordinates, origin at the lower left of the image, float32, shape [uv, 2], or None.
         uv_faces: Indices of uvs, int32, shape [face, 3], or None.
         name: What messages call the mesh.
+
     Raises:
         MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
     """
@@ -48,14 +50,14 @@ class Mesh:
         """Copy, convert and validate the arrays."""
         self._set("positions", _coordinates("positions", self.positions, 3, "vertex"))
         self._set("faces", _indices("faces", self.faces, len(self.positions), "vertex"))
-        if (self.uvs is None) != (self.uv_faces is None):
-            given, missing = ("uv_faces", "uvs") if self.uvs is None else ("uvs", "uv_faces")
-            raise MeshError(f"{missing}: got None although {given} are given, expected both or neither")
-        if self.uvs is not None:
+        if self.uvs is not None and self.uv_faces is not None:
             self._set("uvs", _coordinates("uvs", self.uvs, 2, "uv"))
             self._set("uv_faces", _indices("uv_faces", self.uv_faces, len(self.uvs), "uv"))
-            if len(self.uv_faces) != len(self.faces):
-                raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {len(self.faces)}, one for each face")
+            if len(self.uv_faces) != self.face_count:
+                raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
+        elif self.uvs is not self.uv_faces:
+            missing = "uvs" if self.uvs is None else "uv_faces"
+            raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
 
     def _set(self, name: str, array: np.ndarray) -> None:
         array.setflags(write=False)
@@ -82,7 +84,7 @@ class Mesh:
         """SHA-256 of the arrays, in hexadecimal; the name does not count."""
         digest = hashlib.sha256()
         for array in (self.positions, self.faces, self.uvs, self.uv_faces):
-            digest.update(b"none" if array is None else str(array.shape).encode() + array.tobytes())
+            digest.update(b"none" if array is None else f"{array.shape}".encode() + array.tobytes())
         return digest.hexdigest()
 
     def transformed(
@@ -98,6 +100,7 @@ class Mesh:
             rotation: Matrix that multiplies column vectors, shape [3, 3]; the identity by default.
             translation: Offset [scene units], shape [3]; none by default.
             scale: One factor, or one for each axis, shape [3].
+
         Returns:
             A new mesh with the same uvs and name.
         """
@@ -129,12 +132,14 @@ def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.nda
     with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
         values = np.array(values, dtype=np.float32, order="C")
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
-        raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
+        raise MeshError(
+            f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}"
+        )
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise MeshError(
-            f"{name}: got NaN or Inf at {len(bad)} of {len(values)} (first at {item} {bad[0]}: {values[bad[0]].tolist()}), "
-            "expected finite float32 numbers"
+            f"{name}: got NaN or Inf at {len(bad)} of {len(values)} "
+            f"(first at {item} {bad[0]}: {values[bad[0]].tolist()}), expected finite float32 numbers"
         )
     return values
 
@@ -150,13 +155,13 @@ def _indices(name: str, faces: np.ndarray, count: int, item: str) -> np.ndarray:
     if len(bad):
         face, corner = bad[0]
         raise MeshError(
-            f"{name}: got {len(bad)} indices out of range (first at face {face}: {item} {faces[face, corner]}), "
-            f"expected 0 to {count - 1}"
+            f"{name}: got {len(bad)} indices out of range "
+            f"(first at face {face}: {item} {faces[face, corner]}), expected 0 to {count - 1}"
         )
     return np.array(faces, dtype=np.int32, order="C")
 
 
-# ---------------------------------------------------------------------------------------------------------- files
+# ------------------------------------------------------------------------------------------------------ files
 
 
 class _Part(NamedTuple):
@@ -173,23 +178,26 @@ class _Part(NamedTuple):
 def load_mesh(path: str | Path) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file as one mesh.
 
-    Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes of a
-    scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), vertices that are duplicated
-    only for a uv (same position, and same normal where the file stores normals) share the first one's faces, so
-    that a seam does not break the shading; files without uvs are taken as they are. A USD stage is read at its
-    earliest time, with z-up turned to y-up; subdivision surfaces are read as their control cage. uvs are kept only
-    when every face has them.
+    Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes
+    of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), faces refer
+    to the first of the vertices that are duplicated only for their uvs (same position, and same normal where
+    the file stores normals), so that a seam does not break the shading; without uvs they stay as they are.
+    A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
+    uvs are kept only when every face has them.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
+
     Returns:
         The mesh, named after the file.
+
     Raises:
         MeshError: for what is not such a file, or holds no usable triangles.
         FileNotFoundError: when the file does not exist.
         ImportError: for USD without the package usd-core.
+
     Warns:
-        Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and when uvs are dropped.
+        Once, with the counts of degenerate faces, duplicate faces, unreferenced vertices, and dropped uvs.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -198,12 +206,13 @@ def load_mesh(path: str | Path) -> Mesh:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     try:
-        parts = [part for part in reader(path) if len(part.positions)]
-        mesh, remarks = _concatenate(parts, path.stem)
+        mesh, remarks = _concatenate(reader(path), path.stem)
     except (MeshError, ImportError) as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # the readers of other libraries raise anything on a damaged file
-        raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
+        raise MeshError(
+            f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})"
+        ) from error
     if remarks:
         warnings.warn(f"{path}: {', '.join(remarks)}", stacklevel=2)
     return mesh
@@ -211,15 +220,14 @@ def load_mesh(path: str | Path) -> Mesh:
 
 def _concatenate(parts: list[_Part], name: str) -> tuple[Mesh, list[str]]:
     """Join parts into one mesh and remark on what may surprise."""
-    if not any(len(part.faces) for part in parts):
-        raise MeshError(
-            f"faces: got none ({sum(len(part.positions) for part in parts)} vertices), expected at least one triangle"
-        )
-    textured = [part.uvs is not None for part in parts]
-    uvs = uv_faces = None
-    if all(textured):
-        uvs, uv_faces = _stack([part.uvs for part in parts], [part.uv_faces for part in parts])
-    mesh = Mesh(*_stack([part.positions for part in parts], [part.faces for part in parts]), uvs, uv_faces, name)
+    vertex_count = sum(len(part.positions) for part in parts)
+    parts = [part for part in parts if len(part.faces)]
+    if not parts:
+        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle")
+    positions, faces = _stack((part.positions, part.faces) for part in parts)
+    textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
+    uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
+    mesh = Mesh(positions, faces, uvs, uv_faces, name)
 
     a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
     counts = {
@@ -231,15 +239,17 @@ def _concatenate(parts: list[_Part], name: str) -> tuple[Mesh, list[str]]:
     }
     remarks = [f"{count} {what}" for what, count in counts.items() if count]
     remarks += [part.remark for part in parts if part.remark]
-    if any(textured) and not all(textured):
-        remarks.append(f"uvs dropped because {textured.count(False)} of {len(parts)} parts have none")
+    if 0 < len(textured) < len(parts):
+        remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
     return mesh, remarks
 
 
-def _stack(values: list[np.ndarray], faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Concatenate values, and faces with their indices moved along."""
+def _stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate pairs of values and faces; the faces' indices move along."""
+    values, faces = zip(*blocks, strict=True)
     offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
-    return np.concatenate(values), np.concatenate([f + offset for f, offset in zip(faces, offsets, strict=True)])
+    moved = [block + offset for block, offset in zip(faces, offsets, strict=True)]
+    return np.concatenate(values), np.concatenate(moved)
 
 
 def _move(part: _Part, linear: np.ndarray, translation: np.ndarray) -> _Part:
@@ -337,14 +347,14 @@ def _trimesh_part(shape) -> _Part:
     uvs = getattr(shape.visual, "uv", None)
     if uvs is None:
         return _Part(positions, faces)
-    # Normals in the cache come from the file; `shape.vertex_normals` would compute missing ones, which differ at seams.
+    # Normals in the cache are the file's; shape.vertex_normals computes missing ones, which differ at seams.
     normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
     welded = _weld(faces, positions, *normals)
     return _Part(positions, welded, uvs, faces, len(np.unique(faces)) - len(np.unique(welded)))
 
 
 def _ply_corner_uvs(shape) -> np.ndarray | None:
-    """The uvs [corner, 2] of a PLY file that stores them with faces, which trimesh would average over vertices."""
+    """The uvs [corner, 2] of a PLY file that stores them with faces; trimesh gives each vertex only one."""
     data = shape.metadata.get("_ply_raw", {}).get("face", {}).get("data", {})
     names = data.dtype.names or () if isinstance(data, np.ndarray) else data
     if "texcoord" not in names:
@@ -385,7 +395,9 @@ def _usd_part(mesh, primvars, time) -> _Part:
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], dtype=np.int64)
     corner_counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
     if corner_counts.sum() != len(corners):
-        raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
+        raise MeshError(
+            f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts"
+        )
     faces = _fan(corner_counts)
     part = _Part(positions, corners[faces])
     st = primvars.GetPrimvar("st")
@@ -404,7 +416,7 @@ _READERS: dict[str, Callable[[Path], list[_Part]]] = {
 }
 
 
-# ----------------------------------------------------------------------------------------------------- primitives
+# ------------------------------------------------------------------------------------------------- primitives
 
 
 def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, int] = 64) -> Mesh:
@@ -413,6 +425,7 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     Args:
         size: Edge length along x and z [scene units], one for both or a pair.
         segments: Quads along x and z, one count for both or a pair; each quad is two triangles.
+
     Returns:
         The mesh; u runs along +x, v along -z, both from 0 to 1.
     """
@@ -424,7 +437,9 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
         raise MeshError(f"segments: got {segments}, expected positive integers")
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
-    positions = np.stack([(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1)
+    positions = np.stack(
+        [(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1
+    )
     corner = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
@@ -447,7 +462,13 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
     corners = np.array([(0, y, z * golden) for y in (-1, 1) for z in (-1, 1)])
     positions = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
     near = np.isclose(np.linalg.norm(positions[:, None] - positions, axis=-1), 2)
-    triples = [(a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]]
+    triples = [
+        (a, b, c)
+        for a in range(12)
+        for b in range(a)
+        for c in range(b)
+        if near[a, b] and near[b, c] and near[a, c]
+    ]
     faces = np.array([t if np.linalg.det(positions[list(t)]) > 0 else t[::-1] for t in triples])
     for _ in range(subdivisions):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
@@ -457,10 +478,12 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
         positions = np.concatenate([positions, positions[edges].mean(axis=1)])
         faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
         positions /= np.linalg.norm(positions, axis=1, keepdims=True)
-    return Mesh(positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere")
+    return Mesh(
+        positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere"
+    )
 
 
-# -------------------------------------------------------------------------------------------------------- normals
+# ---------------------------------------------------------------------------------------------------- normals
 
 
 @wp.kernel
@@ -498,13 +521,15 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
 
         n_v = normalize(Σ_{faces at v} (x_j − x_i) × (x_k − x_i))
 
-    On a GPU the sum's order, so its last bits, may differ between runs unless ``wp.config.deterministic`` asks otherwise.
+    On a GPU the order of the sum, so its last bits, may differ between runs; see ``wp.config.deterministic``.
 
     Args:
         positions: Vertex positions [scene units], vec3, shape [batch, vertex].
         faces: Vertex indices, counter-clockwise seen from outside, vec3i, shape [face].
+
     Returns:
         Normals, vec3, shape [batch, vertex]; zero where the faces have no area or the vertex has no face.
+
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
     device, requires_grad = positions.device, positions.requires_grad

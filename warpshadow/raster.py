@@ -29,9 +29,6 @@ _WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind
 # Boxes at least this wide have each row trimmed to the span inside the edges; below, testing every pixel is faster.
 _TRIM_WIDTH = 8
 
-# On CUDA the rows of a face are dealt to this many threads, so that no thread draws a huge face alone.
-_CUDA_STRIPS = 16
-
 _INT32_MASK = (1 << 32) - 1
 
 _Edge = wp.types.vector(length=3, dtype=wp.int64)
@@ -361,10 +358,8 @@ def _barycentrics(
         b = clip_positions[instance, corners[1]]
         c = clip_positions[instance, corners[2]]
         row = pixel / width
-        column = pixel - row * width
-        row -= instance * height
-        x = float(2 * column + 1) / float(width) - 1.0
-        y = float(2 * row + 1) / float(height) - 1.0
+        x = float(2 * (pixel - row * width) + 1 - width) * (1.0 / float(width))
+        y = float(2 * (row - instance * height) + 1 - height) * (1.0 / float(height))
         ax = a[0] - x * a[3]
         ay = a[1] - y * a[3]
         bx = b[0] - x * b[3]
@@ -374,14 +369,15 @@ def _barycentrics(
         volume_a = bx * cy - by * cx
         volume_b = cx * ay - cy * ax
         volume_c = ax * by - ay * bx
-        # A center may lie outside of the face by what the vertices moved when they snapped.
+        # A center may lie outside of the face by what the vertices moved when they snapped. On an edge, where a weight is
+        # 0, the derivative is to pass: wp.max gives it to its second argument.
         side = wp.sign(volume_a + volume_b + volume_c)
-        weight_a = wp.max(side * volume_a, 0.0)
-        weight_b = wp.max(side * volume_b, 0.0)
-        weight_c = wp.max(side * volume_c, 0.0)
+        weight_a = wp.max(0.0, side * volume_a)
+        weight_b = wp.max(0.0, side * volume_b)
+        weight_c = wp.max(0.0, side * volume_c)
         total = weight_a + weight_b + weight_c
         if total > 0.0:
-            barycentrics[pixel] = wp.vec3(weight_a / total, weight_b / total, weight_c / total)
+            barycentrics[pixel] = (1.0 / total) * wp.vec3(weight_a, weight_b, weight_c)
         else:
             # Edge-on, drawn only because its vertices snapped.
             barycentrics[pixel] = wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
@@ -520,7 +516,7 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     keys = wp.zeros((batch_count, height, width), dtype=wp.int64, device=device)
     face_ids = wp.empty((batch_count, height, width), dtype=wp.int32, device=device)
     faults = wp.zeros(2, dtype=int, device=device)
-    strip_count = _CUDA_STRIPS if device.is_cuda else 1
+    strip_count = _strip_count(device)
     wp.launch(
         _snap,
         dim=clip_positions.shape,
@@ -552,3 +548,8 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         if bad_face_count:
             raise ValueError(f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}")
     return face_ids
+
+
+def _strip_count(device: wp.Device) -> int:
+    """Threads among which the rows of a face are dealt: on CUDA several, so that none draws a huge face alone."""
+    return 16 if device.is_cuda else 1

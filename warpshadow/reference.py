@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
-from warpshadow import check
+from warpshadow import check, sh
+from warpshadow.basis import Basis
+from warpshadow.directions import CHUNK, fibonacci
+
+
+def ray_offset(mesh: wp.Mesh) -> float:
+    """Start of rays above a receiver that keeps a mesh from blocking itself: 1e-4 of the diagonal of its bounds."""
+    corners = mesh.points.numpy()
+    return 1e-4 * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
 
 
 @wp.kernel(enable_backward=False)
@@ -60,8 +71,7 @@ def trace_visibility(
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
     if offset is None:
-        corners = mesh.points.numpy()
-        offset = 1e-4 * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+        offset = ray_offset(mesh)
     if not (np.isfinite(offset) and offset >= 0.0):
         raise ValueError(f"offset: got {offset!r}, expected a finite length that is not negative")
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
@@ -73,3 +83,167 @@ def trace_visibility(
         device=points.device,
     )
     return visibility
+
+
+# ---------------------------------------------------------------------------------------------- shading by rays
+
+SET_COUNT = 16
+"""Independent sets of directions; neighboring receivers take different ones, so that error is noise, not bands."""
+
+_UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
+
+
+class LightSamples(NamedTuple):
+    """Directions drawn from light, in sets that are stratified each by itself.
+
+    Args:
+        directions: Unit vectors, shape [set, sample, 3].
+        radiance: Radiance over (probability density · number of samples), shape [set, sample, 3].
+    """
+
+    directions: np.ndarray
+    radiance: np.ndarray
+
+
+def sample_map(radiance: np.ndarray, count: int, *, seed: int = 0) -> LightSamples:
+    """Draw directions from an equirectangular map, about in proportion to luminance.
+
+    Args:
+        radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
+        count: Number of directions of each set.
+        seed: Of the shifts that make the sets differ.
+    """
+    height, width, _ = radiance.shape
+    solid_angle = np.repeat(sh.pixel_solid_angles(height)[:, None], width, axis=1)
+    brightness = np.abs(radiance).mean(axis=2) * solid_angle
+    probability = _UNIFORM_SHARE * solid_angle / (4 * np.pi)
+    if brightness.any():
+        probability += (1 - _UNIFORM_SHARE) * brightness / brightness.sum()
+    probability /= probability.sum()
+
+    # a low-discrepancy sequence (Roberts' R2), shifted for each set, through the inverse of the distribution function
+    ratio = 1.32471795724474602596
+    shifts = np.random.default_rng(seed).random((SET_COUNT, 1, 2))
+    points = (shifts + np.arange(1, count + 1)[:, None] / np.array([ratio, ratio**2])) % 1
+    rows, v = _invert(np.cumsum(probability.sum(axis=1)), points[..., 0])
+    conditional = np.cumsum(probability, axis=1)
+    conditional /= conditional[:, -1:]
+    flat, u = _invert((conditional + np.arange(height)[:, None]).ravel(), points[..., 1] + rows)
+    columns = flat - rows * width
+    drawn = radiance[rows, columns] * (solid_angle / (count * probability))[rows, columns, None]
+    return LightSamples(_map_directions(rows + v, columns + u, height), drawn)
+
+
+def _invert(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Interval of a rising distribution function that each value falls into, and where in it, from 0 to 1."""
+    index = np.minimum(np.searchsorted(distribution, values, side="right"), len(distribution) - 1)
+    start = np.where(index > 0, distribution[index - 1], 0.0)
+    return index, np.clip((values - start) / np.maximum(distribution[index] - start, 1e-300), 0, 1)
+
+
+def _map_directions(rows: np.ndarray, columns: np.ndarray, height: int) -> np.ndarray:
+    """Directions of positions in an equirectangular map, the first pixel spanning 0 to 1."""
+    theta, phi = np.pi * rows / height, np.pi * columns / height
+    return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
+
+
+@wp.kernel(enable_backward=False)
+def _trace_shading(
+    # in
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    offset: float,
+    directions: wp.array2d[wp.vec3],
+    radiance: wp.array2d[wp.vec3],
+    # out
+    shading: wp.array[wp.vec3],
+):
+    """A thread owns a receiver."""
+    receiver = wp.tid()
+    chosen = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
+    normal = normals[receiver]
+    start = points[receiver] + offset * normal
+    total = wp.vec3()
+    for sample in range(directions.shape[1]):
+        toward = directions[chosen, sample]
+        cosine = wp.dot(normal, toward)
+        if cosine > 0.0:
+            if not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
+                total += cosine * radiance[chosen, sample]
+    shading[receiver] = total / wp.pi
+
+
+def trace_shading(
+    mesh: wp.Mesh, points: wp.array, normals: wp.array, samples: LightSamples, *, progress: bool = False
+) -> wp.array:
+    """Trace the shading of receivers: the radiance of a white surface, single bounce, as a path tracer gives it.
+
+    Args:
+        mesh: What blocks the light.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        samples: Directions drawn from the light.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        Shading, vec3 of shape [receiver].
+
+    Differentiable: no.
+    """
+    device = points.device
+    directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
+    radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
+    shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+        wp.launch(
+            _trace_shading,
+            dim=part.stop - part.start,
+            inputs=[mesh.id, points[part], normals[part], ray_offset(mesh), directions, radiance],
+            outputs=[shading[part]],
+            device=device,
+        )
+    return shading
+
+
+def trace_transfer(
+    mesh: wp.Mesh, points: wp.array, normals: wp.array, basis: Basis, count: int, *, progress: bool = False
+) -> wp.array:
+    """Trace transfer vectors: light of the basis is then shadowed by the mesh itself, exactly but for sampling.
+
+    Args:
+        mesh: What blocks the light.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        basis: What the light is expressed in.
+        count: Number of directions, evenly over the sphere.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        Transfer vectors, float32 of shape [receiver, coefficient].
+
+    Differentiable: no.
+    """
+    directions = fibonacci(-(-count // CHUNK) * CHUNK)
+    towards = wp.array(directions, dtype=wp.vec3, device=points.device)
+    functions = (4 / len(directions) * basis.functions(directions)).astype(np.float32)
+    transfer = np.empty((points.shape[0], basis.size), np.float32)
+    for part in _parts(points.shape[0], 2**22 // len(directions), progress):
+        visibility = trace_visibility(
+            mesh, points[part].reshape((1, -1)), normals[part].reshape((1, -1)), towards, offset=ray_offset(mesh)
+        )
+        cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
+        transfer[part] = (visibility.numpy()[0] * cosine) @ functions
+    return wp.array(transfer, device=points.device)
+
+
+def _parts(total: int, size: int, progress: bool) -> Iterator[slice]:
+    """Cut a range into slices of at most ``size``, with a progress bar over them."""
+    from tqdm import tqdm
+
+    size = max(size, 1)
+    with tqdm(total=total, desc="tracing rays", unit="point", delay=1, disable=not progress) as bar:
+        for start in range(0, total, size):
+            stop = min(start + size, total)
+            yield slice(start, stop)
+            bar.update(stop - start)

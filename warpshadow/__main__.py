@@ -1,0 +1,5 @@
+"""``python -m warpshadow``."""
+
+from warpshadow.cli import app
+
+app(prog_name="warpshadow")

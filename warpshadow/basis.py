@@ -1,0 +1,60 @@
+"""What light is expressed in: spherical harmonics or cells of directions. Transfer vectors belong to one of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpshadow import sh
+from warpshadow.light import EnvironmentMap
+
+
+@dataclass(frozen=True)
+class HarmonicBasis:
+    """Real spherical harmonics of an order; the coefficients [order², 3] are those of the light's projection."""
+
+    order: int
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.order**2
+
+    def functions(self, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient]."""
+        return sh.evaluate(self.order, directions)
+
+    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+        """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
+        if isinstance(light, EnvironmentMap):
+            return light.sh(self.order)
+        coefficients = np.zeros((self.size, 3), np.float32)
+        count = min(self.size, len(light))
+        coefficients[:count] = light[:count]
+        return coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class CellBasis:
+    """Cells around directions [direction, 3], one for those nearest to it; the coefficients are their mean radiance."""
+
+    directions: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return len(self.directions)
+
+    def functions(self, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient], 0 or 1."""
+        nearest = np.argmax(directions @ self.directions.T, axis=1)
+        return np.eye(self.size)[nearest]
+
+    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+        """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
+        if isinstance(light, EnvironmentMap):
+            return light.cells(self.directions)
+        order = sh.order_of("light", light)
+        return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
+
+
+Basis = HarmonicBasis | CellBasis

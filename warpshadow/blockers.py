@@ -1,0 +1,76 @@
+"""Blockers: the spheres that stand in for the bodies of a scene."""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.mesh import Mesh
+from warpshadow.scene import Body, Scene
+from warpshadow.spheres import Spheres, fit_spheres
+
+
+class Blockers(NamedTuple):
+    """Spheres in world space."""
+
+    centers: wp.array  # [1, sphere] vec3
+    radii: wp.array  # [1, sphere] float32
+
+
+def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Blockers:
+    """Gather the spheres of all bodies, fitting those that are wanted.
+
+    A flat body with every other body on its front side is a ground (or a wall): one sphere that touches it from
+    behind stands in for it, since small spheres in a sheet would bulge out of it.
+    """
+    meshes = [body.world_mesh() for body in scene.bodies]
+    spheres = []
+    for index, body in enumerate(scene.bodies):
+        others = [mesh.positions[np.unique(mesh.faces)] for k, mesh in enumerate(meshes) if k != index]
+        spheres.append(_body_spheres(body, meshes[index], others, device, progress))
+    centers = np.concatenate([each.centers for each in spheres])
+    radii = np.concatenate([each.radii for each in spheres])
+    return Blockers(
+        wp.array(centers[None], dtype=wp.vec3, device=device), wp.array(radii[None], dtype=wp.float32, device=device)
+    )
+
+
+def _body_spheres(body: Body, world_mesh: Mesh, others: list[np.ndarray], device: wp.DeviceLike, progress: bool) -> Spheres:
+    spheres = body.blockers
+    if isinstance(spheres, int):
+        if spheres == 0:
+            return Spheres(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+        ground = _ground_sphere(world_mesh, others)
+        if ground is not None:
+            return ground
+        spheres = fit_spheres(body.mesh, spheres, device=device, progress=progress).spheres
+    return spheres.transformed(rotation=body.rotation_matrix(), translation=body.translation, scale=body.scale)
+
+
+def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
+    """The sphere that stands in for a flat mesh seen from its front, None if that is not how it is seen.
+
+    It touches the plane below the other bodies, and its radius is such that at their mean height it blocks the solid
+    angle of the mesh's bounding rectangle.
+    """
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    if not others or not normal.any():
+        return None
+    normal /= np.linalg.norm(normal)
+    points = corners.reshape(-1, 3)
+    middle = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    seen_from = np.concatenate(others)
+    heights = (seen_from - middle) @ normal
+    size = np.ptp((points - middle) @ axes.T, axis=0)
+    is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
+    if not is_flat or heights.min() < -1e-2 * size[0] or heights.mean() <= 0:
+        return None
+    height, (a, b) = heights.mean(), size[:2]
+    solid_angle = 4 * np.arctan(a * b / (2 * height * np.sqrt(4 * height**2 + a**2 + b**2)))
+    cosine = 1 - solid_angle / (2 * np.pi)
+    sine = np.sqrt(1 - cosine**2)
+    radius = height * sine / (1 - sine)
+    foot = seen_from.mean(axis=0) - height * normal
+    return Spheres((foot - radius * normal)[None].astype(np.float32), np.array([radius], np.float32))

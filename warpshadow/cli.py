@@ -1,0 +1,199 @@
+"""The command line: render a scene, fit spheres to a mesh, look into an environment map, compile ahead."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+import numpy as np
+import typer
+import warp as wp
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Soft shadows on meshes under environment light, differentiable, on CPU and CUDA.",
+)
+
+Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
+
+
+@app.callback()
+def main() -> None:
+    """Keep Warp's own messages off the terminal."""
+    wp.config.quiet = True
+
+
+@contextlib.contextmanager
+def _clear_errors() -> Iterator[None]:
+    """Turn errors in what the user gave into one line and exit status 1."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        message = error if error.args else type(error).__name__
+        typer.secho(f"error: {message}", fg="red", err=True)
+        raise typer.Exit(1) from error
+
+
+def _check_output(path: Path, *suffixes: str) -> None:
+    """Find out before the work whether its result can be written."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: got extension {path.suffix!r}, expected {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: no such folder")
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage.")
+    ],
+    png: Annotated[Optional[Path], typer.Option(help="Also write an sRGB picture: .png or .jpg.")] = None,
+    exposure: Annotated[
+        Optional[float],
+        typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
+    ] = None,
+    method: Annotated[
+        Optional[Literal["directional", "log-sh", "none", "ray-traced"]],
+        typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
+    ] = None,
+    samples: Annotated[Optional[int], typer.Option(help="Directions of the ray-traced method.", min=1)] = None,
+    device: Device = "cpu",
+) -> None:
+    """Render a scene file to an image with soft shadows."""
+    from warpshadow.image import write_image
+    from warpshadow.render import Renderer
+    from warpshadow.scene import load_scene
+
+    with _clear_errors():
+        _check_output(output, ".exr")
+        if png is not None:
+            _check_output(png, ".png", ".jpg", ".jpeg")
+        loaded = load_scene(scene)
+        changes = {key: value for key, value in (("method", method), ("samples", samples)) if value is not None}
+        loaded = dataclasses.replace(loaded, visibility=dataclasses.replace(loaded.visibility, **changes))
+        start = time.perf_counter()
+        image = Renderer(loaded, device=_device(device), progress=True).render()
+        seconds = time.perf_counter() - start
+        write_image(output, image)
+        typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
+        if png is not None:
+            stops = auto_exposure(image) if exposure is None else exposure
+            write_image(png, _exposed(image, stops))
+            typer.echo(f"{png}: exposure {stops:+.2f} stops")
+
+
+def auto_exposure(image: np.ndarray) -> float:
+    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
+    covered = image[image[..., 3] > 0]
+    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
+    return float(-np.log2(bright)) if bright > 0 else 0.0
+
+
+def _exposed(image: np.ndarray, stops: float) -> np.ndarray:
+    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
+    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
+    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
+
+
+def _device(name: str) -> wp.Device:
+    try:
+        return wp.get_device(name)
+    except ValueError as error:
+        wp.init()
+        known = ", ".join(device.alias for device in wp.get_devices())
+        raise ValueError(f"device: got {name!r}, expected one of {known}") from error
+
+
+@app.command()
+def spheres(
+    mesh: Annotated[Path, typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .gltf or .usd.")],
+    count: Annotated[int, typer.Option(help="Number of spheres.", min=1)] = 64,
+    error: Annotated[
+        Optional[float], typer.Option(help="In place of --count: as many spheres as this relative error takes.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the fit.")] = 0,
+    picture: Annotated[Optional[Path], typer.Option(help="Draw the spheres in the mesh: .png.")] = None,
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write centers and radii: .npz.")] = None,
+    device: Device = "cpu",
+) -> None:
+    """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
+    from warpshadow.mesh import load_mesh
+    from warpshadow.spheres import fit_spheres, plot_spheres
+
+    with _clear_errors():
+        if picture is not None:
+            _check_output(picture, ".png")
+        if output is not None:
+            _check_output(output, ".npz")
+        loaded = load_mesh(mesh)
+        wanted = {"count": count} if error is None else {"error": error}
+        fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **wanted)
+        typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
+        typer.echo(str(fit.report))
+        if output is not None:
+            np.savez(output, centers=fit.spheres.centers, radii=fit.spheres.radii)
+        if picture is not None:
+            plot_spheres(loaded, fit.spheres, picture)
+
+
+@app.command()
+def envmap(
+    file: Annotated[Path, typer.Argument(help="Environment map, .exr or .hdr, twice as wide as high.")],
+    order: Annotated[int, typer.Option(help="Number of spherical-harmonic bands.", min=2, max=8)] = 8,
+    sanitize: Annotated[
+        Optional[Literal["zero", "neighbors"]], typer.Option(help="Repair NaN, Inf and negative pixels.")
+    ] = None,
+) -> None:
+    """Print an environment map's statistics and write its spherical-harmonic reconstruction beside it."""
+    from warpshadow import sh
+    from warpshadow.image import write_image
+    from warpshadow.light import EnvironmentMap
+
+    with _clear_errors():
+        light = EnvironmentMap.read(file, sanitize=sanitize)
+        for name, value in light.statistics().items():
+            shown = " ".join(f"{number:.4g}" for number in np.atleast_1d(value))
+            typer.echo(f"{name.replace('_', ' '):26}{shown}")
+        beside = file.with_name(f"{file.stem}.sh{order}.exr")
+        write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
+        typer.echo(f"{beside}: reconstruction from {order**2} coefficients")
+
+
+@app.command()
+def warmup(device: Device = "cpu") -> None:
+    """Compile every kernel that rendering needs, so that the first render need not."""
+    from tqdm import tqdm
+
+    from warpshadow.camera import Camera
+    from warpshadow.light import EnvironmentMap
+    from warpshadow.mesh import icosphere
+    from warpshadow.render import Renderer
+    from warpshadow.scene import METHODS, Body, Scene, Visibility
+    from warpshadow.spheres import fit_spheres
+
+    with _clear_errors():
+        where = _device(device)
+        mesh = icosphere(subdivisions=1)
+        start = time.perf_counter()
+        with tqdm(total=len(METHODS) + 1, desc="compiling", unit="stage") as bar:
+            fit_spheres(mesh, 1, device=where, cache=False, progress=False)
+            bar.update()
+            for method in METHODS:
+                scene = Scene(
+                    (Body(mesh, blockers=1),),
+                    EnvironmentMap.constant(1.0),
+                    Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8)),
+                    Visibility(method=method, samples=16),
+                )
+                Renderer(scene, device=where).render()
+                bar.update()
+        typer.echo(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,162 @@
+"""Rendering with torch tensors: images that are differentiable in light, albedo and textures.
+
+Geometry and camera stand still, so visibility and rasterization are computed once, by any method, the ray-traced mesh
+included; an iteration is a matrix product and a gather.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+import warp as wp
+
+from warpshadow import check, shading
+from warpshadow.basis import Basis
+from warpshadow.raster import interpolate
+from warpshadow.render import Renderer
+from warpshadow.scene import Scene
+
+
+class TorchRenderer(torch.nn.Module):
+    """Render a scene whose light and reflectance are tensors.
+
+    Args:
+        scene: The scene; what a call is not given is taken from it.
+        device: Device of the tensors and the kernels.
+        basis: What the light is expressed in: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for what the
+            scene's method computes in.
+        progress: Show progress where something takes longer than a second.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        device: str | torch.device = "cpu",
+        basis: Basis | None = None,
+        progress: bool = False,
+    ):
+        super().__init__()
+        self.renderer = Renderer(scene, device=str(device), basis=basis, progress=progress)
+        transfer = wp.to_torch(self.renderer.transfer)[0]
+        self.register_buffer("transfer", transfer, persistent=False)
+        light = torch.from_numpy(self.renderer.basis.coefficients(scene.light))
+        self.register_buffer("scene_light", light.to(transfer.device), persistent=False)
+        coverage = torch.from_numpy(self.renderer.body_ids >= 0).to(transfer)
+        self.register_buffer("coverage", coverage[..., None], persistent=False)
+
+    def forward(
+        self, light: torch.Tensor | None = None, albedo: Sequence[torch.Tensor | None] | None = None
+    ) -> torch.Tensor:
+        """Render the image.
+
+        Args:
+            light: Coefficients of the light in ``renderer.basis``, linear RGB, float32 of shape [coefficient, 3];
+                the scene's by default.
+            albedo: For each body, its reflectance in linear RGB, float32: one color [3], one for each vertex
+                [vertex, 3], or a texture [height, width, 3], which needs uvs; None for the scene's.
+
+        Returns:
+            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: light, albedo. Exact, both being linear in the image.
+        """
+        light = self.scene_light if light is None else light
+        _check_tensor("light", light, self.transfer, [tuple(self.scene_light.shape)])
+        receivers = self.renderer.receivers
+        shaded = apply(lambda values: interpolate(receivers.fragments, receivers.faces, values), self._shade(light))
+        color = shaded[0] * self._albedo_image(albedo)
+        samples = torch.cat([color, self.coverage], dim=-1)
+        factor = self.renderer.scene.supersampling
+        height, width, _ = samples.shape
+        return samples.reshape(height // factor, factor, width // factor, factor, 4).mean(dim=(1, 3))
+
+    def _shade(self, light: torch.Tensor) -> torch.Tensor:
+        return (self.transfer @ light)[None]
+
+    def _albedo_image(self, albedo: Sequence[torch.Tensor | None] | None) -> torch.Tensor:
+        """Reflectance that the samples see, shape [height, width, 3]."""
+        renderer, bodies = self.renderer, self.renderer.scene.bodies
+        kept = wp.to_torch(renderer.albedo)[0]
+        if albedo is None:
+            return kept
+        if len(albedo) != len(bodies):
+            raise ValueError(f"albedo: got {len(albedo)} items, expected {len(bodies)}, one for each body")
+        image = kept
+        for number, (values, body) in enumerate(zip(albedo, bodies, strict=True)):
+            if values is None:
+                continue
+            shapes = [(3,), (body.mesh.vertex_count, 3)] + [("height", "width", 3)] * (body.mesh.uvs is not None)
+            _check_tensor(f"albedo[{number}]", values, self.transfer, shapes)
+            shows = torch.from_numpy(renderer.body_ids == number).to(self.transfer.device)[..., None]
+            image = torch.where(shows, self._body_albedo(number, values), image)
+        return image
+
+    def _body_albedo(self, number: int, values: torch.Tensor) -> torch.Tensor:
+        renderer = self.renderer
+        if values.ndim == 1:
+            return values
+        if values.ndim == 3:
+            pixels = renderer.pixels_of(number)
+
+            def sample(texture: wp.array) -> wp.array:
+                image = wp.zeros(renderer.uvs.shape, dtype=wp.vec3, device=renderer.device, requires_grad=True)
+                shading.sample_texture(texture, pixels, renderer.uvs.flatten(), image.flatten())
+                return image
+
+            return apply(sample, values)[0]
+        first, last = renderer.geometry.first_vertex[number : number + 2]
+        before = torch.nn.functional.pad(values, (0, 0, int(first), int(renderer.geometry.first_vertex[-1] - last)))
+        faces = renderer.geometry.faces
+        return apply(lambda values: interpolate(renderer.fragments, faces, values), before[None])[0]
+
+
+def apply(function: Callable[[wp.array], wp.array], values: torch.Tensor) -> torch.Tensor:
+    """Apply a differentiable function of Warp arrays of vec3 to a float32 tensor of shape [..., 3]."""
+    return _WarpFunction.apply(function, values)
+
+
+class _WarpFunction(torch.autograd.Function):
+    """Records Warp launches on a tape in forward and plays it back in backward, as often as asked."""
+
+    @staticmethod
+    def forward(ctx, function: Callable[[wp.array], wp.array], values: torch.Tensor) -> torch.Tensor:
+        argument = wp.from_torch(values.detach().contiguous(), dtype=wp.vec3, requires_grad=values.requires_grad)
+        with _current_stream(values):
+            if not values.requires_grad:
+                return wp.to_torch(function(argument), requires_grad=False)
+            with wp.Tape() as tape:
+                result = function(argument)
+        ctx.tape, ctx.argument, ctx.result = tape, argument, result
+        return wp.to_torch(result, requires_grad=False)
+
+    @staticmethod
+    def backward(ctx, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
+        with _current_stream(gradient):
+            # copies, since memory shared with torch is reused behind the tape's back
+            wp.copy(ctx.result.grad, wp.from_torch(gradient.contiguous(), dtype=wp.vec3))
+            ctx.tape.backward()
+            result = wp.to_torch(ctx.argument.grad, requires_grad=False).clone()
+            ctx.tape.zero()
+        return None, result
+
+
+def _current_stream(tensor: torch.Tensor) -> wp.ScopedStream:
+    """Launch on torch's current stream."""
+    return wp.ScopedStream(wp.stream_from_torch() if tensor.is_cuda else None)
+
+
+def _check_tensor(name: str, tensor: torch.Tensor, like: torch.Tensor, shapes: list[tuple]) -> None:
+    """Raise ValueError unless a tensor has the type, the device and one of the shapes."""
+    if not isinstance(tensor, torch.Tensor) or tensor.dtype != torch.float32:
+        got = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
+        raise ValueError(f"{name}: got {got}, expected a tensor of torch.float32")
+    if tensor.device != like.device:
+        raise ValueError(f"{name}: got device {tensor.device}, expected {like.device}")
+    fitting = [shape for shape in shapes if len(shape) == tensor.ndim] or shapes[:1]
+    check.shape(name, tuple(tensor.shape), fitting[0])
+    if not np.isfinite(float(tensor.detach().sum())):
+        check.finite(name, tensor.detach().cpu().numpy())
