@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from warpshadow.image import ImageError, read_image, write_image
     from warpshadow.light import EnvironmentMap, synthetic_sky
     from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane
-    from warpshadow.render import Renderer, render
+    from warpshadow.renderer import Renderer, render
     from warpshadow.scene import Body, Scene, SceneError, Visibility, load_scene
     from warpshadow.spheres import Spheres, fit_spheres
 
@@ -21,7 +21,7 @@ _HOMES = {
     "image": ("ImageError", "read_image", "write_image"),
     "light": ("EnvironmentMap", "synthetic_sky"),
     "mesh": ("Mesh", "MeshError", "icosphere", "load_mesh", "plane"),
-    "render": ("Renderer", "render"),
+    "renderer": ("Renderer", "render"),
     "scene": ("Body", "Scene", "SceneError", "Visibility", "load_scene"),
     "spheres": ("Spheres", "fit_spheres"),
 }

@@ -66,7 +66,7 @@ def render(
 ) -> None:
     """Render a scene file to an image with soft shadows."""
     from warpshadow.image import write_image
-    from warpshadow.render import Renderer
+    from warpshadow.renderer import Renderer
     from warpshadow.scene import load_scene
 
     with _clear_errors():
@@ -172,7 +172,7 @@ def warmup(device: Device = "cpu") -> None:
     from warpshadow.camera import Camera
     from warpshadow.light import EnvironmentMap
     from warpshadow.mesh import icosphere
-    from warpshadow.render import Renderer
+    from warpshadow.renderer import Renderer
     from warpshadow.scene import METHODS, Body, Scene, Visibility
     from warpshadow.spheres import fit_spheres
 

@@ -230,7 +230,11 @@ def trace_transfer(
     transfer = np.empty((points.shape[0], basis.size), np.float32)
     for part in _parts(points.shape[0], 2**22 // len(directions), progress):
         visibility = trace_visibility(
-            mesh, points[part].reshape((1, -1)), normals[part].reshape((1, -1)), towards, offset=ray_offset(mesh)
+            mesh,
+            points[part].reshape((1, -1)),
+            normals[part].reshape((1, -1)),
+            towards,
+            offset=ray_offset(mesh),
         )
         cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
         transfer[part] = (visibility.numpy()[0] * cosine) @ functions

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow import check, shading
 from warpshadow.basis import Basis
 from warpshadow.raster import interpolate
-from warpshadow.render import Renderer
+from warpshadow.renderer import Renderer
 from warpshadow.scene import Scene
 
 
