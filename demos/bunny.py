@@ -1,10 +1,10 @@
-"""The main job, on meshes that ship with Warp: render soft shadows by every method, then recover the light from an image.
+"""The main job, on meshes that ship with Warp: soft shadows by every method, then the light recovered from an image.
 
     make demo        or        python demos/bunny.py --output out
 
-A bunny stands on a textured ground under an HDR sky with a sun. It is rendered without shadows, with each method, and
-ray traced. Then the light is forgotten and recovered from the ray-traced image, once by a renderer with shadows and once
-by one without (direct illumination), and both estimates relight a bear.
+A bunny stands on a textured ground under an HDR sky with a sun. It is rendered without shadows, with each method,
+and ray traced. Then the light is forgotten and recovered from the ray-traced image, once by a renderer with shadows
+and once by one without (direct illumination), and both estimates relight a bear.
 """
 
 import argparse
@@ -78,7 +78,10 @@ def scene_of(asset: str, light: ws.EnvironmentMap) -> ws.Scene:
     scale = 2 / (high - low).max()
     middle = (low + high) / 2
     body = ws.Body(
-        mesh, albedo=(0.75, 0.62, 0.5), scale=scale, translation=-scale * np.array([middle[0], low[1], middle[2]])
+        mesh,
+        albedo=(0.75, 0.62, 0.5),
+        scale=scale,
+        translation=-scale * np.array([middle[0], low[1], middle[2]]),
     )
     ground = ws.Body(ws.plane(6.0, 64), texture=checkers())
     camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(256, 256))
@@ -111,9 +114,7 @@ def recover_light(
 ) -> tuple[np.ndarray, float]:
     """Fit SH light to an image with Adam, from darkness."""
     start = time.perf_counter()
-    renderer = TorchRenderer(
-        dataclasses.replace(scene, visibility=visibility), basis=ws.HarmonicBasis(LIGHT_ORDER)
-    )
+    renderer = TorchRenderer(dataclasses.replace(scene, visibility=visibility), basis=ws.HarmonicBasis(LIGHT_ORDER))
     wanted = torch.from_numpy(target)
     light = torch.zeros(LIGHT_ORDER**2, 3, requires_grad=True)
     optimizer = torch.optim.Adam([light], lr=0.1)

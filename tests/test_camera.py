@@ -1,4 +1,4 @@
-"""Cameras: conventions by hand-computed pixels, constructors against each other, errors, and the clip-space kernel."""
+"""Cameras: hand-computed pixels, constructors against each other, errors, and the clip-space kernel."""
 
 import re
 
@@ -101,7 +101,11 @@ def test_rays_pass_through_the_centers_of_their_pixels(seed):
 
 def test_clip_space_is_minus_one_at_the_left_and_top_edge_and_depth_falls_from_one_at_the_near_plane():
     camera = Camera(INTRINSICS, np.eye(3), np.zeros(3), *SIZE, near=0.25)
-    ray = np.linalg.inv(INTRINSICS) @ [[0.0, 96.0], [0.0, 64.0], [1.0, 1.0]]  # top-left and bottom-right corner
+    ray = np.linalg.inv(INTRINSICS) @ [
+        [0.0, 96.0],
+        [0.0, 64.0],
+        [1.0, 1.0],
+    ]  # top-left and bottom-right corner
     for distance in (0.25, 1.0, 1e6):
         points = np.vstack([ray * distance, np.ones(2)])
         clip = camera.clip_matrix() @ points
@@ -219,7 +223,11 @@ def test_one_instance_of_positions_or_cameras_serves_all_of_the_other(device):
 
 def test_the_gradient_of_to_clip_is_that_of_a_matrix_product(device):
     rng = np.random.default_rng(3)
-    points, matrices, seed = rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 4, 4)), rng.normal(size=(2, 5, 4))
+    points, matrices, seed = (
+        rng.normal(size=(2, 5, 3)),
+        rng.normal(size=(2, 4, 4)),
+        rng.normal(size=(2, 5, 4)),
+    )
     positions = to_device(points, wp.vec3, device, requires_grad=True)
     clip_matrices = to_device(matrices, wp.mat44, device, requires_grad=True)
     with wp.Tape() as tape:

@@ -63,8 +63,7 @@ def test_a_part_is_chosen_by_name_or_index_and_the_first_by_default(tmp_path):
     path = tmp_path / "a.exr"
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     parts = [
-        OpenEXR.Part({**header, "name": name}, {"RGB": PIXELS + i}, name)
-        for i, name in enumerate(["left", "right"])
+        OpenEXR.Part({**header, "name": name}, {"RGB": PIXELS + i}, name) for i, name in enumerate(["left", "right"])
     ]
     OpenEXR.File(parts).write(str(path))
     for part, expected in (
@@ -127,9 +126,7 @@ def test_a_deep_exr_is_refused(tmp_path):
     for index in np.ndindex(*samples.shape):
         samples[index] = np.arange(1 + sum(index) % 2, dtype=np.float32)
     channel = {"Z": OpenEXR.Channel("Z", samples)}
-    path = write_exr(
-        tmp_path / "a.exr", channel, type=OpenEXR.deepscanline, compression=OpenEXR.ZIPS_COMPRESSION
-    )
+    path = write_exr(tmp_path / "a.exr", channel, type=OpenEXR.deepscanline, compression=OpenEXR.ZIPS_COMPRESSION)
     with pytest.raises(ImageError, match="got deep pixels"):
         read_image(path)
 
@@ -168,9 +165,7 @@ def float_to_rgbe(pixels):
     mantissa, exponent = np.frexp(pixels.max(axis=-1))
     scale = np.where(mantissa > 0, np.ldexp(1.0, 8 - exponent), 0)
     codes = np.floor(pixels * scale[..., None])
-    return np.concatenate([codes, np.where(mantissa > 0, exponent + 128, 0)[..., None]], axis=-1).astype(
-        np.uint8
-    )
+    return np.concatenate([codes, np.where(mantissa > 0, exponent + 128, 0)[..., None]], axis=-1).astype(np.uint8)
 
 
 def encode_new(rgbe):
@@ -229,9 +224,7 @@ def test_old_style_runs_repeat_the_pixel_before(tmp_path):
     ],
 )
 def test_every_orientation_ends_with_the_top_in_row_zero(tmp_path, resolution, turn):
-    np.testing.assert_array_equal(
-        read_image(radiance_file(tmp_path, encode_new(RGBE), resolution)), turn(DECODED)
-    )
+    np.testing.assert_array_equal(read_image(radiance_file(tmp_path, encode_new(RGBE), resolution)), turn(DECODED))
 
 
 def test_exposures_and_color_corrections_are_divided_out(tmp_path):
@@ -244,9 +237,7 @@ def test_exposures_and_color_corrections_are_divided_out(tmp_path):
 @given(st.integers(0, 2**32 - 1), st.integers(8, 300))
 def test_any_rgbe_survives_run_length_encoding(tmp_path_factory, seed, width):
     random = np.random.default_rng(seed)
-    rgbe = random.integers(0, 3, (2, width, 4)).astype(np.uint8) * np.uint8(
-        [1, 1, 1, 70]
-    )  # exponent 0 is black
+    rgbe = random.integers(0, 3, (2, width, 4)).astype(np.uint8) * np.uint8([1, 1, 1, 70])  # exponent 0 is black
     path = radiance_file(tmp_path_factory.mktemp("hdr"), encode_new(rgbe), f"-Y 2 +X {width}")
     expected = rgbe[..., :3] * 2.0 ** (rgbe[..., 3:].astype(int) - 136) * (rgbe[..., 3:] > 0)
     np.testing.assert_array_equal(read_image(path), expected.astype(np.float32))
@@ -329,9 +320,7 @@ def test_palettes_become_colors(tmp_path):
 
     codes = RANDOM.integers(0, 256, (4, 4, 3)).astype(np.uint8)
     Image.fromarray(codes).quantize(16).save(tmp_path / "palette.png")
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "palette.png"), srgb_to_linear(codes / 255).astype(np.float32)
-    )
+    np.testing.assert_array_equal(read_image(tmp_path / "palette.png"), srgb_to_linear(codes / 255).astype(np.float32))
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -356,9 +345,7 @@ def test_srgb_encoding_inverts_decoding(value):
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
-@pytest.mark.parametrize(
-    ("keep", "message"), [(0, "not a PNG or JPEG"), (5, "not a PNG or JPEG"), (-200, "truncated")]
-)
+@pytest.mark.parametrize(("keep", "message"), [(0, "not a PNG or JPEG"), (5, "not a PNG or JPEG"), (-200, "truncated")])
 def test_a_truncated_png_or_jpeg_is_refused(tmp_path, suffix, keep, message):
     path = tmp_path / f"a.{suffix}"
     write_image(path, RANDOM.random((64, 64, 3)))

@@ -139,9 +139,7 @@ def test_a_cube_map_file_is_named_as_such(tmp_path):
 
 @pytest.mark.parametrize(("channels", "expected"), [(1, [0.5, 0.5, 0.5]), (3, [0.5, 1, 2]), (4, [0.5, 1, 2])])
 def test_gray_becomes_rgb_and_alpha_is_dropped(tmp_path, channels, expected):
-    write_image(
-        tmp_path / "a.exr", np.broadcast_to(np.float32([0.5, 1, 2, 0.25])[:channels], (2, 4, channels))
-    )
+    write_image(tmp_path / "a.exr", np.broadcast_to(np.float32([0.5, 1, 2, 0.25])[:channels], (2, 4, channels)))
     np.testing.assert_array_equal(EnvironmentMap.read(tmp_path / "a.exr").radiance[1, 2], expected)
 
 
@@ -248,9 +246,7 @@ def test_an_unknown_convention_is_refused_by_name(tmp_path):
 def test_scaling_is_linear_and_never_negative():
     environment = random_map()
     np.testing.assert_allclose(environment.scaled(3).radiance, 3 * environment.radiance)
-    np.testing.assert_allclose(
-        environment.scaled([1, 0, 2]).radiance, environment.radiance * np.float32([1, 0, 2])
-    )
+    np.testing.assert_allclose(environment.scaled([1, 0, 2]).radiance, environment.radiance * np.float32([1, 0, 2]))
     with pytest.raises(ImageError, match="negative"):
         environment.scaled(-1)
 
@@ -325,9 +321,7 @@ def test_a_point_light_has_its_own_direction_and_no_spread():
     np.testing.assert_allclose(spreads[dark], np.arccos(1 - 2 / 32), rtol=1e-6)  # a cap of 4π/32
 
 
-@pytest.mark.parametrize(
-    "directions", [np.zeros((0, 3)), np.ones((4, 3)), np.full((4, 3), np.nan), np.ones(3)]
-)
+@pytest.mark.parametrize("directions", [np.zeros((0, 3)), np.ones((4, 3)), np.full((4, 3), np.nan), np.ones(3)])
 def test_cells_want_unit_vectors(directions):
     with pytest.raises(ValueError, match="directions: "):
         random_map().cells(directions)
@@ -351,9 +345,7 @@ def test_statistics_describe_a_map_in_plain_numbers():
 
 
 def test_an_even_map_has_a_hundredth_of_its_energy_in_a_hundredth_of_the_sphere():
-    np.testing.assert_allclose(
-        EnvironmentMap.constant().statistics()["brightest_percent_share"], 0.01, rtol=1e-6
-    )
+    np.testing.assert_allclose(EnvironmentMap.constant().statistics()["brightest_percent_share"], 0.01, rtol=1e-6)
     assert EnvironmentMap.constant(0).statistics()["brightest_percent_share"] == 0
 
 

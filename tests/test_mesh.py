@@ -101,9 +101,7 @@ def test_the_bounds_ignore_vertices_without_faces():
 
 
 def test_a_transform_scales_then_rotates_then_translates():
-    mesh = Mesh(TRIANGLE, [[0, 1, 2]]).transformed(
-        rotation=QUARTER_TURN_Y, translation=[0, 0, 5], scale=[1, 2, 3]
-    )
+    mesh = Mesh(TRIANGLE, [[0, 1, 2]]).transformed(rotation=QUARTER_TURN_Y, translation=[0, 0, 5], scale=[1, 2, 3])
     np.testing.assert_allclose(mesh.positions, [[0, 0, 4], [0, 2, 5], [3, 0, 5]], atol=1e-6)
 
 
@@ -129,9 +127,7 @@ def test_a_plane_faces_up_and_fills_its_size():
     np.testing.assert_allclose(normals[:, 1].sum() / 2, 8, rtol=1e-6)
     assert (normals[:, 1] > 0).all() and (normals[:, [0, 2]] == 0).all()
     np.testing.assert_array_equal(mesh.bounds, [[-2, 0, -1], [2, 0, 1]])
-    np.testing.assert_allclose(
-        mesh.uvs, np.stack([mesh.positions[:, 0] / 4, -mesh.positions[:, 2] / 2], 1) + 0.5
-    )
+    np.testing.assert_allclose(mesh.uvs, np.stack([mesh.positions[:, 0] / 4, -mesh.positions[:, 2] / 2], 1) + 0.5)
     np.testing.assert_array_equal(mesh.uv_faces, mesh.faces)
 
 
@@ -515,9 +511,7 @@ def test_normals_of_a_welded_seam_are_smooth_across_it(tmp_path, device):
     vertices, faces, uvs = cylinder()
     mesh = load_mesh(export(tmp_path, "a.glb", vertices=vertices, faces=faces, uvs=uvs))
     lower, upper = normals_of(mesh, device)[[0, 5]]
-    np.testing.assert_allclose(
-        lower, upper * [1, 1, -1], atol=ROUNDING
-    )  # by symmetry, though the diagonals tilt both
+    np.testing.assert_allclose(lower, upper * [1, 1, -1], atol=ROUNDING)  # by symmetry, though the diagonals tilt both
     assert lower[0] > 0.9 > np.sqrt(0.5)  # the normal of either quad
 
 
@@ -541,9 +535,7 @@ def test_the_gradient_of_vertex_normals_equals_central_differences(device):
 
 
 def test_faces_without_area_give_zero_normals_and_zero_gradients(device):
-    points = np.float32(
-        [[0, 0, 0], [1, 0, 0], [2, 0, 0], [7, 7, 7]]
-    )  # three on a line, and one without a face
+    points = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0], [7, 7, 7]])  # three on a line, and one without a face
     positions = wp.array(points[None], dtype=wp.vec3, device=device, requires_grad=True)
     with wp.Tape() as tape:
         normals = vertex_normals(positions, wp.array([[0, 1, 2], [1, 1, 1]], dtype=wp.vec3i, device=device))

@@ -1,4 +1,4 @@
-"""Rasterization: against a brute-force float64 twin, exactness of coverage, hostile triangles, and gradients."""
+"""Rasterization: a brute-force float64 twin, exactness of coverage, hostile triangles, and gradients."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,15 @@ from warpshadow import raster
 from warpshadow.camera import Camera, to_clip
 from warpshadow.raster import Fragments, barycentrics, interpolate, rasterize
 
-# Vertices snap to 1/4096 pixel, so coverage may differ from the twin's within this distance of an edge [pixels].
+# Vertices snap to 1/4096 pixel, so coverage may differ from the twin's within this distance of an edge
+# [pixels].
 SNAP = 1e-3
 # Depths that differ by less, relatively, may be ordered either way in float32.
 DEPTH_TIE = 1e-5
 
 
 def twin_weights(clip, x, y):
-    """Perspective-correct weights of clip-space triangles [..., 3, 4] at normalized device coordinates, float64."""
+    """Perspective-correct weights of clip-space triangles [..., 3, 4] at normalized device coordinates."""
     p = np.stack([clip[..., 0] - x * clip[..., 3], clip[..., 1] - y * clip[..., 3]], axis=-1)
     a, b, c = p[..., 0, :], p[..., 1, :], p[..., 2, :]
 
@@ -31,7 +32,7 @@ def twin_weights(clip, x, y):
 
 
 def twin(clip, faces, width, height):
-    """Brute force: every face at every pixel. Returns face ids, weights and where the answer is beyond rounding."""
+    """Every face at every pixel. Returns face ids, weights, and where no rounding could change them."""
     corners = np.asarray(clip, np.float64)[faces]
     rows, columns = np.mgrid[:height, :width]
 
@@ -124,7 +125,8 @@ def test_triangles_of_any_size_match_the_twin(device, seed, scale, near):
 
 
 def grid_patch(rng, count, low, high, jitter):
-    """A square patch of count x count quads with random diagonals and random windings, in pixels: [face, 3, 2].
+    """A square patch of count x count quads with random diagonals and random windings, in pixels: [face, 3,
+    2].
 
     Faces overlap when jitter reaches a quarter of a quad.
     """
@@ -162,7 +164,7 @@ def test_edges_through_pixel_centers_belong_to_one_face(step, device):
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 2.0))
 def test_a_surface_around_the_camera_covers_each_pixel_exactly_once(device, seed, size):
-    """A tessellated plane reaches from behind the camera to far ahead, tilted at random; neighbors are exact."""
+    """A tessellated plane reaches from behind the camera to far ahead, tilted at random."""
     rng = np.random.default_rng(seed)
     corners = grid_patch(rng, 12, -50.0, 50.0, 0.24).astype(np.float32)
     height = -np.float32(size) + np.float32(rng.normal() * 0.1) * corners[..., 0]
@@ -190,6 +192,18 @@ def test_huge_triangles_cover_every_pixel_once_and_interpolate_right(distance, d
     assert np.diff(np.append(angles, angles[0] + 2 * np.pi)).max() < np.pi
     assert (draw_each_alone(clip, 40, 30, device) == 1).all()
     assert_equals_twin(clip.reshape(-1, 4), np.arange(27).reshape(-1, 3), 40, 30, device)
+
+
+def test_far_faces_around_a_vertex_beside_a_pixel_center_leave_no_hole_there(device):
+    """Their edges must meet in the snapped vertex, not in that vertex before it snapped."""
+    rng = np.random.default_rng(23)
+    for _ in range(40):
+        angles = np.sort(rng.uniform(0, 2 * np.pi / 9, 9) + np.arange(9) * 2 * np.pi / 9)
+        ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * rng.uniform(1e5, 1e6, (9, 1))
+        center = rng.integers(0, 8, 2) + 0.5 + rng.uniform(-3e-4, 3e-4, 2)
+        corners = np.array([[center, center + ring[i], center + ring[(i + 1) % 9]] for i in range(9)])
+        clip = from_pixels(corners[..., 0], corners[..., 1], width=8, height=8)
+        assert (draw_each_alone(clip, 8, 8, device) == 1).all()
 
 
 def test_far_strips_are_drawn_once_between_parallel_edges_without_a_vertex_near_the_image(device):
@@ -241,6 +255,35 @@ def test_slivers_and_edge_on_faces_have_finite_weights_in_the_unit_range(device)
     drawn = face_ids >= 0
     assert drawn.any() and np.isfinite(weights).all() and weights.min() >= 0 and weights.max() <= 1
     np.testing.assert_allclose(weights[drawn].sum(-1), 1.0, rtol=1e-6)
+
+
+def clip_at(fixed, depth, rng, size):
+    """A clip position that snaps to given 1/4096 pixels, which float32 cannot hold itself but x/w can be."""
+    w = rng.uniform(1.0, 2.0, 4096).astype(np.float32)
+    xy = ((np.asarray(fixed) / 2048 / size - 1) * w[:, None]).astype(np.float32)
+    snapped = np.rint((xy / w[:, None].astype(np.float64) + 1) * size * 2048)
+    i = np.flatnonzero((snapped == fixed).all(1))[0]
+    return [*xy[i], depth * w[i], w[i]]
+
+
+def test_rounding_does_not_carry_the_depth_of_a_sliver_beyond_that_of_its_vertices(device):
+    """Slivers of 60 000 pixels in length with next to no area through a pixel center, and a plane nearby."""
+    rng = np.random.default_rng(24)
+    size, center = 32, 16 * 4096 + 2048
+    x, y = np.array([-99.0, 199.0, -99.0]), np.array([-99.0, -99.0, 199.0])
+    for _ in range(10):
+        p, q = 2, 2
+        while np.gcd(p, q) != 1:
+            p, q = (int(n) for n in rng.integers(1 << 25, 1 << 27, 2))
+        v = pow(p, -1, q)
+        u = (p * v - 1) // q  # p v - q u = 1: the least area that is not zero
+        fixed = center + np.array([[-p, -q], [p, q], [u, v], [-u, -v]])
+        for side, sliver_wins in ((1, True), (-1, False)):
+            depths = 0.5 + side * np.array([1e-5, 1e-5, 0.4, 0.4])
+            sliver = [clip_at(f, d, rng, size) for f, d in zip(fixed, depths, strict=True)]
+            plane = from_pixels(x, y, 0.5, width=size, height=size)
+            ids, _ = draw(np.vstack([sliver, plane]), [[0, 1, 2], [0, 1, 3], [4, 5, 6]], size, size, device)
+            assert (ids[0, 16, 16] != 2) == sliver_wins
 
 
 def test_both_sides_of_a_face_are_drawn_alike(device):
@@ -413,6 +456,13 @@ def test_the_gradient_of_interpolation_matches_central_differences(device):
 
     expected = central_differences(loss, attributes)
     np.testing.assert_allclose(device_attributes.grad.numpy(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_barycentrics_refuse_positions_of_another_batch(device):
+    clip, faces = on_device(*random_triangles(np.random.default_rng(22), 3), device)
+    face_ids = wp.zeros((2, 4, 4), dtype=wp.int32, device=device)
+    with pytest.raises(ValueError, match="^clip_positions: got shape"):
+        barycentrics(face_ids, faces, clip)
 
 
 def test_barycentrics_of_kept_face_ids_equal_those_of_rasterize(device):

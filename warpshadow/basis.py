@@ -27,6 +27,7 @@ class HarmonicBasis:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         if isinstance(light, EnvironmentMap):
             return light.sh(self.order)
+        sh.order_of("light", light)
         coefficients = np.zeros((self.size, 3), np.float32)
         count = min(self.size, len(light))
         coefficients[:count] = light[:count]

@@ -31,11 +31,14 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     centers = np.concatenate([each.centers for each in spheres])
     radii = np.concatenate([each.radii for each in spheres])
     return Blockers(
-        wp.array(centers[None], dtype=wp.vec3, device=device), wp.array(radii[None], dtype=wp.float32, device=device)
+        wp.array(centers[None], dtype=wp.vec3, device=device),
+        wp.array(radii[None], dtype=wp.float32, device=device),
     )
 
 
-def _body_spheres(body: Body, world_mesh: Mesh, others: list[np.ndarray], device: wp.DeviceLike, progress: bool) -> Spheres:
+def _body_spheres(
+    body: Body, world_mesh: Mesh, others: list[np.ndarray], device: wp.DeviceLike, progress: bool
+) -> Spheres:
     spheres = body.blockers
     if isinstance(spheres, int):
         if spheres == 0:

@@ -3,10 +3,12 @@
 Conventions (OpenCV, with pixel centers at +0.5):
 
 - Camera space: x right, y down, z forward; ``c = R p + t`` takes a world point to it.
-- Pixel space: ``(u, v) = (K c)_xy / c_z``; column j, row i has its center at (j + 0.5, i + 0.5); row 0 is on top.
-- Clip space ``(x, y, z, w)``: ``x/w`` runs from -1 at the left edge of the image to +1 at the right edge, ``y/w`` from
-  -1 at the **top** edge to +1 at the **bottom** edge, and ``z/w = near / c_z`` from 1 at the near plane to 0 at infinity
-  (reversed, without a far plane, so float32 keeps its relative precision at every distance); ``w = c_z``.
+- Pixel space: ``(u, v) = (K c)_xy / c_z``; column j, row i has its center at (j + 0.5, i + 0.5); row 0 is
+  on top.
+- Clip space ``(x, y, z, w)``: ``x/w`` runs from -1 at the left edge of the image to +1 at the right edge,
+  ``y/w`` from -1 at the **top** edge to +1 at the **bottom** edge, and ``z/w = near / c_z`` from 1 at the
+  near plane to 0 at infinity (reversed, without a far plane, so float32 keeps its relative precision at every
+  distance); ``w = c_z``.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ class Camera:
             raise ValueError(f"intrinsics: got last row {self.intrinsics[2].tolist()}, expected [0, 0, 1]")
         focal = self.intrinsics[:2, :2]
         if abs(np.linalg.det(focal)) <= 1e-12 * np.abs(focal).max() ** 2:
-            raise ValueError(f"intrinsics: got a singular matrix {self.intrinsics.tolist()}, expected non-zero focal lengths")
+            raise ValueError(f"intrinsics: got a singular matrix {self.intrinsics.tolist()}, expected focal lengths")
         _check_rotation("rotation", self.rotation)
 
     @classmethod
@@ -89,9 +91,7 @@ class Camera:
         forward = view / distance
         right = np.cross(forward, up)
         if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(up):
-            raise ValueError(
-                f"up: got {up.tolist()}, expected a direction not parallel to the view {forward.tolist()}"
-            )
+            raise ValueError(f"up: got {up.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         width, height = _size(size)
@@ -112,12 +112,15 @@ class Camera:
 
         Args:
             view: World to eye, a rotation and a translation [scene units], shape [4, 4].
-            projection: Perspective projection to OpenGL's clip space, shape [4, 4]; off-center ones are welcome.
+            projection: Perspective projection to OpenGL's clip space, shape [4, 4]; off-center ones are
+                welcome.
             fov_y: In place of ``projection``: vertical field of view [degrees].
             size: Width and height [pixels].
-            near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with ``fov_y``.
+            near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with
+                ``fov_y``.
         Raises:
-            ValueError: naming the argument; so when the view is not rigid or the projection not a perspective.
+            ValueError: naming the argument; so when the view is not rigid or the projection not a
+                perspective.
         """
         view = _array("view", view, (4, 4))
         if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
@@ -133,7 +136,7 @@ class Camera:
             projection = _array("projection", projection, (4, 4))
             if not np.array_equal(projection[3], (0.0, 0.0, -1.0, 0.0)) or projection[:2, 3].any():
                 raise ValueError(
-                    f"projection: got {projection.tolist()}, expected a perspective with last row [0, 0, -1, 0] "
+                    f"projection: got {projection.tolist()}, expected a perspective, last row [0, 0, -1, 0] "
                     "and no translation of x and y"
                 )
             # ndc = (P c) / c_z with c in OpenGL's axes; then u = (1 + x) width/2 and v = (1 - y) height/2.
@@ -180,7 +183,8 @@ class Camera:
         Args:
             points: World positions [scene units], shape [..., 3].
         Returns:
-            (u, v) [pixels], shape [..., 2]; NaN for points on or behind the plane of the eye, which have no image.
+            (u, v) [pixels], shape [..., 2]; NaN for points on or behind the plane of the eye, which have no
+            image.
         """
         homogeneous = (np.asarray(points, np.float64) @ self.rotation.T + self.translation) @ self.intrinsics.T
         depth = homogeneous[..., 2:]

@@ -50,7 +50,8 @@ def _check_output(path: Path, *suffixes: str) -> None:
 def render(
     scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage.")
+        Path,
+        typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage."),
     ],
     png: Annotated[Optional[Path], typer.Option(help="Also write an sRGB picture: .png or .jpg.")] = None,
     exposure: Annotated[
@@ -114,7 +115,8 @@ def spheres(
     mesh: Annotated[Path, typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .gltf or .usd.")],
     count: Annotated[int, typer.Option(help="Number of spheres.", min=1)] = 64,
     error: Annotated[
-        Optional[float], typer.Option(help="In place of --count: as many spheres as this relative error takes.")
+        Optional[float],
+        typer.Option(help="In place of --count: as many spheres as this relative error takes."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fit.")] = 0,
     picture: Annotated[Optional[Path], typer.Option(help="Draw the spheres in the mesh: .png.")] = None,

@@ -62,12 +62,15 @@ class ChunkCones(NamedTuple):
     sine: np.ndarray
 
 
-def chunk_cones(directions: np.ndarray) -> ChunkCones:
-    """Bound every run of 16 directions [Q, 3] with a cone."""
+def chunk_cones(directions: np.ndarray, width: float = 0.0) -> ChunkCones:
+    """Bound every run of 16 directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
+
+    All three together must stay within 180°, where cosines order angles; a chunk that is too wide culls nothing.
+    """
     chunks = directions.reshape(-1, CHUNK, 3)
     axes = chunks.mean(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
     cosine = np.einsum("cqx,cx->cq", chunks, axes).min(axis=1)
-    is_wide = cosine < np.cos(np.radians(80))
+    is_wide = cosine < max(np.cos(np.radians(80)), np.sin(width))
     cosine = np.where(is_wide, 0.0, cosine)
     return ChunkCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))

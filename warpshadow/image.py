@@ -72,9 +72,7 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
-        raise ImageError(
-            f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]"
-        )
+        raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
     unfinished.touch()  # a missing folder is an ordinary FileNotFoundError
     try:
@@ -111,9 +109,7 @@ def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray
     header = {channel.name: channel for channel in parts[chosen].header["channels"]}
     names = _find_channels(list(header))
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in header.values()):
-        raise ImageError(
-            f"got subsampled channels among {', '.join(header)}, expected all at full resolution"
-        )
+        raise ImageError(f"got subsampled channels among {', '.join(header)}, expected all at full resolution")
 
     try:
         complete = OpenEXR.File(str(path), separate_channels=True).parts
@@ -131,9 +127,7 @@ def _find_part(names: list[str], part: str | int | None) -> int:
         return part
     if part in names:
         return names.index(part)
-    raise ImageError(
-        f"got part {part!r}, expected 0 to {len(names) - 1} or one of {', '.join(map(repr, names))}"
-    )
+    raise ImageError(f"got part {part!r}, expected 0 to {len(names) - 1} or one of {', '.join(map(repr, names))}")
 
 
 def _find_channels(names: list[str]) -> list[str]:
@@ -149,8 +143,7 @@ def _find_channels(names: list[str]) -> list[str]:
     if len(colors) == 1:
         return colors.popitem()[1]
     raise ImageError(
-        f"got channels {', '.join(names)} ({len(colors)} layers with color), "
-        "expected R, G, B or Y, in one layer"
+        f"got channels {', '.join(names)} ({len(colors)} layers with color), expected R, G, B or Y, in one layer"
     )
 
 
@@ -176,9 +169,7 @@ def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.nd
         while line := file.readline(4096).strip():
             key, _, value = line.partition(b"=")
             if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-                raise ImageError(
-                    f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe"
-                )
+                raise ImageError(f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe")
             if key in (b"EXPOSURE", b"COLORCORR"):  # the product of all, already multiplied into the pixels
                 exposure *= _positive_numbers(key, value)
         resolution = _RESOLUTION.fullmatch(line := file.readline(80))
@@ -214,9 +205,7 @@ def _decode_rgbe(data: bytes, line_count: int, width: int) -> np.ndarray:
     start = 0
     for line in range(line_count):
         is_new_style = (
-            8 <= width < 32768
-            and data[start : start + 2] == b"\2\2"
-            and data[start + 2 : start + 3] < b"\x80"
+            8 <= width < 32768 and data[start : start + 2] == b"\2\2" and data[start + 2 : start + 3] < b"\x80"
         )
         decode = _decode_planes if is_new_style else _decode_pixels
         try:
@@ -268,9 +257,7 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode linear values in [0, 1] as sRGB (IEC 61966-2-1), in the precision of the argument."""
-    return np.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    )
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-
 MODULE_OPTIONS = {"max_unroll": 1}
 """Options of modules whose kernels loop over lanes: unrolled, such loops take ten times as long to compile."""
 

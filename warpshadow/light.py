@@ -234,8 +234,7 @@ def _check_aspect(pixels: np.ndarray) -> None:
         is_cube = any(width * down == height * across for across, down in faces_or_crosses)
         cube = ", which looks like a cube map" if is_cube else ""
         raise ImageError(
-            f"radiance: got {width} x {height} pixels{cube}, "
-            "expected an equirectangular map, twice as wide as high"
+            f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
         )
 
 
@@ -250,9 +249,7 @@ def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
     if how == "zero" or not bad.any():
         return values
     if bad.all(axis=(0, 1)).any():
-        raise ImageError(
-            "radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by"
-        )
+        raise ImageError("radiance: a channel has no good value, so sanitize='neighbors' has nothing to go by")
     good = (~bad).astype(np.float32)
     while (good == 0).any():
         total, count = _around(values * good), _around(good)
@@ -280,9 +277,7 @@ def draw_test_map(height: int = 256) -> EnvironmentMap:
     towards = sh.equirectangular_directions(height)
     axis = np.abs(towards).argmax(axis=-1)
     negative = np.take_along_axis(towards, axis[..., None], axis=-1)[..., 0] < 0
-    colors = np.array(
-        [[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]]
-    )
+    colors = np.array([[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]])
     picture = Image.fromarray(colors[axis, negative.astype(int)].astype(np.uint8))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=height / 7)
     for step in range(24):
@@ -365,6 +360,4 @@ def _sunlight(elevation_sine: float) -> np.ndarray:
     """Color of the sun through the air mass of Kasten and Young (1989), at luminance 1."""
     degrees = np.degrees(np.arcsin(elevation_sine))
     air_mass = 1 / (elevation_sine + 0.50572 * (degrees + 6.07995) ** -1.6364)
-    return _chroma(
-        np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass)
-    )  # Rayleigh at 610, 550, 465 nm and thin haze
+    return _chroma(np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass))  # Rayleigh at 610, 550, 465 nm and thin haze

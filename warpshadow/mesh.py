@@ -132,9 +132,7 @@ def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.nda
     with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
         values = np.array(values, dtype=np.float32, order="C")
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
-        raise MeshError(
-            f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}"
-        )
+        raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise MeshError(
@@ -210,9 +208,7 @@ def load_mesh(path: str | Path) -> Mesh:
     except (MeshError, ImportError) as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # the readers of other libraries raise anything on a damaged file
-        raise MeshError(
-            f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})"
-        ) from error
+        raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
     if remarks:
         warnings.warn(f"{path}: {', '.join(remarks)}", stacklevel=2)
     return mesh
@@ -233,9 +229,7 @@ def _concatenate(parts: list[_Part], name: str) -> tuple[Mesh, list[str]]:
     counts = {
         "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
         "duplicate faces": mesh.face_count - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)),
-        "unreferenced vertices": mesh.vertex_count
-        - len(np.unique(mesh.faces))
-        - sum(part.welded for part in parts),
+        "unreferenced vertices": mesh.vertex_count - len(np.unique(mesh.faces)) - sum(part.welded for part in parts),
     }
     remarks = [f"{count} {what}" for what, count in counts.items() if count]
     remarks += [part.remark for part in parts if part.remark]
@@ -261,9 +255,7 @@ def _move(part: _Part, linear: np.ndarray, translation: np.ndarray) -> _Part:
 
 def _turned_over(part: _Part) -> _Part:
     """Reverse the winding of every face."""
-    return part._replace(
-        faces=part.faces[:, ::-1], uv_faces=None if part.uv_faces is None else part.uv_faces[:, ::-1]
-    )
+    return part._replace(faces=part.faces[:, ::-1], uv_faces=None if part.uv_faces is None else part.uv_faces[:, ::-1])
 
 
 def _fan(corner_counts: np.ndarray) -> np.ndarray:
@@ -395,9 +387,7 @@ def _usd_part(mesh, primvars, time) -> _Part:
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], dtype=np.int64)
     corner_counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
     if corner_counts.sum() != len(corners):
-        raise MeshError(
-            f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts"
-        )
+        raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
     faces = _fan(corner_counts)
     part = _Part(positions, corners[faces])
     st = primvars.GetPrimvar("st")
@@ -437,9 +427,7 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
         raise MeshError(f"segments: got {segments}, expected positive integers")
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
-    positions = np.stack(
-        [(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1
-    )
+    positions = np.stack([(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1)
     corner = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
@@ -463,11 +451,7 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
     positions = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
     near = np.isclose(np.linalg.norm(positions[:, None] - positions, axis=-1), 2)
     triples = [
-        (a, b, c)
-        for a in range(12)
-        for b in range(a)
-        for c in range(b)
-        if near[a, b] and near[b, c] and near[a, c]
+        (a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]
     ]
     faces = np.array([t if np.linalg.det(positions[list(t)]) > 0 else t[::-1] for t in triples])
     for _ in range(subdivisions):
@@ -478,9 +462,7 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
         positions = np.concatenate([positions, positions[edges].mean(axis=1)])
         faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
         positions /= np.linalg.norm(positions, axis=1, keepdims=True)
-    return Mesh(
-        positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere"
-    )
+    return Mesh(positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere")
 
 
 # ---------------------------------------------------------------------------------------------------- normals

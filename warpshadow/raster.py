@@ -1,9 +1,9 @@
 """Rasterize triangles: which face a pixel sees, where on it, and what an attribute is worth there.
 
-Pixels and clip space are those of `warpshadow.camera`. Coverage is decided in integers, so it is exact and the same on
-every device: vertices snap to 1/4096 pixel, a pixel belongs to the face that holds its center, and a center on an edge
-belongs to one of the two faces that share it (the top-left rule). Both sides of a face are drawn. Of the faces over a
-pixel the nearest wins; of equally near ones, that of the lowest index.
+Pixels and clip space are those of `warpshadow.camera`. Coverage is decided in integers, so it is exact:
+vertices snap to 1/4096 pixel, a pixel belongs to the face that holds its center, and a center on an edge
+belongs to one of the two faces that share it (the top-left rule). Both sides of a face are drawn. Of the
+faces over a pixel the nearest wins; of equally near ones, that of the lowest index.
 
 Coverage has no derivative. Barycentrics are recomputed from the face of each pixel, so they do.
 """
@@ -18,15 +18,15 @@ from warpshadow import check
 MAX_SIZE = 1 << 15
 """Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
 
-# Fixed-point pixel positions have 12 fractional bits and, with sign, 29 bits in all. So edge coefficients have at most 30
-# bits, their products with positions 59, and their sums fit 64.
+# Fixed-point pixel positions have 12 fractional bits and, with sign, 29 bits in all. So edge coefficients
+# have at most 30 bits, their products with positions 59, and their sums fit 64.
 _ONE = 1 << 12
 _HALF = _ONE // 2
 _SHIFT = 12
 _LIMIT = 1 << 28
 _WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind the eye or beyond the limit
 
-# Boxes at least this wide have each row trimmed to the span inside the edges; below, testing every pixel is faster.
+# In boxes wider than this each row is trimmed to the span inside the edges; else testing pixels is faster.
 _TRIM_WIDTH = 8
 
 _INT32_MASK = (1 << 32) - 1
@@ -41,8 +41,8 @@ class Fragments:
 
     Args:
         face_ids: Index of the visible face, -1 where there is none, int32, shape [batch, height, width].
-        barycentrics: Perspective-correct weights of the face's three vertices, non-negative with sum 1, zero where
-            there is no face, vec3, shape [batch, height, width].
+        barycentrics: Perspective-correct weights of the face's three vertices, non-negative with sum 1, zero
+            where there is no face, vec3, shape [batch, height, width].
     """
 
     face_ids: wp.array
@@ -66,7 +66,7 @@ def _snap(
     if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2]) and wp.isfinite(p[3])):
         wp.atomic_add(faults, 0, 1)
     corner = wp.vec2i(_WILD, _WILD)
-    depth = float(0.0)
+    depth = 0.0
     if p[3] > 0.0:
         inverse = wp.float64(1.0) / wp.float64(p[3])
         x = (wp.float64(p[0]) * inverse + wp.float64(1.0)) * wp.float64(width * _HALF)
@@ -80,7 +80,7 @@ def _snap(
 
 @wp.func
 def _edge(a: wp.vec2i, b: wp.vec2i):
-    """Line through two snapped vertices: E(x, y) = e0 x + e1 y + e2, positive on the right of a -> b as seen on screen."""
+    """Line through snapped vertices: E(x, y) = e0 x + e1 y + e2, positive to the right of a -> b."""
     x = wp.int64(a[1] - b[1])
     y = wp.int64(b[0] - a[0])
     return _Edge(x, y, -(x * wp.int64(a[0]) + y * wp.int64(a[1])))
@@ -99,8 +99,9 @@ def _pixel_homogeneous(p: wp.vec4, width: int, height: int):
 def _wild_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec2i):
     """Line of an edge with a vertex behind the eye or far away.
 
-    In homogeneous coordinates the line is a x b, wherever its ends are. It is rounded to integers, made to pass through
-    an end that has a snapped position, and computed in one order of a and b, so that both faces of the edge get the same.
+    In homogeneous coordinates the line is a x b, wherever its ends are. It is rounded to integers, made to
+    pass through an end that has a snapped position, and computed in one order of a and b, so that both faces
+    of the edge get the same.
     """
     if a_corner[0] != _WILD and b_corner[0] != _WILD:
         return _edge(a_corner, b_corner)
@@ -141,7 +142,8 @@ def _first_pixel(fixed: int):
 def _at_pixel_centers(edge: _Edge, sign: wp.int64):
     """Edge function of pixel indices instead of positions, non-negative exactly on the pixels inside.
 
-    Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight below it.
+    Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight
+    below it.
     """
     x = sign * edge[0]
     y = sign * edge[1]
@@ -153,7 +155,7 @@ def _at_pixel_centers(edge: _Edge, sign: wp.int64):
 
 @wp.func
 def _trim(span: wp.vec2i, step: wp.int64, value: wp.int64):
-    """Shrink a span of columns to where an edge function may be non-negative, a column to spare on either side."""
+    """Shrink a span of columns to where an edge function may be non-negative, with a column to spare."""
     if step == wp.int64(0):
         return span
     root = -wp.float64(value) / wp.float64(step)
@@ -213,7 +215,7 @@ def _cover(
     keys: wp.array3d(dtype=wp.int64),
     faults: wp.array(dtype=int),
 ):
-    """One thread owns every strip_count-th row of one face: it offers the face to the pixels that the face covers.
+    """One thread owns every strip_count-th row of one face and offers the face to the pixels there.
 
     A pixel keeps the largest key: nearest depth above, lowest face below. Zero is the background.
     """
@@ -230,9 +232,9 @@ def _cover(
     c = corners[instance, k]
     wild = a[0] == _WILD or b[0] == _WILD or c[0] == _WILD
 
-    left = int(0)
+    left = 0
     right = width - 1
-    top = int(0)
+    top = 0
     bottom = height - 1
     if not wild:
         left = wp.max(left, _first_pixel(wp.min(a[0], wp.min(b[0], c[0]))))
@@ -246,7 +248,7 @@ def _cover(
     edge_b = _edge(c, a)
     edge_c = _edge(a, b)
     plane = wp.vec3d()
-    farthest = int(0)
+    farthest = 0
     nearest = int(_DEPTH_ONE + 1)
     sign = wp.int64(1)
     if wild:
@@ -328,11 +330,12 @@ def _resolve(
     face_ids[pixel] = ~wp.int32(keys[pixel])
 
 
-# Pixel kernels run over flat images: on a CPU, splitting an index into instance, row and column takes as long as the rest.
+# Pixel kernels run over flat images: on a CPU, splitting an index into instance, row and column takes as long
+# as the rest.
 @wp.func
 def _instance(pixel: int, pixels_per_instance: int, instance_count: int):
     """Instance of a pixel, without the division where there is only one."""
-    instance = int(0)
+    instance = 0
     if instance_count > 1:
         instance = pixel / pixels_per_instance
     return instance
@@ -340,27 +343,27 @@ def _instance(pixel: int, pixels_per_instance: int, instance_count: int):
 
 @wp.func
 def _relative(p: wp.vec4, ray: wp.vec2):
-    """A vertex in clip space relative to the ray of a pixel: the ray meets it where both coordinates are zero."""
+    """A vertex in clip space relative to the ray of a pixel, which passes through it if both are zero."""
     return wp.vec2(p[0] - ray[0] * p[3], p[1] - ray[1] * p[3])
 
 
 @wp.func
 def _volumes(a: wp.vec2, b: wp.vec2, c: wp.vec2):
-    """Volumes that a ray spans with two vertices each, times a sign that makes them positive inside of the face."""
-    volumes = wp.vec3(b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0])
-    return wp.sign(volumes[0] + volumes[1] + volumes[2]) * volumes
+    """What a ray spans with two vertices each, given relative to it: all of one sign inside of the face."""
+    return wp.vec3(b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0])
 
 
 @wp.func
 def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
-    """Perspective-correct barycentrics of a ray.
+    """Perspective-correct barycentrics: to each other as the volumes that the ray spans in clip space.
 
-    They are to each other as the volumes that the ray spans with two vertices each in clip space. That holds for vertices
-    behind the eye, too, so no clipping is needed; and relative to the ray nothing cancels when a face is small.
+    That holds for vertices behind the eye, too, so no clipping is needed; and relative to the ray nothing
+    cancels when a face is small.
     """
     volumes = _volumes(_relative(a, ray), _relative(b, ray), _relative(c, ray))
+    side = wp.sign(volumes[0] + volumes[1] + volumes[2])
     # A pixel's center may lie outside of the face by what the vertices moved when they snapped.
-    inside = wp.max(volumes, wp.vec3(0.0, 0.0, 0.0))
+    inside = wp.max(side * volumes, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
     if total > 0.0:
         return (1.0 / total) * inside
@@ -369,28 +372,25 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
 
 @wp.func_grad(_weights)
 def _adj_weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_ret: wp.vec3):
-    """The derivative by hand takes half the time of the derivative by rote.
+    """Derivative by hand: the kernel's backward pass takes 1.2 ms instead of 1.7 ms (40 000 pixels on a CPU).
 
-    With volumes v and their sum t, dL/dv_i = (dL/dw_i - Σ_j w_j dL/dw_j) / t, 0 where v_i is negative; v_a = b x c, ...
+    With volumes v, their sum t and weights w = v/t: dL/dv_i = (dL/dw_i - Σ_j w_j dL/dw_j) / t, but 0 where
+    v_i is clamped. A volume of exactly 0, on an edge, is not clamped: meshes aligned with the pixels would
+    lose gradients there.
     """
     at_a = _relative(a, ray)
     at_b = _relative(b, ray)
     at_c = _relative(c, ray)
-    raw = wp.vec3(
-        at_b[0] * at_c[1] - at_b[1] * at_c[0],
-        at_c[0] * at_a[1] - at_c[1] * at_a[0],
-        at_a[0] * at_b[1] - at_a[1] * at_b[0],
-    )
-    side = wp.sign(raw[0] + raw[1] + raw[2])
-    volumes = side * raw
-    inside = wp.max(volumes, wp.vec3(0.0, 0.0, 0.0))
+    volumes = _volumes(at_a, at_b, at_c)
+    side = wp.sign(volumes[0] + volumes[1] + volumes[2])
+    inside = wp.max(side * volumes, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
     if total > 0.0:
         scale = side / total
         mean = wp.dot(inside, adj_ret) / total
-        adj_a = wp.where(volumes[0] < 0.0, 0.0, scale * (adj_ret[0] - mean))
-        adj_b = wp.where(volumes[1] < 0.0, 0.0, scale * (adj_ret[1] - mean))
-        adj_c = wp.where(volumes[2] < 0.0, 0.0, scale * (adj_ret[2] - mean))
+        adj_a = wp.where(side * volumes[0] < 0.0, 0.0, scale * (adj_ret[0] - mean))
+        adj_b = wp.where(side * volumes[1] < 0.0, 0.0, scale * (adj_ret[1] - mean))
+        adj_c = wp.where(side * volumes[2] < 0.0, 0.0, scale * (adj_ret[2] - mean))
         ax = adj_c * at_b[1] - adj_b * at_c[1]
         ay = adj_b * at_c[0] - adj_c * at_b[0]
         bx = adj_a * at_c[1] - adj_c * at_a[1]
@@ -462,8 +462,8 @@ def _interpolation(dtype: type):
 def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:
     """Find the face that each pixel sees, and where on that face.
 
-    A face is drawn where it holds a pixel's center, however small it is, where 0 < z <= w (between the near plane and
-    infinity); a face without area draws nothing.
+    A face is drawn where it holds a pixel's center, however small it is, where 0 < z <= w (between the near
+    plane and infinity); a face without area draws nothing.
 
     Args:
         clip_positions: Vertices in clip space (`warpshadow.camera.to_clip`), vec4, shape [batch, vertex].
@@ -473,11 +473,14 @@ def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int
     Returns:
         Fragments. Distances along the view are ``interpolate(fragments, faces, w)``.
     Raises:
-        ValueError: naming the argument; so for NaN or Inf positions and for indices of no vertex. (Reading the two
-            counts back waits for the device. While a CUDA graph is captured that cannot be, and nothing is checked.)
-    Differentiable: barycentrics in clip_positions, but where they are clamped to 0 because snapping put the pixel just outside of
-        the face. Not: face_ids.
+        ValueError: naming the argument; so for NaN or Inf positions and for indices of no vertex. (Reading
+            the two counts back waits for the device. While a CUDA graph is captured that cannot be, and
+            nothing is checked.)
+    Differentiable: barycentrics in clip_positions. Not: face_ids; nor a weight that is clamped to 0 where
+        snapping put a pixel's center just outside of its face.
     """
+    check.shape("clip_positions", clip_positions.shape, ("batch", "vertex"))
+    check.shape("faces", faces.shape, ("face",))
     for name, size in (("width", width), ("height", height)):
         if not 1 <= size <= MAX_SIZE:
             raise ValueError(f"{name}: got {size!r}, expected 1 to {MAX_SIZE} pixels")
@@ -494,8 +497,11 @@ def barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) 
         clip_positions: Vertices in clip space, vec4, shape [batch, vertex].
     Returns:
         Perspective-correct weights of the face's three vertices, vec3, shape [batch, height, width].
+    Raises:
+        ValueError: when the batches differ.
     Differentiable: clip_positions. Not: face_ids.
     """
+    check.shape("clip_positions", clip_positions.shape, (face_ids.shape[0], "vertex"))
     device = clip_positions.device
     weights = wp.zeros(face_ids.shape, dtype=wp.vec3, device=device, requires_grad=clip_positions.requires_grad)
     _, height, width = face_ids.shape
@@ -514,10 +520,10 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
 
     Args:
         fragments: What each pixel sees.
-        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology of the
-            same mesh (uv_faces), face by face.
-        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute]; batch may be 1 and then
-            serves every instance.
+        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology
+            of the same mesh (uv_faces), face by face.
+        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute]; batch may be 1
+            and then serves every instance.
     Returns:
         Image, dtype of the attributes, shape [batch, height, width], zero where there is no face.
     Raises:
@@ -553,7 +559,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
 
 
 def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> wp.array:
-    """Index of the nearest face over each pixel, -1 where there is none, int32, shape [batch, height, width]."""
+    """Nearest face over each pixel, -1 where there is none, int32, shape [batch, height, width]."""
     device = clip_positions.device
     batch_count, vertex_count = clip_positions.shape
     corners = wp.empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
@@ -591,10 +597,12 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:
-            raise ValueError(f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}")
+            raise ValueError(
+                f"faces: got {bad_face_count} with an index out of range, expected 0 to {vertex_count - 1}"
+            )
     return face_ids
 
 
 def _strip_count(device: wp.Device) -> int:
-    """Threads among which the rows of a face are dealt: on CUDA several, so that none draws a huge face alone."""
+    """Threads that share the rows of a face: on CUDA several, so that none draws a huge face alone."""
     return 16 if device.is_cuda else 1

@@ -1,4 +1,4 @@
-"""What the approximations are judged by: visibility of the mesh itself, by rays through its bounding volume hierarchy."""
+"""What the approximations are judged by: the mesh itself, by rays through its bounding volume hierarchy."""
 
 from __future__ import annotations
 
@@ -52,19 +52,23 @@ def trace_visibility(
 ) -> wp.array:
     """Trace which directions every receiver sees past the mesh, exactly.
 
-    Rays start ``offset`` above the receiver along its normal, so that a point of the mesh does not block itself.
-    Directions below a receiver's horizon (n·ω ≤ 0) receive no light from there; they are not traced and count as blocked.
+    Rays start ``offset`` above the receiver along its normal, so that a point of the mesh does not block
+    itself. Directions below a receiver's horizon (n·ω ≤ 0) are not traced and count as blocked.
 
     Args:
         mesh: The blockers in scene units, one mesh for all batches; build it once, it holds the hierarchy.
         points: Receiver positions [scene units], vec3, shape [batch, vertex].
         normals: Unit normals of the receivers, vec3, shape [batch, vertex].
         directions: Unit directions toward the light, vec3, shape [direction].
-        offset: Start of the rays above the receivers [scene units]; by default 1e-4 of the diagonal of the mesh's bounding box.
+        offset: Start of the rays above the receivers [scene units]; by default 1e-4 of the diagonal of the
+            mesh's bounding box.
+
     Returns:
         1 where the ray escapes, else 0; uint8, shape [batch, vertex, direction].
+
     Raises:
         ValueError: naming the argument whose shape or value does not fit.
+
     Differentiable: no.
     """
     check.shape("points", points.shape, ("batch", "vertex"))
@@ -168,9 +172,8 @@ def _trace_shading(
     for sample in range(directions.shape[1]):
         toward = directions[chosen, sample]
         cosine = wp.dot(normal, toward)
-        if cosine > 0.0:
-            if not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
-                total += cosine * radiance[chosen, sample]
+        if cosine > 0.0 and not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
+            total += cosine * radiance[chosen, sample]
     shading[receiver] = total / wp.pi
 
 

@@ -6,14 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import reference, shading
+from warpshadow import sh, shading
 from warpshadow.basis import Basis, CellBasis, HarmonicBasis
-from warpshadow.blockers import scene_blockers
+from warpshadow.blockers import Blockers, scene_blockers
 from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.raster import Fragments, interpolate, rasterize
+from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
 from warpshadow.visibility import directional, log_sh
 
@@ -45,24 +46,28 @@ class Renderer:
     Args:
         scene: The scene.
         device: Warp device, "cpu" by default.
-        basis: What free light is expressed in; None for what the method computes in: cells of directions
-            ("directional") or spherical harmonics.
+        basis: What free light is expressed in (:attr:`transfer`); None for what the method computes in: cells of
+            directions ("directional") or spherical harmonics.
         progress: Show progress where something takes longer than a second.
     """
 
     def __init__(
-        self, scene: Scene, *, device: wp.DeviceLike = "cpu", basis: Basis | None = None, progress: bool = False
+        self,
+        scene: Scene,
+        *,
+        device: wp.DeviceLike = "cpu",
+        basis: Basis | None = None,
+        progress: bool = False,
     ):
         self.scene = scene
         self.device = wp.get_device(device)
         self.progress = progress
         visibility = scene.visibility
-        self._cells = fibonacci(visibility.directions)
-        own_basis = (
-            CellBasis(self._cells) if visibility.method == "directional" else HarmonicBasis(visibility.order)
+        is_cellular = visibility.method == "directional"
+        self._own_basis = (
+            CellBasis(fibonacci(visibility.directions)) if is_cellular else HarmonicBasis(visibility.order)
         )
-        self._own_basis = own_basis
-        self.basis = own_basis if basis is None else basis
+        self.basis = self._own_basis if basis is None else basis
 
     # ------------------------------------------------------------------------------------------ what stands still
 
@@ -76,16 +81,15 @@ class Renderer:
         first_uv = np.cumsum([0] + [len(uv) for uv in uvs])
         positions = self._array(np.concatenate([mesh.positions for mesh in meshes])[None], wp.vec3)
         faces = self._array(
-            np.concatenate([mesh.faces + first for mesh, first in zip(meshes, first_vertex, strict=False)]), wp.vec3i
+            np.concatenate([mesh.faces + first for mesh, first in zip(meshes, first_vertex, strict=False)]),
+            wp.vec3i,
         )
         return Geometry(
             positions,
             vertex_normals(positions, faces),
             faces,
             self._array(np.concatenate(uvs)[None], wp.vec2),
-            self._array(
-                np.concatenate([uv + first for uv, first in zip(uv_faces, first_uv, strict=False)]), wp.vec3i
-            ),
+            self._array(np.concatenate([uv + first for uv, first in zip(uv_faces, first_uv, strict=False)]), wp.vec3i),
             np.repeat(np.arange(len(meshes)), [mesh.face_count for mesh in meshes]),
             first_vertex,
         )
@@ -136,30 +140,36 @@ class Renderer:
         )
 
     @functools.cached_property
+    def blockers(self) -> Blockers:
+        """The spheres of all bodies."""
+        return scene_blockers(self.scene, device=self.device, progress=self.progress)
+
+    @functools.cached_property
     def transfer(self) -> wp.array:
         """Transfer vectors of the receivers to :attr:`basis`, float32 of shape [1, receiver, coefficient]."""
+        if self.scene.visibility.method == "ray-traced":
+            points, normals, *_ = self.receivers
+            count = self.scene.visibility.samples
+            traced = trace_transfer(self._ray_mesh, points[0], normals[0], self.basis, count, progress=self.progress)
+            return traced.reshape((1, *traced.shape))
+        if isinstance(self._own_basis, CellBasis):
+            return self._to_basis(self._cell_transfer(self._own_basis.directions))
+        return self._to_basis(self._harmonic_transfer())
+
+    def _cell_transfer(self, directions: np.ndarray) -> wp.array:
+        points, normals, *_ = self.receivers
+        softness = self.scene.visibility.softness
+        seen = directional.transmittance(points, normals, *self.blockers, directions, softness=softness)
+        return shading.directional_transfer(seen, normals, directions)
+
+    def _harmonic_transfer(self) -> wp.array:
         points, normals, *_ = self.receivers
         visibility = self.scene.visibility
-        if visibility.method == "ray-traced":
-            traced = reference.trace_transfer(
-                self._ray_mesh, points[0], normals[0], self.basis, visibility.samples, progress=self.progress
-            )
-            return traced.reshape((1, *traced.shape))
-        blockers = None
-        if visibility.method != "none":
-            blockers = scene_blockers(self.scene, device=self.device, progress=self.progress)
-        if visibility.method == "directional":
-            transfer = directional.transmittance(
-                points, normals, *blockers, self._cells, softness=visibility.softness
-            )
-            transfer = shading.directional_transfer(transfer, normals, self._cells)
-        else:
-            seen = None
-            if blockers is not None and blockers.radii.size:
-                log = log_sh.accumulate(points, normals, *blockers, order=visibility.order, log=visibility.log)
-                seen = log_sh.exponentiate(log, base=visibility.base)
-            transfer = shading.sh_transfer(seen, normals, order=visibility.order)
-        return self._to_basis(transfer)
+        seen = None
+        if visibility.method == "log-sh" and self.blockers.radii.size:
+            log = log_sh.accumulate(points, normals, *self.blockers, order=visibility.order, log=visibility.log)
+            seen = log_sh.exponentiate(log, base=visibility.base)
+        return shading.sh_transfer(seen, normals, order=visibility.order)
 
     def _to_basis(self, transfer: wp.array) -> wp.array:
         """Take transfer vectors from what the method computes in to what the light is expressed in."""
@@ -187,30 +197,38 @@ class Renderer:
         """Texture coordinates of the samples, vec2 of shape [1, height, width]."""
         return interpolate(self.fragments, self.geometry.uv_faces, self.geometry.uvs)
 
-    # ------------------------------------------------------------------------------------------ what may vary
+    @functools.cached_property
+    def scene_shading(self) -> wp.array:
+        """The receivers in the scene's light, each as a white surface: vec3 of shape [1, receiver]."""
+        return self.shade(self.scene.light)
 
-    def light_coefficients(self, light: EnvironmentMap | np.ndarray) -> wp.array:
-        """Express light in :attr:`basis`: vec3 of shape [1, coefficient]."""
-        return self._array(self.basis.coefficients(light)[None], wp.vec3)
+    def shade(self, light: EnvironmentMap | np.ndarray) -> wp.array:
+        """Light the receivers, each as a white surface, as accurately as the method can for known light.
 
-    def shade(self, light: EnvironmentMap | np.ndarray | None = None) -> wp.array:
-        """Light the receivers, each as a white surface: vec3 of shape [1, receiver]."""
-        light = self.scene.light if light is None else light
-        if self.scene.visibility.method == "ray-traced":
+        Args:
+            light: Environment map or SH coefficients [order², 3].
+
+        Returns:
+            Shading, vec3 of shape [1, receiver].
+        """
+        method = self.scene.visibility.method
+        if method == "ray-traced":
             return self._trace(light)
-        return shading.shade(self.transfer, self.light_coefficients(light))
+        if method == "directional":
+            cells = self._own_basis.directions
+            # a cell looks to where its light comes from: a sun is rarely in the middle
+            aims = light.cell_moments(cells).directions if isinstance(light, EnvironmentMap) else cells
+            transfer = self._cell_transfer(aims)
+        else:
+            transfer = self._harmonic_transfer()
+        return shading.shade(transfer, self._array(self._own_basis.coefficients(light)[None], wp.vec3))
 
     def _trace(self, light: EnvironmentMap | np.ndarray) -> wp.array:
-        if isinstance(light, EnvironmentMap):
-            radiance = light.radiance
-        else:
-            from warpshadow import sh
-
-            radiance = sh.reconstruct_map(light, 64)
+        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
         count = max(1, self.scene.visibility.samples // self.scene.supersampling**2)
-        samples = reference.sample_map(radiance, count)
         points, normals, *_ = self.receivers
-        traced = reference.trace_shading(self._ray_mesh, points[0], normals[0], samples, progress=self.progress)
+        samples = sample_map(radiance, count)
+        traced = trace_shading(self._ray_mesh, points[0], normals[0], samples, progress=self.progress)
         return traced.reshape((1, -1))
 
     @functools.cached_property
@@ -218,10 +236,7 @@ class Renderer:
         """Reflectance that the samples see, vec3 of shape [1, height, width]."""
         counts = np.diff(self.geometry.first_vertex)
         of_vertices = np.concatenate(
-            [
-                np.broadcast_to(body.albedo, (count, 3))
-                for body, count in zip(self.scene.bodies, counts, strict=True)
-            ]
+            [np.broadcast_to(body.albedo, (count, 3)) for body, count in zip(self.scene.bodies, counts, strict=True)]
         )
         albedo = interpolate(self.fragments, self.geometry.faces, self._array(of_vertices[None], wp.vec3))
         for number, body in enumerate(self.scene.bodies):
@@ -240,8 +255,8 @@ class Renderer:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
         """
         receivers = self.receivers
-        irradiance = interpolate(receivers.fragments, receivers.faces, self.shade(light))
-        color = irradiance.numpy()[0] * self.albedo.numpy()[0]
+        lit = self.scene_shading if light is None else self.shade(light)
+        color = interpolate(receivers.fragments, receivers.faces, lit).numpy()[0] * self.albedo.numpy()[0]
         coverage = (self.body_ids >= 0).astype(np.float32)
         samples = np.concatenate([color, coverage[..., None]], axis=-1)
         factor = self.scene.supersampling

@@ -106,7 +106,9 @@ class Body:
         object.__setattr__(self, "albedo", albedo)
         if self.texture is not None:
             if self.mesh.uvs is None:
-                raise ValueError(f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs")
+                raise ValueError(
+                    f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs"
+                )
             texture = np.array(self.texture, np.float32)
             check.shape("texture", texture.shape, ("height", "width", 3))
             check.finite("texture", texture)
@@ -133,9 +135,7 @@ class Body:
 
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""
-        return self.mesh.transformed(
-            rotation=self.rotation_matrix(), translation=self.translation, scale=self.scale
-        )
+        return self.mesh.transformed(rotation=self.rotation_matrix(), translation=self.translation, scale=self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def _camera(table: dict[str, Any]) -> Camera:
 def _light(table: dict[str, Any], folder: Path) -> EnvironmentMap | np.ndarray:
     check.known_keys("key", table, _LIGHT_KEYS)
     if ("envmap" in table) == ("sh" in table):
-        raise ValueError("expected either envmap = \"FILE\" or sh = [[r, g, b], …]")
+        raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
     rotation, scale = _number(table, "rotation", 0.0), _number(table, "scale", 1.0)
     if "envmap" in table:
         light = EnvironmentMap.read(folder / _text(table, "envmap"))

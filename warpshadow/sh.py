@@ -129,9 +129,7 @@ def equirectangular_directions(height: int) -> np.ndarray:
     theta = np.pi * (np.arange(height) + 0.5)[:, None] / height
     phi = np.pi * (np.arange(2 * height) + 0.5)[None, :] / height
     ring = np.sin(theta)
-    return np.stack(
-        np.broadcast_arrays(np.sin(phi) * ring, np.cos(theta), -np.cos(phi) * ring), axis=-1
-    )
+    return np.stack(np.broadcast_arrays(np.sin(phi) * ring, np.cos(theta), -np.cos(phi) * ring), axis=-1)
 
 
 def pixel_solid_angles(height: int) -> np.ndarray:

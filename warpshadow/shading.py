@@ -2,9 +2,9 @@
 
     B(x) = a(x)/π ∫ L(ω) V(ω, x) max(n·ω, 0) dω
 
-is linear in the light, so a receiver that stands still has a *transfer vector* T with B = a · (T · L): its coefficients
-belong to the light's, either spherical harmonics or cells of directions. The 1/π is in T: white under L = 1, unoccluded,
-gives 1. *Shading* below is T · L, the radiance of a white surface.
+is linear in the light, so a receiver that stands still has a *transfer vector* T with B = a · (T · L): its
+coefficients belong to the light's, either spherical harmonics or cells of directions. The 1/π is in T: white under
+L = 1, unoccluded, gives 1. *Shading* below is T · L, the radiance of a white surface.
 """
 
 import functools
@@ -139,6 +139,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
     check_count("directions", count)
     check.shape("transmittance", transmittance.shape, (*normals.shape, count))
     device = normals.device
+    transmittance = transmittance.contiguous()  # to be viewed as chunks
     transfer = wp.empty_like(transmittance)
     shape = (*normals.shape, count // CHUNK)
     wp.launch(

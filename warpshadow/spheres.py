@@ -37,7 +37,7 @@ from warpshadow.mesh import Mesh, vertex_normals
 from warpshadow.reference import trace_visibility
 from warpshadow.visibility.cones import BLEND, FADE
 
-ALGORITHM_VERSION = 1
+ALGORITHM_VERSION = 2
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
 
 LANES = 16
@@ -71,9 +71,7 @@ class Spheres:
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if len(self.centers) != len(self.radii):
-            raise ValueError(
-                f"radii: got {len(self.radii)} radii for {len(self.centers)} centers, expected one each"
-            )
+            raise ValueError(f"radii: got {len(self.radii)} radii for {len(self.centers)} centers, expected one each")
         if (self.radii < 0).any():
             raise ValueError(f"radii: got {self.radii.min()}, expected radii that are not negative")
 
@@ -168,8 +166,8 @@ class SphereFit(NamedTuple):
 @wp.func
 def _cone_cosine(distance: float):
     """Cosine of a sphere's cone, as warpshadow.visibility.cones has it, and its slope; distance in radii."""
-    cosine = float(0.0)
-    slope = float(0.0)
+    cosine = 0.0
+    slope = 0.0
     if distance >= 1.0 + BLEND:
         cosine = wp.sqrt(1.0 - 1.0 / (distance * distance))
         slope = 1.0 / (distance * distance * distance * cosine)
@@ -298,9 +296,7 @@ class _Body:
         points = wp.array(positions, dtype=wp.vec3, device=device)
         normals = vertex_normals(points.reshape((1, -1)), wp.array(faces, dtype=wp.vec3i, device=device))
         self.normals = normals.numpy()[0].astype(np.float64)
-        self.mesh = wp.Mesh(
-            points, wp.array(faces.ravel(), dtype=wp.int32, device=device), support_winding_number=True
-        )
+        self.mesh = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device), support_winding_number=True)
         corners = positions[faces].astype(np.float64)
         edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(edges, axis=1)
@@ -347,7 +343,7 @@ class _Body:
 
 
 def _medial_balls(body: _Body, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Balls inside the mesh that touch it at random points, as large as they can be: [ball, (x, y, z, radius)].
+    """Balls inside the mesh that touch it at random points, as large as fit: [ball, (x, y, z, radius)].
 
     A ball that touches the surface at p shrinks until it contains no other point of it.
     """
@@ -383,9 +379,7 @@ def _start(body: _Body, count: int, rng: np.random.Generator) -> tuple[np.ndarra
     left = np.concatenate(shares).astype(np.float32)
 
     reach = balls[:, 3] + 0.1 * spacing
-    squares = (
-        (balls[:, :3] ** 2).sum(axis=1)[:, None] + (samples**2).sum(axis=1) - 2 * balls[:, :3] @ samples.T
-    )
+    squares = (balls[:, :3] ** 2).sum(axis=1)[:, None] + (samples**2).sum(axis=1) - 2 * balls[:, :3] @ samples.T
     covers = (squares < reach[:, None] ** 2).astype(np.float32)
     picked = np.zeros(len(balls), bool)
     chosen = []
@@ -420,8 +414,8 @@ def _soft_edge(distance: float, width: float):
     sw = wp.sin(width)
     lo = cosine * cw - sine * sw
     lo_slope = (cw + cotangent * sw) * slope
-    hi = float(1.0)
-    hi_slope = float(0.0)
+    hi = 1.0
+    hi_slope = 0.0
     if cosine < cw:
         hi = cosine * cw + sine * sw
         hi_slope = (cw - cotangent * sw) * slope
@@ -481,15 +475,14 @@ def _transmit(
             axis = edge[1] * axes[i, sphere]
             t = axis[0] * x + axis[1] * y + axis[2] * z - _Lane(edge[0] * edge[1])
             t = wp.min(wp.max(t, _Lane(0.0)), _Lane(1.0))
-            passing = wp.cw_mul(
-                passing, _Lane(1.0) - edge[2] * wp.cw_mul(wp.cw_mul(t, t), _Lane(3.0) - 2.0 * t)
-            )
+            passing = wp.cw_mul(passing, _Lane(1.0) - edge[2] * wp.cw_mul(wp.cw_mul(t, t), _Lane(3.0) - 2.0 * t))
     transmittance[i, q] = passing
 
 
-# With t = (u·ω − lo)/(hi − lo) clamped to [0, 1], s = t²(3 − 2t) and the gradient by log T_q in `upstream`, the
-# factor 1 − A s of one sphere has d log T/ds = −A/(1 − A s), ds/dt = 6 t(1 − t). Six sums over the directions
-# hold every derivative: of g (x, y, z), g and g t with g = upstream t(1 − t)/(1 − A s), and of upstream s/(1 − A s).
+# With t = (u·ω − lo)/(hi − lo) clamped to [0, 1], s = t²(3 − 2t) and the gradient by log T_q in `upstream`,
+# the factor 1 − A s of one sphere has d log T/ds = −A/(1 − A s), ds/dt = 6 t(1 − t). Six sums over the
+# directions hold every derivative: of g (x, y, z), g and g t, with g = upstream t(1 − t)/(1 − A s), and of
+# upstream s/(1 − A s).
 # In C++ because its sums stay in vector registers: for 256 receivers × 64 spheres × 128 directions it takes
 # 1.1 ms on one core, Warp's own vectors 5.7 ms.
 _EDGE_SUMS = f"""
@@ -506,7 +499,7 @@ for (int q = 0; q < count; q += {LANES}) {{
         t = t > 1.f ? 1.f : t;
         const float s = t * t * (3.f - 2.f * t);
         float passing = 1.f - edge[2] * s;
-        passing = passing < 1e-4f ? 1e-4f : passing;
+        passing = passing < 1e-6f ? 1e-6f : passing;
         const float share = up[q + l] / passing;
         const float g = share * t * (1.f - t);
         s0[l] += g * x[q + l];
@@ -571,7 +564,7 @@ def _transmit_backward(
 
 
 def _hemisphere(count: int) -> np.ndarray:
-    """Directions about z with the cosine as density, so that each stands for as much irradiance [count, 3]."""
+    """Directions about z with the cosine as density: each stands for as much irradiance [count, 3]."""
     i = np.arange(count) + 0.5
     radius, azimuth = np.sqrt(i / count), i * np.pi * (1 + np.sqrt(5))
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], axis=1)
@@ -608,12 +601,12 @@ class _Refinement:
     """Receivers around a body, what they see past it, and how the spheres' view differs."""
 
     DIRECTIONS = 128
-    RECEIVERS = 6144
+    RECEIVERS = 12288
     BATCH = 256
-    WIDTHS = (0.12, 0.05)
+    WIDTHS = (0.1, 0.04)
     """Soft edge of the cones [radians], first and last."""
     RATE = 0.003
-    """Learning rate of the centers; ten times that for the logarithm of the radii."""
+    """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
     VISIBLE_FLOOR = 0.2
     """Weight of receivers that nothing can see, next to 1 for those in the open."""
     RELOCATIONS = 9
@@ -655,21 +648,14 @@ class _Refinement:
         surface, surface_normals = (np.concatenate(pair) for pair in zip(at_vertices, between, strict=True))
 
         square = rng.uniform(-1, 1, size=(ground_count, 2))
-        square *= (
-            1.25 * body.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5
-        )  # denser near the body
-        drop = np.where(rng.uniform(size=ground_count) < 0.25, 0.3 * body.longest, 0.0) * rng.uniform(
-            size=ground_count
-        )
+        square *= 1.25 * body.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
+        drop = np.where(rng.uniform(size=ground_count) < 0.25, 0.3 * body.longest, 0.0) * rng.uniform(size=ground_count)
         ground = np.column_stack([square[:, 0], body.low[1] - 1e-5 - drop, square[:, 1]])
         ground_normals = np.tile([0.0, 1.0, 0.0], (ground_count, 1))
 
         away = rng.normal(size=(shell_count, 3))
         away *= (
-            rng.uniform(size=(shell_count, 1)) ** 2
-            * 0.5
-            * body.longest
-            / np.linalg.norm(away, axis=1, keepdims=True)
+            rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * body.longest / np.linalg.norm(away, axis=1, keepdims=True)
         )
         shell = body.sample(shell_count, rng)[0] + away
         closest, inside = body.closest(shell)
@@ -678,9 +664,7 @@ class _Refinement:
         toward += 0.5 * rng.normal(size=toward.shape)
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         shell[inside], toward[inside] = surface[:shell_count][inside], surface_normals[:shell_count][inside]
-        return np.concatenate([surface, ground, shell]), np.concatenate(
-            [surface_normals, ground_normals, toward]
-        )
+        return np.concatenate([surface, ground, shell]), np.concatenate([surface_normals, ground_normals, toward])
 
     def _project(self, chosen: wp.array, spheres: wp.array, width: float) -> tuple[wp.array, wp.array]:
         shape = (len(chosen), len(spheres))
@@ -729,11 +713,7 @@ class _Refinement:
         rng = self.rng
         chosen = rng.choice(self.RECEIVERS, 384, replace=False)
         near = spheres[rng.choice(len(spheres), 75)]
-        near = (
-            near * [1, 1, 1, 0]
-            + 0.8 * near[:, 3:] * rng.normal(size=(75, 4)) * [1, 1, 1, 0]
-            + near * [0, 0, 0, 1]
-        )
+        near = near * [1, 1, 1, 0] + 0.8 * near[:, 3:] * rng.normal(size=(75, 4)) * [1, 1, 1, 0] + near * [0, 0, 0, 1]
         near[:, 3] *= rng.uniform(0.4, 1.0, size=75)
         fresh = balls[rng.choice(len(balls), 75)]
         fresh[:, 3] = np.minimum(fresh[:, 3], 2 * np.median(spheres[:, 3])) * rng.uniform(0.5, 1.1, size=75)
@@ -767,9 +747,9 @@ class _Refinement:
         spheres = spheres.astype(np.float64)
         mean, square = np.zeros_like(spheres), np.zeros_like(spheres)
         age = np.zeros((len(spheres), 1))
-        relocations = (
-            set(np.linspace(0, 0.6 * steps, self.RELOCATIONS + 1).astype(int)[1:]) if steps > 50 else set()
-        )
+        relocation_count = min(self.RELOCATIONS, steps // 100)
+        relocations = set(np.linspace(0, 0.6 * steps, relocation_count + 1).astype(int)[1:])
+        first_rate = self.RATE * min(1.0, np.sqrt(64 / len(spheres)))
         queue = np.zeros(0, int)
         for step in range(steps):
             done = step / steps
@@ -785,7 +765,7 @@ class _Refinement:
             mean += 0.1 * (gradient - mean)
             square += 0.01 * (gradient**2 - square)
             move = mean / (1 - 0.9**age) / (np.sqrt(square / (1 - 0.99**age)) + 1e-12)
-            rate = self.RATE * 0.5 * (1 + np.cos(np.pi * done))
+            rate = first_rate * 0.5 * (1 + np.cos(np.pi * done))
             spheres[:, :3] -= rate * move[:, :3]
             spheres[:, 3] *= np.exp(-10 * rate * move[:, 3])
             yield spheres
@@ -828,23 +808,17 @@ def _measure(body: _Body, spheres: np.ndarray, seconds: float) -> FitReport:
     up = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
 
     surface, _, _ = body.sample(4000, rng)
-    gaps = (
-        np.linalg.norm(surface[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
-        if len(spheres)
-        else None
-    )
+    gaps = np.linalg.norm(surface[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3] if len(spheres) else None
     volumes = spheres[:, 3] ** 3
     outside_volume = 0.0
     if volumes.sum() > 0:
         owner = rng.choice(len(spheres), 4000, p=volumes / volumes.sum())
         inside_ball = rng.normal(size=(4000, 3))
-        inside_ball *= rng.uniform(size=(4000, 1)) ** (1 / 3) / np.linalg.norm(
-            inside_ball, axis=1, keepdims=True
-        )
+        inside_ball *= rng.uniform(size=(4000, 1)) ** (1 / 3) / np.linalg.norm(inside_ball, axis=1, keepdims=True)
         points = spheres[owner, :3] + inside_ball * spheres[owner, 3:]
-        shared = (
-            np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) <= spheres[:, 3] * (1 + 1e-6)
-        ).sum(axis=1)
+        shared = (np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) <= spheres[:, 3] * (1 + 1e-6)).sum(
+            axis=1
+        )
         share = 1 / np.maximum(shared, 1)
         outside_volume = float(share[~body.closest(points)[1]].sum() / share.sum())
     return FitReport(
@@ -931,9 +905,7 @@ def _search(fit: partial, error: float) -> tuple[np.ndarray, FitReport]:
         failed, count = count, 2 * count
         best = fit(count)
     if best[1].visibility_error > error:
-        message = (
-            f"error: {error} is not met with {count} spheres; the fit has {best[1].visibility_error:.4f}"
-        )
+        message = f"error: {error} is not met with {count} spheres; the fit has {best[1].visibility_error:.4f}"
         warnings.warn(message, stacklevel=3)
         return best
     while count - failed > max(count // 8, 1):
@@ -965,9 +937,7 @@ def _fit(
         rng = np.random.default_rng(seed)
         spheres, balls = _start(body, count, rng)
         refined = _Refinement(body, rng).run(spheres, balls, steps) if steps else iter(())
-        with tqdm(
-            total=steps, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False
-        ) as bar:
+        with tqdm(total=steps, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False) as bar:
             for refined_spheres in refined:
                 spheres = refined_spheres
                 bar.update()
@@ -1060,9 +1030,7 @@ def plot_spheres(mesh: Mesh, spheres: Spheres, path: str | Path) -> None:
         triangles = mesh.positions[mesh.faces[::stride]][:, :, upright] * [1, -1, 1]
         axes.add_collection3d(Poly3DCollection(triangles, facecolors="0.5", alpha=0.12))
         for center, radius in zip(spheres.centers[:, upright] * [1, -1, 1], spheres.radii, strict=True):
-            axes.plot_surface(
-                *(center[:, None, None] + radius * ball), color="tab:orange", alpha=0.6, linewidth=0
-            )
+            axes.plot_surface(*(center[:, None, None] + radius * ball), color="tab:orange", alpha=0.6, linewidth=0)
         for set_limits, axis, sign in ((axes.set_xlim, 0, 1), (axes.set_ylim, 2, -1), (axes.set_zlim, 1, 1)):
             set_limits(sign * middle[axis] - half, sign * middle[axis] + half)
         axes.set_box_aspect((1, 1, 1))

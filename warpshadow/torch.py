@@ -4,17 +4,19 @@ Geometry and camera stand still, so visibility and rasterization are computed on
 included; an iteration is a matrix product and a gather.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 import warp as wp
 
-from warpshadow import check, shading
+from warpshadow import check
 from warpshadow.basis import Basis
 from warpshadow.raster import interpolate
 from warpshadow.renderer import Renderer
 from warpshadow.scene import Scene
+from warpshadow.shading import sample_texture
 
 
 class TorchRenderer(torch.nn.Module):
@@ -38,12 +40,17 @@ class TorchRenderer(torch.nn.Module):
     ):
         super().__init__()
         self.renderer = Renderer(scene, device=str(device), basis=basis, progress=progress)
-        transfer = wp.to_torch(self.renderer.transfer)[0]
-        self.register_buffer("transfer", transfer, persistent=False)
-        light = torch.from_numpy(self.renderer.basis.coefficients(scene.light))
-        self.register_buffer("scene_light", light.to(transfer.device), persistent=False)
-        coverage = torch.from_numpy(self.renderer.body_ids >= 0).to(transfer)
-        self.register_buffer("coverage", coverage[..., None], persistent=False)
+        self.device = torch.device(device)
+
+    @functools.cached_property
+    def transfer(self) -> torch.Tensor:
+        """Transfer vectors to free light, shape [receiver, coefficient]."""
+        return wp.to_torch(self.renderer.transfer)[0]
+
+    @functools.cached_property
+    def coverage(self) -> torch.Tensor:
+        """1 where a sample sees a body, shape [height, width, 1]."""
+        return torch.from_numpy(self.renderer.body_ids >= 0).to(self.device, torch.float32)[..., None]
 
     def forward(
         self, light: torch.Tensor | None = None, albedo: Sequence[torch.Tensor | None] | None = None
@@ -51,8 +58,8 @@ class TorchRenderer(torch.nn.Module):
         """Render the image.
 
         Args:
-            light: Coefficients of the light in ``renderer.basis``, linear RGB, float32 of shape [coefficient, 3];
-                the scene's by default.
+            light: Coefficients of the light in ``renderer.basis``, linear RGB, float32 of shape [coefficient, 3]. By
+                default the scene's light, which is shaded once, more accurately than free light can be.
             albedo: For each body, its reflectance in linear RGB, float32: one color [3], one for each vertex
                 [vertex, 3], or a texture [height, width, 3], which needs uvs; None for the scene's.
 
@@ -64,10 +71,9 @@ class TorchRenderer(torch.nn.Module):
 
         Differentiable: light, albedo. Exact, both being linear in the image.
         """
-        light = self.scene_light if light is None else light
-        _check_tensor("light", light, self.transfer, [tuple(self.scene_light.shape)])
         receivers = self.renderer.receivers
-        shaded = apply(lambda values: interpolate(receivers.fragments, receivers.faces, values), self._shade(light))
+        shading = wp.to_torch(self.renderer.scene_shading) if light is None else self._shade(light)
+        shaded = apply(lambda values: interpolate(receivers.fragments, receivers.faces, values), shading)
         color = shaded[0] * self._albedo_image(albedo)
         samples = torch.cat([color, self.coverage], dim=-1)
         factor = self.renderer.scene.supersampling
@@ -75,6 +81,7 @@ class TorchRenderer(torch.nn.Module):
         return samples.reshape(height // factor, factor, width // factor, factor, 4).mean(dim=(1, 3))
 
     def _shade(self, light: torch.Tensor) -> torch.Tensor:
+        _check_tensor("light", light, self.device, [(self.renderer.basis.size, 3)])
         return (self.transfer @ light)[None]
 
     def _albedo_image(self, albedo: Sequence[torch.Tensor | None] | None) -> torch.Tensor:
@@ -90,8 +97,8 @@ class TorchRenderer(torch.nn.Module):
             if values is None:
                 continue
             shapes = [(3,), (body.mesh.vertex_count, 3)] + [("height", "width", 3)] * (body.mesh.uvs is not None)
-            _check_tensor(f"albedo[{number}]", values, self.transfer, shapes)
-            shows = torch.from_numpy(renderer.body_ids == number).to(self.transfer.device)[..., None]
+            _check_tensor(f"albedo[{number}]", values, self.device, shapes)
+            shows = torch.from_numpy(renderer.body_ids == number).to(self.device)[..., None]
             image = torch.where(shows, self._body_albedo(number, values), image)
         return image
 
@@ -104,7 +111,7 @@ class TorchRenderer(torch.nn.Module):
 
             def sample(texture: wp.array) -> wp.array:
                 image = wp.zeros(renderer.uvs.shape, dtype=wp.vec3, device=renderer.device, requires_grad=True)
-                shading.sample_texture(texture, pixels, renderer.uvs.flatten(), image.flatten())
+                sample_texture(texture, pixels, renderer.uvs.flatten(), image.flatten())
                 return image
 
             return apply(sample, values)[0]
@@ -149,13 +156,13 @@ def _current_stream(tensor: torch.Tensor) -> wp.ScopedStream:
     return wp.ScopedStream(wp.stream_from_torch() if tensor.is_cuda else None)
 
 
-def _check_tensor(name: str, tensor: torch.Tensor, like: torch.Tensor, shapes: list[tuple]) -> None:
+def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shapes: list[tuple]) -> None:
     """Raise ValueError unless a tensor has the type, the device and one of the shapes."""
     if not isinstance(tensor, torch.Tensor) or tensor.dtype != torch.float32:
         got = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
         raise ValueError(f"{name}: got {got}, expected a tensor of torch.float32")
-    if tensor.device != like.device:
-        raise ValueError(f"{name}: got device {tensor.device}, expected {like.device}")
+    if tensor.device != device:
+        raise ValueError(f"{name}: got device {tensor.device}, expected {device}")
     fitting = [shape for shape in shapes if len(shape) == tensor.ndim] or shapes[:1]
     check.shape(name, tuple(tensor.shape), fitting[0])
     if not np.isfinite(float(tensor.detach().sum())):

@@ -1,0 +1,1 @@
+"""Visibility of spheres: as log-SH sums, and as transmittance towards cells of directions."""

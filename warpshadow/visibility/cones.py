@@ -47,12 +47,14 @@ def cone_function(lanes: int) -> wp.Function:
         distance = sqrt(distance2)
         inverse = wp.cw_div(Lane(1.0), distance)
         sine2 = wp.min(wp.cw_mul(radius * inverse, radius * inverse), Lane(SINE2))
-        # the blend's cubic is 0 inside the sphere and _COSINE from 1.01 r on, so that sums need no cases
+        # What the blend's cubic lacks of _COSINE is exactly 0 from 1.01 r on, where u is: sums need no cases, and
+        # sine2 keeps its digits even where a compiler fuses multiplication and addition.
         t = wp.min(wp.max((distance / radius - Lane(1.0)) / BLEND, Lane(0.0)), Lane(1.0))
-        t2 = wp.cw_mul(t, t)
-        blend = wp.cw_mul(t2, Lane(3.0 * COSINE - RISE) + (RISE - 2.0 * COSINE) * t)
-        cosine = sqrt(Lane(1.0) - sine2) + (blend - Lane(COSINE))
-        sine2 = sine2 + (Lane(COSINE * COSINE) - wp.cw_mul(blend, blend))
+        u = Lane(1.0) - t
+        lack = wp.cw_mul(u, Lane(3.0 * COSINE - 2.0 * RISE) + (RISE - 2.0 * COSINE) * u)
+        lack = wp.cw_mul(u, Lane(RISE) + lack)
+        cosine = sqrt(Lane(1.0) - sine2) - lack
+        sine2 = sine2 + wp.cw_mul(lack, Lane(2.0 * COSINE) - lack)
         near = wp.min(distance / (FADE * radius), Lane(1.0))
         weight = wp.cw_mul(wp.cw_mul(near, near), Lane(3.0) - 2.0 * near)
         return wp.cw_mul(dx, inverse), wp.cw_mul(dy, inverse), wp.cw_mul(dz, inverse), cosine, sine2, weight

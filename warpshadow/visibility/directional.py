@@ -70,7 +70,9 @@ def _transmittance_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
             if radius > 0.0:
-                ux, uy, uz, cosine, sine2, weight = cone(Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius)
+                ux, uy, uz, cosine, sine2, weight = cone(
+                    Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
+                )
                 sine = sqrt(sine2)
                 low = cos_width * cosine - sin_width * sine
                 # does the cone, widened, reach the chunk's?
@@ -142,8 +144,12 @@ def transmittance(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
+    if normals is not None:
+        check.shape("normals", normals.shape, points.shape)
+    check.shape("centers", centers.shape, (batch_count, "sphere"))
+    check.shape("radii", radii.shape, centers.shape)
     groups = group_count(vertex_count, lanes)
-    axes, cosine, sine = chunk_cones(directions)
+    axes, cosine, sine = chunk_cones(directions, width)
     result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
     wp.launch(
         _transmittance_kernel(normals is not None, lanes),

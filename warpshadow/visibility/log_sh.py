@@ -31,6 +31,7 @@ EIGENVALUE_FLOOR = 0.05
 HORIZON_FADE = 0.5
 """A sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane."""
 
+
 class Threshold(NamedTuple):
     """The |f̂| that a base approximation of the exponential is given by default, and the most it may be given."""
 
@@ -105,10 +106,10 @@ def _zonal_cap_function(order: int, lanes: int) -> wp.Function:
         legendre = cosine  # P_l
         slope_below = Lane(0.0)
         slope = Lane(1.0)
-        for l in range(1, order):
-            band = float(l)
+        for index in range(1, order):
+            band = float(index)
             factor = wp.sqrt(wp.pi * (2.0 * band + 1.0)) / (band * (band + 1.0))
-            zonal[l] = factor * wp.cw_mul(sine2, slope)
+            zonal[index] = factor * wp.cw_mul(sine2, slope)
             slope_above = slope_below + (2.0 * band + 1.0) * legendre
             above = ((2.0 * band + 1.0) * wp.cw_mul(cosine, legendre) - band * below) / (band + 1.0)
             below = legendre
@@ -141,8 +142,8 @@ def _zonal_log_function(order: int, log: str, lanes: int) -> wp.Function:
             z = table[interval, 2] + t * table[interval, 3]
             z = table[interval, 1] + t * z
             z = sine2[lane] * (table[interval, 0] + t * z)
-            for l in range(order):
-                zonal[l, lane] = z[l]
+            for band in range(order):
+                zonal[band, lane] = z[band]
         return zonal
 
     return {"cap": cap, "eigen": eigen}[log]
@@ -236,6 +237,10 @@ def accumulate(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
+    if normals is not None:
+        check.shape("normals", normals.shape, points.shape)
+    check.shape("centers", centers.shape, (batch_count, "sphere"))
+    check.shape("radii", radii.shape, centers.shape)
     groups = group_count(vertex_count, lanes)
     log_sh = wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device)
     wp.launch(
@@ -398,7 +403,14 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     wp.launch(
         _exponentiate_kernel(order, base, lanes),
         dim=(batch_count, groups),
-        inputs=[log_sh, threshold, *sh.product_table(order, str(device), symmetric=True), optimal, power, squared],
+        inputs=[
+            log_sh,
+            threshold,
+            *sh.product_table(order, str(device), symmetric=True),
+            optimal,
+            power,
+            squared,
+        ],
         outputs=[visibility],
         device=device,
     )

@@ -1,0 +1,334 @@
+"""Sphere fits: the formulas they rest on, what they promise, and how good they are."""
+
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warpshadow import spheres as module
+from warpshadow.directions import cell_radius, fibonacci
+from warpshadow.mesh import Mesh, icosphere, load_mesh
+from warpshadow.spheres import Spheres, exact_occlusion, fit_spheres, plot_spheres
+from warpshadow.visibility.directional import SOFTNESS, transmittance
+
+SEED = 3
+QUICK = {"steps": 60, "cache": False, "progress": False}
+
+
+def box(size=(1.0, 0.6, 0.8), segments=8) -> Mesh:
+    """A closed box with finely divided sides."""
+    trimesh = pytest.importorskip("trimesh")
+    solid = trimesh.creation.box(extents=size)
+    positions, faces = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, max(size) / segments)
+    return Mesh(positions, faces)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    return Mesh(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(faces))
+
+
+def bumpy() -> Mesh:
+    """An irregular closed mesh, whose best spheres are unlike each other."""
+    ball = icosphere(1.0, 3)
+    x, y, z = ball.positions.astype(np.float64).T
+    grow = 1 + 0.3 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.2 * np.sin(4 * z)
+    return Mesh(ball.positions * grow[:, None] * [1.3, 1.0, 0.7], ball.faces)
+
+
+# ------------------------------------------------------------------------------ float64 twins
+
+
+def twin_cone(distance):
+    """Cosine of the cone by the distance in radii."""
+    edge = 1 + module.BLEND
+    cosine, slope = np.sqrt(1 - edge**-2), edge**-3 / np.sqrt(1 - edge**-2)
+    t = np.clip((distance - 1) / module.BLEND, 0, 1)
+    blend = cosine * (3 * t**2 - 2 * t**3) + module.BLEND * slope * (t**3 - t**2)
+    return np.where(distance >= edge, np.sqrt(1 - np.maximum(distance, edge) ** -2), blend)
+
+
+def twin_near(distance):
+    t = np.minimum(distance / module.FADE, 1)
+    return t**2 * (3 - 2 * t)
+
+
+def twin_transmittance(points, directions, spheres, width):
+    """DESIGN.md section 4 with an edge of fixed width, [receiver, direction]."""
+    result = np.ones((len(points), directions.shape[1]))
+    for sphere in spheres:
+        toward = sphere[:3] - points
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = twin_cone(distance / sphere[3])
+        angle = np.arccos(cosine)
+        lo, hi = np.cos(np.minimum(angle + width, np.pi)), np.cos(np.maximum(angle - width, 0))
+        opacity = np.minimum(1, (1 - cosine) / (1 - (hi + lo) / 2)) * twin_near(distance / sphere[3])
+        t = np.einsum("pi,pqi->pq", toward / distance[:, None], directions)
+        t = np.clip((t - lo[:, None]) / (hi - lo)[:, None], 0, 1)
+        result *= 1 - opacity[:, None] * t**2 * (3 - 2 * t)
+    return result
+
+
+@pytest.fixture
+def refinement(device):
+    """A refinement of a small body, and spheres that receivers see from near, far and inside."""
+    mesh = bumpy()
+    diagonal = np.linalg.norm(np.ptp(mesh.positions, axis=0))
+    body = module._Body((mesh.positions / diagonal).astype(np.float32), mesh.faces, wp.get_device(device))
+    rng = np.random.default_rng(SEED)
+    spheres, _ = module._start(body, 12, rng)
+    return module._Refinement(body, rng), spheres.astype(np.float32).astype(np.float64)
+
+
+def test_soft_transmittance_and_loss_agree_with_float64(refinement):
+    fit, spheres = refinement
+    chosen = np.arange(0, fit.RECEIVERS, 97)
+    width = 0.1
+    batch = wp.array(chosen.astype(np.int32), dtype=wp.int32, device=fit.device)
+    balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=fit.device)
+    got = fit._transmittance(*fit._project(batch, balls, width))
+    points = fit.points.numpy()[chosen].astype(np.float64)
+    directions = np.einsum("qi,pij->pqj", module._hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    np.testing.assert_allclose(got, twin_transmittance(points, directions, spheres, width), atol=2e-4)
+
+
+def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
+    fit, spheres = refinement
+    chosen = np.arange(0, fit.RECEIVERS, 61)
+    width = 0.1
+    points = fit.points.numpy()[chosen].astype(np.float64)
+    directions = np.einsum("qi,pij->pqj", module._hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+
+    def loss(balls):
+        error = twin_transmittance(points, directions, balls, width) - fit.visibility[chosen]
+        return ((error @ fit.metric.astype(np.float64)) * fit.weights[chosen] * error).sum() / len(chosen)
+
+    got_loss, got = fit.gradient(spheres, chosen, width)
+    assert got_loss == pytest.approx(loss(spheres), rel=1e-4)
+    step = 1e-6
+    expected = np.zeros_like(spheres)
+    for index in np.ndindex(spheres.shape):
+        change = np.zeros_like(spheres)
+        change[index] = step
+        grown = np.where(np.arange(4) == 3, spheres * np.exp(change), spheres + change)
+        shrunk = np.where(np.arange(4) == 3, spheres * np.exp(-change), spheres - change)
+        expected[index] = (loss(grown) - loss(shrunk)) / (2 * step)
+    np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+
+
+# ------------------------------------------------------------------------------ spheres and their occlusion
+
+
+def test_exact_occlusion_agrees_with_the_cone_outside_on_and_inside_the_sphere(device):
+    center, radius = np.array([0.3, -0.2, 0.5]), 0.7
+    away = np.array([0.01, 0.1, 0.13, 0.5, 0.999, 1.0, 1.004, 1.02, 1.5, 20.0])
+    outward = fibonacci(16)[: len(away)]
+    points = (center + away[:, None] * radius * outward).astype(np.float32)
+    directions = fibonacci(1024)
+
+    def array(values, kind):
+        return wp.array(np.asarray(values, np.float32), dtype=kind, device=device)
+
+    got = exact_occlusion(
+        array(points[None], wp.vec3),
+        array(directions, wp.vec3),
+        array([[center, center + 9]], wp.vec3),
+        array([[radius, 0.0]], wp.float32),  # a radius of 0 blocks nothing
+    ).numpy()[0]
+    cosine = -outward @ directions.T
+    edge = twin_cone(away)[:, None]
+    expected = (cosine > edge) & (twin_near(away) > 0.5)[:, None]
+    clear = np.abs(cosine - edge) > 2e-3
+    assert clear.mean() > 0.95
+    np.testing.assert_array_equal(got[clear], expected[clear])
+    assert got[4].mean() == pytest.approx(0.5, abs=0.01)  # a hemisphere from inside
+
+
+def test_the_refinement_sees_the_cones_that_the_renderer_sees(device):
+    rng = np.random.default_rng(SEED)
+    points = rng.normal(size=(1, 64, 3))
+    centers, radii = 0.5 * rng.normal(size=(1, 6, 3)), rng.uniform(0.1, 0.6, size=(1, 6))
+
+    def array(values, kind):
+        return wp.array(np.asarray(values, np.float32), dtype=kind, device=device)
+
+    directions = fibonacci(128)
+    spheres = array(centers, wp.vec3), array(radii, wp.float32)
+    got = transmittance(array(points, wp.vec3), None, *spheres, directions).numpy()[0]
+    width = SOFTNESS * cell_radius(128)
+    everywhere = np.broadcast_to(directions, (64, 128, 3))
+    twin = twin_transmittance(points[0], everywhere, np.column_stack([centers[0], radii[0]]), width)
+    np.testing.assert_allclose(got, twin, atol=2e-3)
+
+
+def test_a_similarity_moves_and_scales_spheres():
+    spheres = Spheres([[1, 0, 0], [0, 2, 0]], [0.5, 1.5])
+    quarter_turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    moved = spheres.transformed(rotation=quarter_turn, translation=(0, 0, 3), scale=2.0)
+    np.testing.assert_allclose(moved.centers, [[0, 2, 3], [-4, 0, 3]], atol=1e-6)
+    np.testing.assert_allclose(moved.radii, [1.0, 3.0])
+    both = Spheres.concatenate([spheres, moved])
+    assert len(both) == 4 and len(Spheres.concatenate([])) == 0
+    np.testing.assert_array_equal(both.centers[2:], moved.centers)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Spheres([[0, 0]], [1]), r"centers: got shape \(1, 2\)"),
+        (lambda: Spheres([[0, 0, np.nan]], [1]), "centers: got 1 NaN"),
+        (lambda: Spheres([[0, 0, 0]], [-1]), "radii: got -1"),
+        (lambda: Spheres([[0, 0, 0]], [1, 2]), "radii: got 2 radii for 1 centers"),
+        (lambda: Spheres([[0, 0, 0]], [1]).transformed(scale=0), "scale: got 0"),
+        (lambda: Spheres([[0, 0, 0]], [1]).transformed(rotation=2 * np.eye(3)), "rotation: got"),
+    ],
+)
+def test_spheres_that_are_none_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# ------------------------------------------------------------------------------ fits
+
+
+def test_a_ball_is_one_sphere():
+    fit = fit_spheres(icosphere(2.0, 3), 1, **{**QUICK, "steps": 300})
+    assert fit.spheres.radii[0] == pytest.approx(2.0, rel=0.03)
+    assert np.linalg.norm(fit.spheres.centers[0]) < 0.08
+    assert fit.report.coverage > 0.95
+    assert fit.report.visibility_error < 0.03
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device):
+    options = {**QUICK, "steps": 120, "device": device}  # enough for spheres to be relocated
+    first, second = (fit_spheres(bumpy(), 10, **options).spheres for _ in range(2))
+    np.testing.assert_array_equal(first.centers, second.centers)
+    np.testing.assert_array_equal(first.radii, second.radii)
+    other = fit_spheres(bumpy(), 10, seed=1, **{**QUICK, "steps": 2, "device": device}).spheres
+    assert not np.array_equal(first.centers, other.centers)
+
+
+def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
+    mesh = bumpy()
+    moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
+    options = {
+        **QUICK,
+        "steps": 10,
+    }  # rounding of the moved positions changes last bits, which descent amplifies
+    here, there = (fit_spheres(each, 10, **options).spheres for each in (mesh, moved))
+    np.testing.assert_allclose(here.transformed(translation=(300, -70, 20), scale=50).centers, there.centers, atol=1.0)
+    np.testing.assert_allclose(50 * here.radii, there.radii, atol=1.0)
+    power = Mesh(mesh.positions * np.float32(4), mesh.faces)
+    np.testing.assert_array_equal(4 * here.centers, fit_spheres(power, 10, **options).spheres.centers)
+
+
+def test_refinement_and_more_spheres_lower_the_error():
+    mesh = box()
+    start = fit_spheres(mesh, 32, **{**QUICK, "steps": 0}).report
+    few, some, many = (fit_spheres(mesh, count, **{**QUICK, "steps": 250}).report for count in (8, 32, 96))
+    assert some.visibility_error < 0.6 * start.visibility_error
+    assert few.visibility_error > some.visibility_error > many.visibility_error
+
+
+def test_a_requested_error_is_met_with_as_few_spheres_as_needed():
+    fit = fit_spheres(bumpy(), error=0.06, **{**QUICK, "steps": 150})
+    assert fit.report.visibility_error <= 0.06
+    assert fit.report.sphere_count == len(fit.spheres) <= 64
+
+
+def test_open_and_multi_part_meshes_are_fitted():
+    ball = icosphere(1.0, 3)
+    bowl = Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0])
+    grid = np.linspace(-1, 1, 12)
+    x, z = np.meshgrid(grid, grid)
+    index = np.arange(144).reshape(12, 12)
+    corners = [index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
+    for mesh in (bowl, sheet, two):
+        start = fit_spheres(mesh, 24, **{**QUICK, "steps": 0}).report
+        fit = fit_spheres(mesh, 24, **{**QUICK, "steps": 200})
+        assert 0 < len(fit.spheres) <= 24
+        errors, start_errors = (each.ground_error**2 + each.surface_error**2 for each in (fit.report, start))
+        assert errors < max(0.5 * start_errors, 0.05**2)
+
+
+def test_no_spheres_are_an_empty_fit():
+    fit = fit_spheres(bumpy(), 0, **QUICK)
+    assert len(fit.spheres) == 0 and fit.report.coverage == 0 and fit.report.ground_error > 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"count": -1}, "count: got -1"),
+        ({"count": 2.5}, "count: got 2.5"),
+        ({"error": 0.0}, "error: got 0.0"),
+        ({"steps": None}, "steps: got None"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        fit_spheres(bumpy(), **{**QUICK, **arguments})
+
+
+def test_a_mesh_without_surface_is_refused():
+    line = SimpleNamespace(positions=np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0]]), faces=np.int32([[0, 1, 2]]))
+    with pytest.raises(ValueError, match="without area"):
+        fit_spheres(line, 4, **QUICK)
+    with pytest.raises(ValueError, match="no faces"):
+        fit_spheres(SimpleNamespace(positions=line.positions, faces=np.zeros((0, 3), np.int32)), 4, **QUICK)
+
+
+# ------------------------------------------------------------------------------ cache and picture
+
+
+def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    options = {**QUICK, "cache": True, "steps": 5}
+    made = fit_spheres(bumpy(), 6, **options)
+    (file,) = (tmp_path / "spheres").iterdir()
+    read = fit_spheres(bumpy(), 6, **options)
+    assert not made.report.cached and read.report.cached
+    np.testing.assert_array_equal(made.spheres.centers, read.spheres.centers)
+    assert read.report.ground_error == made.report.ground_error
+
+    file.write_bytes(b"not a fit")
+    with pytest.warns(UserWarning, match="cannot be read"):
+        again = fit_spheres(bumpy(), 6, **options)
+    np.testing.assert_array_equal(made.spheres.centers, again.spheres.centers)
+    assert fit_spheres(bumpy(), 6, **options).report.cached
+    fit_spheres(bumpy(), 7, **options)
+    assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
+
+
+def test_the_picture_of_a_fit_is_written(tmp_path):
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "spheres.png"
+    plot_spheres(bumpy(), Spheres([[0, 0, 0]], [0.5]), path)
+    assert path.stat().st_size > 10_000
+
+
+# ------------------------------------------------------------------------------ accuracy and portability
+
+
+def test_64_spheres_on_the_bunny_meet_the_targets():
+    pytest.importorskip("pxr", reason="reading bunny.usd takes usd-core")
+    import warp.examples
+
+    mesh = load_mesh(os.path.join(warp.examples.get_asset_directory(), "bunny.usd"))
+    report = fit_spheres(mesh, 64, cache=False, progress=False).report
+    assert report.ground_error < 0.035
+    assert report.surface_error < 0.045
+
+
+def test_kernels_compile_for_cuda_without_a_gpu(tmp_path):
+    try:
+        wp.compile_aot_module("warpshadow.spheres", device=None, arch=[75, 90], module_dir=tmp_path, use_ptx=True)
+    except RuntimeError as problem:
+        pytest.skip(f"this Warp cannot compile for CUDA: {problem}")
+    assert len(list(tmp_path.glob("*.ptx"))) == 2
