@@ -24,10 +24,10 @@ def test_cells_are_the_fibonacci_directions_in_another_order(count):
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_equal_cells_integrate_the_first_bands(count):
-    """Fibonacci points are not a quadrature rule; their error falls like 1/Q (0.4/Q here for these bands)."""
+    """Fibonacci points are not a quadrature rule; their error falls like 1/Q; measured 0.23/Q at most."""
     directions = cells.fibonacci(count)
-    assert np.abs(directions.mean(axis=0)).max() < 2 / count
-    assert np.abs(directions.T @ directions / count - np.eye(3) / 3).max() < 2 / count
+    assert np.abs(directions.mean(axis=0)).max() < 0.5 / count
+    assert np.abs(directions.T @ directions / count - np.eye(3) / 3).max() < 0.5 / count
 
 
 @pytest.mark.parametrize("count", [128, 256, 1024])

@@ -19,8 +19,8 @@ ACCUMULATE = 2e-5
 # 2048 intervals; measured: 0.0055 at most of one cap's coefficients (order 8), whose norm is 1 or more there.
 CORNER = 6e-3
 CORNER_WIDTH = 3 / 2048
-# Each of p squarings doubles the relative error, 6e-8·2^p, times the growth of the norm by triple products.
-EXPONENTIATE = 2e-4
+# Each of p squarings doubles the relative error, 6e-8·2^p; measured 1.4e-6 for quadratic, 1.9e-5 for linear (p = 7, 10).
+EXPONENTIATE = 5e-5
 # The golden zonal vectors are given to 1e-6 of numbers up to 10.
 ZONAL = 1e-5
 
@@ -299,7 +299,7 @@ def test_exponentials_are_those_of_the_float64_twin(base, order, device):
     assert row_errors(got, expected).max() < EXPONENTIATE
 
 
-@pytest.mark.parametrize("base, error", [("quadratic", 5e-3), ("linear", 5e-2), ("optimal_linear", 5e-2)])
+@pytest.mark.parametrize("base, error", [("quadratic", 5e-3), ("linear", 5e-3), ("optimal_linear", 5e-2)])
 def test_the_default_threshold_is_near_convergence(base, error, device):
     """Converged: quadratic with a threshold of 1/1000. The errors are the base approximation's, not roundings."""
     rows = accumulate(*twins.random_scene(13), device).astype(float)
@@ -333,6 +333,13 @@ def test_the_largest_threshold_allowed_does_not_explode(base, device):
     converged = twins.exponential(rows, "quadratic", 1e-3)
     got = exponentiate(rows, device, base=base, threshold=log_sh.THRESHOLDS[base].limit)
     assert np.linalg.norm(got - converged) < np.linalg.norm(converged)
+
+
+def test_no_receivers_is_no_work(device):
+    nobody = np.zeros((0, 3))
+    rows = accumulate(nobody, nobody, [[0, 0, 0]], [1.0], device, order=4)
+    assert rows.shape == (0, 16)
+    assert exponentiate(rows, device).shape == (0, 16)
 
 
 def test_unknown_bases_and_logs_are_refused_with_a_suggestion(device):

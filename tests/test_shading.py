@@ -80,7 +80,7 @@ def test_white_under_unit_light_in_sh_is_one(order, device):
 
 @pytest.mark.parametrize("count, error", [(64, 0.02), (128, 0.01), (256, 0.005)])
 def test_white_under_unit_light_in_cells_is_nearly_one(count, error, device):
-    """Cells at the horizon count wholly or not at all; Fibonacci cells average that out as 1/Q, about 1.3/Q at worst."""
+    """Cells at the horizon count wholly or not at all; that averages out as 1/Q, 0.9/Q at worst."""
     normals = wp.array(unit_vectors(3, 1, 500), dtype=wp.vec3, device=device)
     everything = wp.ones((1, 500, count), dtype=wp.float32, device=device)
     transfer = shading.directional_transfer(everything, normals, cells.fibonacci(count))

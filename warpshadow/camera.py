@@ -83,20 +83,20 @@ class Camera:
         Raises:
             ValueError: naming the argument; so when eye and target coincide or up is parallel to the view.
         """
-        eye, target, up = (_array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
-        view = target - eye
+        origin, goal, top = (_array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
+        view = goal - origin
         distance = np.linalg.norm(view)
-        if distance <= 1e-9 * max(np.abs(eye).max(), np.abs(target).max()):
-            raise ValueError(f"target: got {target.tolist()}, expected a point away from eye {eye.tolist()}")
+        if distance <= 1e-9 * max(np.abs(origin).max(), np.abs(goal).max()):
+            raise ValueError(f"target: got {goal.tolist()}, expected a point away from eye {origin.tolist()}")
         forward = view / distance
-        right = np.cross(forward, up)
-        if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(up):
-            raise ValueError(f"up: got {up.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
+        right = np.cross(forward, top)
+        if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
+            raise ValueError(f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         width, height = _size(size)
         intrinsics = _centered_intrinsics(fov_y, width, height)
-        return cls(intrinsics, rotation, -rotation @ eye, width, height, near)
+        return cls(intrinsics, rotation, -rotation @ origin, width, height, near)
 
     @classmethod
     def from_opengl(
@@ -129,7 +129,7 @@ class Camera:
         width, height = _size(size)
         if (projection is None) == (fov_y is None):
             raise ValueError("projection, fov_y: expected exactly one of them")
-        if projection is None:
+        if fov_y is not None:
             intrinsics = _centered_intrinsics(fov_y, width, height)
             near = 0.01 if near is None else near
         else:

@@ -75,8 +75,11 @@ def render(
         if png is not None:
             _check_output(png, ".png", ".jpg", ".jpeg")
         loaded = load_scene(scene)
-        changes = {key: value for key, value in (("method", method), ("samples", samples)) if value is not None}
-        loaded = dataclasses.replace(loaded, visibility=dataclasses.replace(loaded.visibility, **changes))
+        visibility = loaded.visibility
+        visibility = dataclasses.replace(
+            visibility, method=method or visibility.method, samples=samples or visibility.samples
+        )
+        loaded = dataclasses.replace(loaded, visibility=visibility)
         start = time.perf_counter()
         image = Renderer(loaded, device=_device(device), progress=True).render()
         seconds = time.perf_counter() - start
@@ -159,7 +162,7 @@ def envmap(
     with _clear_errors():
         light = EnvironmentMap.read(file, sanitize=sanitize)
         for name, value in light.statistics().items():
-            shown = " ".join(f"{number:.4g}" for number in np.atleast_1d(value))
+            shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
             typer.echo(f"{name.replace('_', ' '):26}{shown}")
         beside = file.with_name(f"{file.stem}.sh{order}.exr")
         write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))

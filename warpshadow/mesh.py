@@ -118,7 +118,7 @@ class Mesh:
         if path.suffix.lower() != ".obj":
             raise MeshError(f"{path}: got extension {path.suffix!r}, expected .obj")
         lines = ["v {:.9g} {:.9g} {:.9g}".format(*position) for position in self.positions.tolist()]
-        if self.uvs is None:
+        if self.uvs is None or self.uv_faces is None:
             lines += ["f {} {} {}".format(*face) for face in (self.faces + 1).tolist()]
         else:
             lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]

@@ -335,9 +335,9 @@ def _resolve(
 @wp.func
 def _instance(pixel: int, pixels_per_instance: int, instance_count: int):
     """Instance of a pixel, without the division where there is only one."""
-    instance = 0
+    instance = int(0)
     if instance_count > 1:
-        instance = pixel / pixels_per_instance
+        instance = pixel // pixels_per_instance
     return instance
 
 

@@ -214,7 +214,7 @@ class Renderer:
         method = self.scene.visibility.method
         if method == "ray-traced":
             return self._trace(light)
-        if method == "directional":
+        if isinstance(self._own_basis, CellBasis):
             cells = self._own_basis.directions
             # a cell looks to where its light comes from: a sun is rarely in the middle
             aims = light.cell_moments(cells).directions if isinstance(light, EnvironmentMap) else cells

@@ -1,5 +1,6 @@
 """Scenes: bodies, light, camera and how visibility is computed; in Python or from a TOML file."""
 
+import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -129,13 +130,13 @@ class Body:
         angle = np.radians(np.linalg.norm(self.rotation))
         if angle == 0:
             return np.eye(3)
-        x, y, z = self.rotation / np.linalg.norm(self.rotation)
+        x, y, z = np.array(self.rotation) / np.linalg.norm(self.rotation)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""
-        return self.mesh.transformed(rotation=self.rotation_matrix(), translation=self.translation, scale=self.scale)
+        return self.mesh.transformed(rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +224,7 @@ def load_scene(path: str | Path) -> Scene:
     if not isinstance(tables["body"], list):
         raise SceneError(f"{path}: [body]: expected [[body]], since a scene may have several")
     bodies = tuple(
-        build(f"[[body]] number {number}", lambda table=table: _body(table, path.parent))
+        build(f"[[body]] number {number}", functools.partial(_body, table, path.parent))
         for number, table in enumerate(tables["body"], start=1)
     )
     light = build("[light]", lambda: _light(tables["light"], path.parent))
