@@ -77,7 +77,7 @@ def test_irradiance_of_log_sh_is_the_golden_one(log, name, golden, device):
 
 
 def test_unshadowed_irradiance_is_the_golden_one(golden, device):
-    """Of the full light the golden value is, of which order 8 keeps all but 0.1%: the odd bands beyond are nothing to a cosine."""
+    """Of the full light the golden value is, of which order 8 keeps all but 0.1% here."""
     _, normals = geometry(golden, device, has_normals=True)
     got = np.pi * shading.sh_transfer(None, normals, order=8).numpy()[0] @ golden["light_sh"]
     assert relative(got, golden["irradiance_unshadowed"]) < 0.002

@@ -16,7 +16,7 @@ from warpshadow.lanes import MODULE_OPTIONS, lane_functions, lane_type
 EXACT = 1e-12
 # Kernels sum up to 10² float32 terms of size 1, each good to 6e-8.
 FLOAT32 = 5e-6
-# Midpoint rule over 64 rows of a map, whose error falls with the square of the pixel: (π/64)²/24 · band²; measured 2.3e-3.
+# Midpoint rule over 64 rows of a map; error falls with the square of the pixel, (π/64)²/24 · band²; measured 2.3e-3.
 MAP_64 = 5e-3
 
 ORDERS = list(sh.ORDERS)

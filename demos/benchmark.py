@@ -1,0 +1,144 @@
+"""Time the stages of rendering the bunny scene, and how long their kernels take to compile.
+
+    make bench       or        python demos/benchmark.py [--compile]
+
+The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
+Figures are medians of runs that take turns, so that a slow moment of the machine strikes all alike.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+
+def main(device: str, runs: int) -> None:
+    import torch
+    import warp as wp
+
+    from warpshadow.basis import CellBasis, HarmonicBasis
+    from warpshadow.camera import to_clip
+    from warpshadow.directions import fibonacci
+    from warpshadow.raster import interpolate, rasterize
+    from warpshadow.renderer import Renderer
+    from warpshadow.shading import directional_transfer, sh_transfer, shade
+    from warpshadow.torch import TorchRenderer
+    from warpshadow.visibility import directional, log_sh
+
+    wp.config.quiet = True
+    scene = bunny_scene()
+    renderer = Renderer(scene, device=device, progress=True)
+    points, normals, *_ = renderer.receivers
+    centers, radii = renderer.blockers
+    cells = CellBasis(fibonacci(128))
+    cell_light = wp.array(cells.coefficients(scene.light)[None], dtype=wp.vec3, device=device)
+    sh_light = wp.array(HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
+    clip_matrices = wp.array(scene.camera.clip_matrix()[None], dtype=wp.mat44, device=device)
+    faces, shading = renderer.geometry.faces, renderer.scene_shading
+
+    def shade_directional() -> None:
+        seen = directional.transmittance(points, normals, centers, radii, cells.directions)
+        shade(directional_transfer(seen, normals, cells.directions), cell_light)
+
+    def shade_log_sh() -> None:
+        log = log_sh.accumulate(points, normals, centers, radii, order=8)
+        shade(sh_transfer(log_sh.exponentiate(log), normals, order=8), sh_light)
+
+    def draw() -> None:
+        clip = to_clip(renderer.geometry.positions, clip_matrices)
+        interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, shading)
+
+    def whole_image() -> None:
+        Renderer(scene, device=device).render()
+
+    torch_renderer = TorchRenderer(scene, device=device)
+    light = torch.from_numpy(cells.coefficients(scene.light)).to(torch_renderer.device).requires_grad_()
+
+    def fit_light() -> None:
+        torch_renderer(light).square().sum().backward()
+
+    rows: dict[str, Callable[[], None]] = {
+        "visibility and shading, directional, 128 directions": shade_directional,
+        "visibility and shading, log-SH eigen, order 8": shade_log_sh,
+        "project, rasterize and interpolate": draw,
+        "whole image from the scene, directional": whole_image,
+        "one iteration of a light fit, forward and backward": fit_light,
+    }
+    vertex_count, sphere_count = points.shape[1], radii.shape[1]
+    print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs}")
+    for label, milliseconds in in_turn(rows, runs).items():
+        print(f"  {label:54}{milliseconds:8.1f} ms")
+
+
+def in_turn(rows: dict[str, Callable[[], None]], runs: int) -> dict[str, float]:
+    """Median milliseconds of each function, called in turn after a warm-up."""
+    import warp as wp
+
+    times: dict[str, list[float]] = {label: [] for label in rows}
+    for run in range(runs + 1):
+        for label, function in rows.items():
+            wp.synchronize()
+            start = time.perf_counter()
+            function()
+            wp.synchronize()
+            if run:
+                times[label].append(1e3 * (time.perf_counter() - start))
+    return {label: statistics.median(each) for label, each in times.items()}
+
+
+def bunny_scene():
+    """The bunny that ships with Warp on a plane of 64 × 64 quads, under a sky with a sun."""
+    import warp.examples
+
+    import warpshadow as ws
+
+    bunny = ws.load_mesh(Path(warp.examples.get_asset_directory()) / "bunny.usd")
+    low, high = bunny.bounds
+    scale = 2 / (high - low).max()
+    middle = (low + high) / 2
+    place = -scale * np.array([middle[0], low[1], middle[2]])
+    return ws.Scene(
+        bodies=(ws.Body(bunny, scale=scale, translation=place), ws.Body(ws.plane(6.0, 64), blockers=0)),
+        light=ws.synthetic_sky(),
+        camera=ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(256, 256)),
+        supersampling=1,
+    )
+
+
+def time_compilation(device: str) -> None:
+    """Compile what each method of rendering needs in a new process with an empty kernel cache."""
+    for method in ("directional", "log-sh", "none"):
+        program = (
+            "import time, warp as wp; wp.config.quiet = True; import warpshadow as ws\n"
+            "scene = ws.Scene((ws.Body(ws.icosphere(), blockers=ws.Spheres([[0, 0, 0]], [1])), "
+            "ws.Body(ws.plane(), blockers=0)), "
+            "ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 1, 5), (0, 0, 0)), "
+            f"ws.Visibility(method={method!r}))\n"
+            f"start = time.perf_counter(); ws.render(scene, device={device!r}); cold = time.perf_counter() - start\n"
+            f"start = time.perf_counter(); ws.render(scene, device={device!r}); warm = time.perf_counter() - start\n"
+            "print(cold - warm)"
+        )
+        with tempfile.TemporaryDirectory() as cache:
+            environment = os.environ | {"WARP_CACHE_PATH": cache}
+            run = subprocess.run(
+                [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+            )
+        print(f"  cold compile for {method:37}{float(run.stdout.split()[-1]):8.1f} s")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
+    parser.add_argument("--runs", type=int, default=15, help="timed runs of each row")
+    parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
+    arguments = parser.parse_args()
+    main(arguments.device, arguments.runs)
+    if arguments.compile:
+        time_compilation(arguments.device)
