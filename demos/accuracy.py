@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import warp as wp
-import warp.examples
+from scenes import image_error, on_ground, shipped_mesh
 
 import warpshadow as ws
 
@@ -37,9 +37,9 @@ def main(data: Path | None, sphere_count: int, samples: int) -> None:
     print(f"{'mesh':18}{'sky':16}" + "".join(f"{label:>17}" for label in METHODS))
     rows = []
     for mesh, (sky_name, sky) in pairs:
-        scene = place(mesh, sky, sphere_count)
+        scene = on_ground(mesh, sky, blockers=sphere_count)
         truth = render(scene, ws.Visibility(method="ray-traced", samples=samples))
-        rows.append([error(render(scene, visibility), truth) for visibility in METHODS.values()])
+        rows.append([100 * image_error(render(scene, visibility), truth) for visibility in METHODS.values()])
         print(f"{mesh.name:18}{sky_name:16}" + "".join(f"{value:16.1f}%" for value in rows[-1]), flush=True)
     for label, values in (("mean", np.mean(rows, axis=0)), ("worst", np.max(rows, axis=0))):
         print(f"{label:34}" + "".join(f"{value:16.1f}%" for value in values))
@@ -54,13 +54,10 @@ def load_meshes(data: Path | None) -> list[ws.Mesh]:
         "cylinder": create.cylinder(0.4, 2).subdivide().subdivide(),
         "table": table(),
     }
-    assets = Path(warp.examples.get_asset_directory())
-    files = [assets / name for name in ("bunny.usd", "bear.usd", "rocks.usd")]
+    meshes = [shipped_mesh(name) for name in ("bunny", "bear", "rocks")]
     if data is not None:
-        files += sorted((data / "meshes").iterdir())
-    return [ws.load_mesh(file) for file in files] + [
-        ws.Mesh(shape.vertices, shape.faces, name=name) for name, shape in shapes.items()
-    ]
+        meshes += [ws.load_mesh(file) for file in sorted((data / "meshes").iterdir())]
+    return meshes + [ws.Mesh(shape.vertices, shape.faces, name=name) for name, shape in shapes.items()]
 
 
 def table() -> trimesh.Trimesh:
@@ -82,29 +79,8 @@ def load_skies(data: Path | None) -> list[tuple[str, ws.EnvironmentMap]]:
     ]
 
 
-def place(mesh: ws.Mesh, sky: ws.EnvironmentMap, sphere_count: int) -> ws.Scene:
-    """A mesh made 2 units large, on the middle of the ground."""
-    low, high = mesh.bounds
-    scale = 2 / (high - low).max()
-    middle = (low + high) / 2
-    body = ws.Body(
-        mesh,
-        albedo=(0.8, 0.6, 0.5),
-        blockers=sphere_count,
-        scale=scale,
-        translation=-scale * np.array([middle[0], low[1], middle[2]]),
-    )
-    ground = ws.Body(ws.plane(6.0, 64), albedo=(0.7, 0.7, 0.7))
-    return ws.Scene((body, ground), sky, ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=38))
-
-
 def render(scene: ws.Scene, visibility: ws.Visibility) -> np.ndarray:
     return ws.render(dataclasses.replace(scene, visibility=visibility), progress=True)
-
-
-def error(image: np.ndarray, truth: np.ndarray) -> float:
-    covered = truth[..., 3] == 1
-    return 100 * np.linalg.norm((image - truth)[covered, :3]) / np.linalg.norm(truth[covered, :3])
 
 
 if __name__ == "__main__":

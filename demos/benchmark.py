@@ -7,6 +7,7 @@ Figures are medians of runs that take turns, so that a slow moment of the machin
 """
 
 import argparse
+import dataclasses
 import os
 import statistics
 import subprocess
@@ -14,24 +15,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-import numpy as np
+import torch
+import warp as wp
+from scenes import on_ground, shipped_mesh
+
+import warpshadow as ws
+from warpshadow.basis import CellBasis, HarmonicBasis
+from warpshadow.camera import to_clip
+from warpshadow.directions import fibonacci
+from warpshadow.raster import interpolate, rasterize
+from warpshadow.renderer import Renderer
+from warpshadow.shading import directional_transfer, sh_transfer, shade
+from warpshadow.torch import TorchRenderer
+from warpshadow.visibility import directional, log_sh
 
 
 def main(device: str, runs: int) -> None:
-    import torch
-    import warp as wp
-
-    from warpshadow.basis import CellBasis, HarmonicBasis
-    from warpshadow.camera import to_clip
-    from warpshadow.directions import fibonacci
-    from warpshadow.raster import interpolate, rasterize
-    from warpshadow.renderer import Renderer
-    from warpshadow.shading import directional_transfer, sh_transfer, shade
-    from warpshadow.torch import TorchRenderer
-    from warpshadow.visibility import directional, log_sh
-
     wp.config.quiet = True
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
@@ -79,8 +79,6 @@ def main(device: str, runs: int) -> None:
 
 def in_turn(rows: dict[str, Callable[[], None]], runs: int) -> dict[str, float]:
     """Median milliseconds of each function, called in turn after a warm-up."""
-    import warp as wp
-
     times: dict[str, list[float]] = {label: [] for label in rows}
     for run in range(runs + 1):
         for label, function in rows.items():
@@ -93,23 +91,11 @@ def in_turn(rows: dict[str, Callable[[], None]], runs: int) -> dict[str, float]:
     return {label: statistics.median(each) for label, each in times.items()}
 
 
-def bunny_scene():
-    """The bunny that ships with Warp on a plane of 64 × 64 quads, under a sky with a sun."""
-    import warp.examples
-
-    import warpshadow as ws
-
-    bunny = ws.load_mesh(Path(warp.examples.get_asset_directory()) / "bunny.usd")
-    low, high = bunny.bounds
-    scale = 2 / (high - low).max()
-    middle = (low + high) / 2
-    place = -scale * np.array([middle[0], low[1], middle[2]])
-    return ws.Scene(
-        bodies=(ws.Body(bunny, scale=scale, translation=place), ws.Body(ws.plane(6.0, 64), blockers=0)),
-        light=ws.synthetic_sky(),
-        camera=ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(256, 256)),
-        supersampling=1,
-    )
+def bunny_scene() -> ws.Scene:
+    """The bunny on a plane of 64 × 64 quads that casts no shadow, under a sky with a sun."""
+    ground = ws.Body(ws.plane(6.0, 64), blockers=0)
+    scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky(), ground=ground)
+    return dataclasses.replace(scene, supersampling=1)
 
 
 def time_compilation(device: str) -> None:

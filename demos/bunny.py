@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
-import warp.examples
 from PIL import Image, ImageDraw, ImageFont
+from scenes import image_error, on_ground, shipped_mesh
 
 import warpshadow as ws
 from warpshadow.image import linear_to_srgb
@@ -40,7 +40,8 @@ def main(output: Path, iterations: int) -> None:
     sky_file = output / "sky.exr"
     ws.synthetic_sky((0.55, 0.6, 0.45), sun_strength=1.5, sun_radius=6.0).write(sky_file)
     sky = ws.EnvironmentMap.read(sky_file)
-    bunny, bear = scene_of("bunny.usd", sky), scene_of("bear.usd", sky)
+    ground = ws.Body(ws.plane(6.0, 64), texture=checkers())
+    bunny, bear = (on_ground(shipped_mesh(name), sky, ground=ground) for name in ("bunny", "bear"))
 
     print("rendering the bunny")
     truth, truth_seconds = timed(bunny, RAY_TRACED)
@@ -49,7 +50,7 @@ def main(output: Path, iterations: int) -> None:
     for label, visibility in METHODS.items():
         timed(bunny, visibility)  # compiles kernels and fits spheres
         image, seconds = timed(bunny, visibility)
-        panels.append((image, f"{label}\n{error(image, truth):.1%} error, {1e3 * seconds:.0f} ms"))
+        panels.append((image, f"{label}\n{image_error(image, truth):.1%} error, {1e3 * seconds:.0f} ms"))
         ws.write_image(output / f"{label.replace(', ', '_').replace(' ', '_')}.exr", image)
     panels.append((truth, f"ray traced\n{RAY_TRACED.samples} directions, {1e3 * truth_seconds:.0f} ms"))
 
@@ -59,7 +60,9 @@ def main(output: Path, iterations: int) -> None:
     for label, visibility in (("directional", METHODS["directional"]), ("no shadows", METHODS["no shadows"])):
         estimate, seconds = recover_light(bunny, visibility, truth, iterations)
         image, _ = timed(dataclasses.replace(bear, light=estimate), METHODS["directional"])
-        relit.append((image, f"light recovered with {label}\n{error(image, relit_truth):.1%} error, {seconds:.1f} s"))
+        relit.append(
+            (image, f"light recovered with {label}\n{image_error(image, relit_truth):.1%} error, {seconds:.1f} s")
+        )
         np.save(output / f"light_{label.replace(' ', '_')}.npy", estimate)
     relit.append((relit_truth, "true light\nray traced"))
 
@@ -69,23 +72,6 @@ def main(output: Path, iterations: int) -> None:
         name, figures = caption.split("\n")
         print(f"  {name:38}{figures}")
     print(f"{output / 'demo.png'} and EXR files beside it; {time.perf_counter() - start:.0f} s in all")
-
-
-def scene_of(asset: str, light: ws.EnvironmentMap) -> ws.Scene:
-    """A mesh that ships with Warp, made 2 units large, on a checkered ground."""
-    mesh = ws.load_mesh(Path(warp.examples.get_asset_directory()) / asset)
-    low, high = mesh.bounds
-    scale = 2 / (high - low).max()
-    middle = (low + high) / 2
-    body = ws.Body(
-        mesh,
-        albedo=(0.75, 0.62, 0.5),
-        scale=scale,
-        translation=-scale * np.array([middle[0], low[1], middle[2]]),
-    )
-    ground = ws.Body(ws.plane(6.0, 64), texture=checkers())
-    camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(256, 256))
-    return ws.Scene((body, ground), light, camera)
 
 
 def checkers(size: int = 512, tiles: int = 12) -> np.ndarray:
@@ -101,12 +87,6 @@ def timed(scene: ws.Scene, visibility: ws.Visibility) -> tuple[np.ndarray, float
     start = time.perf_counter()
     image = ws.render(dataclasses.replace(scene, visibility=visibility), progress=True)
     return image, time.perf_counter() - start
-
-
-def error(image: np.ndarray, truth: np.ndarray) -> float:
-    """Relative L2 error over the pixels that are wholly covered."""
-    covered = truth[..., 3] == 1
-    return np.linalg.norm((image - truth)[covered, :3]) / np.linalg.norm(truth[covered, :3])
 
 
 def recover_light(
