@@ -6,7 +6,6 @@ import pytest
 import warp as wp
 
 wp.config.quiet = True
-wp.config.verify_autograd_array_access = True
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -24,3 +23,9 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("shared/data (real meshes, environment maps, golden values) is not beside this checkout")
     return SHARED_DATA
+
+
+@pytest.fixture
+def verified_tape(monkeypatch):
+    """Let Warp report arrays that a tape sees overwritten. Kernels compile anew for it, so only tape tests ask."""
+    monkeypatch.setattr(wp.config, "verify_autograd_array_access", True)

@@ -221,7 +221,7 @@ def test_one_instance_of_positions_or_cameras_serves_all_of_the_other(device):
         to_clip(to_device(np.zeros((3, 5, 3)), wp.vec3, device), to_device(matrices, wp.mat44, device))
 
 
-def test_the_gradient_of_to_clip_is_that_of_a_matrix_product(device):
+def test_the_gradient_of_to_clip_is_that_of_a_matrix_product(device, verified_tape):
     rng = np.random.default_rng(3)
     points, matrices, seed = (
         rng.normal(size=(2, 5, 3)),

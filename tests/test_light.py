@@ -167,7 +167,7 @@ MAPS = [
 def test_real_maps_are_read_and_their_cells_keep_their_energy(shared_data, name):
     environment = EnvironmentMap.read(shared_data / "envmaps" / name)
     assert environment.radiance.shape == ((512, 1024, 3) if name.endswith("hdr") else (256, 512, 3))
-    cells = environment.cells(fibonacci(128)).astype(np.float64)
+    cells = environment.cells(fibonacci(128)).radiance.astype(np.float64)
     np.testing.assert_allclose(4 * np.pi / 128 * cells.sum(axis=0), integral(environment), rtol=ENERGY)
 
 
@@ -281,10 +281,10 @@ def cells_twin(environment, directions, split):
 def test_cells_and_their_moments_equal_their_twins():
     environment, directions = random_map(8), fibonacci(10)
     energy, moment = cells_twin(environment, directions, split=int(np.ceil(4 * np.pi * np.sqrt(10) / 8)))
-    cells = environment.cells(directions)
+    cells = environment.cells(directions).radiance
     assert cells.dtype == np.float32
     np.testing.assert_allclose(cells, energy * 10 / (4 * np.pi), rtol=1e-5)
-    mean, spreads = environment.cell_moments(directions)
+    _, mean, spreads = environment.cells(directions)
     length = np.linalg.norm(moment, axis=1)
     np.testing.assert_allclose(mean, moment / length[:, None], atol=1e-5)
     np.testing.assert_allclose(spreads, np.arccos(2 * length / (energy @ LUMINANCE) - 1), atol=1e-5)
@@ -296,23 +296,23 @@ def test_cells_keep_the_energy_for_any_directions(count, height, seed):
     directions = np.random.default_rng(seed).normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     environment = random_map(height, seed)
-    total = 4 * np.pi / count * environment.cells(directions).astype(np.float64).sum(axis=0)
+    total = 4 * np.pi / count * environment.cells(directions).radiance.astype(np.float64).sum(axis=0)
     np.testing.assert_allclose(total, integral(environment), rtol=ENERGY)
 
 
 def test_cells_of_an_even_light_are_even_and_as_wide_as_their_solid_angle():
     directions = fibonacci(128)
     environment = EnvironmentMap.constant(2.0, height=128)
-    np.testing.assert_allclose(environment.cells(directions), 2, rtol=0.1)  # Fibonacci cells vary by 6%
-    np.testing.assert_allclose(environment.cell_moments(directions).spreads, 2 / np.sqrt(128), rtol=0.1)
+    np.testing.assert_allclose(environment.cells(directions).radiance, 2, rtol=0.1)  # Fibonacci cells vary by 6%
+    np.testing.assert_allclose(environment.cells(directions).spreads, 2 / np.sqrt(128), rtol=0.1)
 
 
 def test_a_point_light_has_its_own_direction_and_no_spread():
     environment = spot(20, 30, height=64)
     towards = direction_twin(20.5, 30.5, 64)
     directions = fibonacci(32)
-    mean, spreads = environment.cell_moments(directions)
-    lit = np.argmax(environment.cells(directions)[:, 0])
+    _, mean, spreads = environment.cells(directions)
+    lit = np.argmax(environment.cells(directions).radiance[:, 0])
     assert lit == np.argmax(directions @ towards)
     np.testing.assert_allclose(mean[lit], towards, atol=1e-3)
     assert spreads[lit] < np.pi / 64

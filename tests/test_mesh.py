@@ -515,7 +515,7 @@ def test_normals_of_a_welded_seam_are_smooth_across_it(tmp_path, device):
     assert lower[0] > 0.9 > np.sqrt(0.5)  # the normal of either quad
 
 
-def test_the_gradient_of_vertex_normals_equals_central_differences(device):
+def test_the_gradient_of_vertex_normals_equals_central_differences(device, verified_tape):
     random = np.random.default_rng(1)
     mesh = icosphere(1.0, 1)
     start = mesh.positions + 0.1 * random.normal(size=mesh.positions.shape)
@@ -534,7 +534,7 @@ def test_the_gradient_of_vertex_normals_equals_central_differences(device):
     np.testing.assert_allclose(positions.grad.numpy()[0], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_faces_without_area_give_zero_normals_and_zero_gradients(device):
+def test_faces_without_area_give_zero_normals_and_zero_gradients(device, verified_tape):
     points = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0], [7, 7, 7]])  # three on a line, and one without a face
     positions = wp.array(points[None], dtype=wp.vec3, device=device, requires_grad=True)
     with wp.Tape() as tape:

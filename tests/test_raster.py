@@ -406,7 +406,7 @@ def test_attributes_of_a_wrong_batch_or_dtype_are_refused(device):
         interpolate(fragments, faces, wp.zeros((1, 9), dtype=wp.vec3d, device=device))
 
 
-def test_the_gradient_of_barycentrics_matches_central_differences_also_across_the_near_plane(device):
+def test_the_gradient_of_barycentrics_matches_central_differences_also_across_the_near_plane(device, verified_tape):
     rng = np.random.default_rng(19)
     width, height = 24, 18
     clip, faces = random_triangles(rng, 12)
@@ -432,7 +432,7 @@ def test_the_gradient_of_barycentrics_matches_central_differences_also_across_th
     np.testing.assert_allclose(got / scale, expected / scale, atol=2e-3)
 
 
-def test_the_gradient_of_interpolation_matches_central_differences(device):
+def test_the_gradient_of_interpolation_matches_central_differences(device, verified_tape):
     rng = np.random.default_rng(20)
     clip, faces = random_triangles(rng, 6)
     clip_positions, device_faces = on_device(np.stack([clip, clip[::-1]]), faces, device, requires_grad=True)
@@ -472,7 +472,7 @@ def test_barycentrics_of_kept_face_ids_equal_those_of_rasterize(device):
     np.testing.assert_array_equal(again.numpy(), fragments.barycentrics.numpy())
 
 
-def test_gradients_flow_through_the_whole_pipeline_into_positions(device):
+def test_gradients_flow_through_the_whole_pipeline_into_positions(device, verified_tape):
     """Sliding a textured quad sideways changes each pixel by minus the slope of its texture."""
     corners = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]], np.float32)
     camera = Camera(np.diag([8.0, 8.0, 1.0]) + [[0, 0, 4], [0, 0, 4], [0, 0, 0]], np.eye(3), np.zeros(3), 8, 8)

@@ -188,7 +188,7 @@ def difference(function, inputs, index, direction, weights, step=0.1):
     return (sums[0] - sums[1]) / (2 * step)
 
 
-def test_gradients_of_shading_are_its_central_differences(device):
+def test_gradients_of_shading_are_its_central_differences(device, verified_tape):
     inputs = random_light(device, requires_grad=True)
     rng = np.random.default_rng(6)
     weights = rng.normal(size=(2, 7, 3)).astype(np.float32)
@@ -251,7 +251,7 @@ def test_texel_centers_get_their_texels(device):
     assert np.abs(albedo.numpy() - texture.numpy().reshape(-1, 3)).max() < 2e-6
 
 
-def test_gradients_of_a_texture_are_its_central_differences(device):
+def test_gradients_of_a_texture_are_its_central_differences(device, verified_tape):
     texture, pixels, uvs = random_texture(device, requires_grad=True)
 
     def sample(values):

@@ -53,7 +53,7 @@ class CellBasis:
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         if isinstance(light, EnvironmentMap):
-            return light.cells(self.directions)
+            return light.cells(self.directions).radiance
         order = sh.order_of("light", light)
         return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
 

@@ -25,9 +25,17 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
 
 
-class CellMoments(NamedTuple):
-    """Where in a cell light comes from: mean directions [direction, 3] and spreads [direction] in radians."""
+class CellLight(NamedTuple):
+    """The light of cells of directions, and where in its cell it comes from.
 
+    Args:
+        radiance: Mean radiance, L_q = Q/4π ∫_cell L dω, so that Σ_q (4π/Q) L_q = ∫ L dω; float32 [direction, 3].
+        directions: Mean directions, weighted with luminance; float32 [direction, 3].
+        spreads: Half-angles of the evenly bright caps whose mean vectors are as long: 0 for a point, about 2/√Q for an
+            even cell [radians]; float32 [direction].
+    """
+
+    radiance: np.ndarray
     directions: np.ndarray
     spreads: np.ndarray
 
@@ -149,33 +157,14 @@ class EnvironmentMap:
         """
         return sh.project_map(self.radiance, order).astype(np.float32)
 
-    def cells(self, directions: np.ndarray) -> np.ndarray:
+    def cells(self, directions: np.ndarray) -> CellLight:
         """Gather the light of the cells around directions: every pixel belongs to the nearest one.
 
-            L_q = Q/4π ∫_cell L dω,    so that Σ_q (4π/Q) L_q = ∫ L dω
-
-        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that
-        are not much smaller than a cell are split.
+        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
+        much smaller than a cell are split. A dark cell gets its own direction and the spread of a cap of 4π/Q.
 
         Args:
             directions: Unit vectors, shape [direction, 3].
-
-        Returns:
-            Radiance, float32, shape [direction, 3].
-        """
-        energy, _ = self._cell_integrals(directions)
-        return (energy * (len(energy) / (4 * np.pi))).astype(np.float32)
-
-    def cell_moments(self, directions: np.ndarray) -> CellMoments:
-        """Find where in its cell the light comes from: a sun wants its own direction, not the cell's.
-
-        Args:
-            directions: Unit vectors, shape [direction, 3].
-
-        Returns:
-            Per cell the mean direction, weighted with luminance, and its spread: the half-angle of the evenly
-            bright cap whose mean vector is as long, so 0 for a point and about 2/√Q for an even cell. A dark
-            cell gets its own direction and the spread of a cap of 4π/Q.
         """
         energy, moment = self._cell_integrals(directions)
         power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
@@ -183,7 +172,8 @@ class EnvironmentMap:
         mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
         concentration = np.where(lit, length / np.where(lit, power, 1), 1 - 1 / len(energy))
         spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
-        return CellMoments(mean.astype(np.float32), spreads.astype(np.float32))
+        radiance = energy * (len(energy) / (4 * np.pi))
+        return CellLight(radiance.astype(np.float32), mean.astype(np.float32), spreads.astype(np.float32))
 
     def _cell_integrals(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Over every cell, ∫ L dω [direction, RGB] and ∫ luminance d dω [direction, 3], float64."""

@@ -150,11 +150,17 @@ class Renderer:
         if self.scene.visibility.method == "ray-traced":
             points, normals, *_ = self.receivers
             count = self.scene.visibility.samples
-            traced = trace_transfer(self._ray_mesh, points[0], normals[0], self.basis, count, progress=self.progress)
+            traced = trace_transfer(
+                self._ray_mesh, points.flatten(), normals.flatten(), self.basis, count, progress=self.progress
+            )
             return traced.reshape((1, *traced.shape))
+        return self._to_basis(self._own_transfer())
+
+    def _own_transfer(self) -> wp.array:
+        """Transfer vectors to what the method computes in."""
         if isinstance(self._own_basis, CellBasis):
-            return self._to_basis(self._cell_transfer(self._own_basis.directions))
-        return self._to_basis(self._harmonic_transfer())
+            return self._cell_transfer(self._own_basis.directions)
+        return self._harmonic_transfer()
 
     def _cell_transfer(self, directions: np.ndarray) -> wp.array:
         points, normals, *_ = self.receivers
@@ -214,22 +220,22 @@ class Renderer:
         method = self.scene.visibility.method
         if method == "ray-traced":
             return self._trace(light)
-        if isinstance(self._own_basis, CellBasis):
-            cells = self._own_basis.directions
+        if isinstance(self._own_basis, CellBasis) and isinstance(light, EnvironmentMap):
             # a cell looks to where its light comes from: a sun is rarely in the middle
-            aims = light.cell_moments(cells).directions if isinstance(light, EnvironmentMap) else cells
+            coefficients, aims, _ = light.cells(self._own_basis.directions)
             transfer = self._cell_transfer(aims)
         else:
-            transfer = self._harmonic_transfer()
-        return shading.shade(transfer, self._array(self._own_basis.coefficients(light)[None], wp.vec3))
+            coefficients = self._own_basis.coefficients(light)
+            transfer = self._own_transfer()
+        return shading.shade(transfer, self._array(coefficients[None], wp.vec3))
 
     def _trace(self, light: EnvironmentMap | np.ndarray) -> wp.array:
         radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
         count = max(1, self.scene.visibility.samples // self.scene.supersampling**2)
         points, normals, *_ = self.receivers
         samples = sample_map(radiance, count)
-        traced = trace_shading(self._ray_mesh, points[0], normals[0], samples, progress=self.progress)
-        return traced.reshape((1, -1))
+        traced = trace_shading(self._ray_mesh, points.flatten(), normals.flatten(), samples, progress=self.progress)
+        return traced.reshape(points.shape)
 
     @functools.cached_property
     def albedo(self) -> wp.array:

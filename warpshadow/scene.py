@@ -246,6 +246,7 @@ def _camera(table: dict[str, Any]) -> Camera:
     for key in ("fov_y", "near"):
         _number(table, key, 1.0)
     _integer(table, "supersampling")
+    _vector(table, "size", 2)
     return Camera.look_at(**{key: value for key, value in table.items() if key != "supersampling"})
 
 
