@@ -29,3 +29,21 @@ def shared_data() -> Path:
 def verified_tape(monkeypatch):
     """Let Warp report arrays that a tape sees overwritten. Kernels compile anew for it, so only tape tests ask."""
     monkeypatch.setattr(wp.config, "verify_autograd_array_access", True)
+
+
+@pytest.fixture
+def poisoned_outputs(monkeypatch):
+    """Fill what is allocated with NaN or −1, so that what a kernel leaves unwritten or reads too early shows."""
+    empty = wp.empty
+
+    def poisoned(*args, **kwargs):
+        array = empty(*args, **kwargs)
+        array.fill_(-1 if array.dtype in (wp.int32, wp.int64, wp.uint8) else float("nan"))
+        return array
+
+    monkeypatch.setattr(wp, "empty", poisoned)
+    monkeypatch.setattr(
+        wp,
+        "empty_like",
+        lambda a, **options: poisoned(a.shape, **{"dtype": a.dtype, "device": a.device} | options),
+    )

@@ -17,17 +17,7 @@ FLOAT32 = {16: 1e-5, 64: 5e-5, 128: 1e-4, 256: 2e-4, 1024: 1e-3}
 OPAQUE = 1e-4
 
 
-@pytest.fixture(autouse=True)
-def poison(monkeypatch):
-    """Fill what is allocated with NaN, so that what a kernel leaves unwritten or reads too early shows."""
-    empty = wp.empty
-
-    def poisoned(*args, **kwargs):
-        array = empty(*args, **kwargs)
-        array.fill_(np.nan)
-        return array
-
-    monkeypatch.setattr(wp, "empty", poisoned)
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 
 def transmittance(points, normals, centers, radii, directions, device="cpu", **options):

@@ -28,18 +28,7 @@ LOGS = list(log_sh.LOGS)
 BASES = list(log_sh.THRESHOLDS)
 
 
-@pytest.fixture(autouse=True)
-def poison(monkeypatch):
-    """Fill what is allocated with NaN, so that what a kernel leaves unwritten or reads too early shows."""
-    empty = wp.empty
-
-    def poisoned(*args, **kwargs):
-        array = empty(*args, **kwargs)
-        array.fill_(np.nan)
-        return array
-
-    monkeypatch.setattr(wp, "empty", poisoned)
-    monkeypatch.setattr(wp, "empty_like", lambda a, **k: poisoned(a.shape, dtype=a.dtype, device=a.device, **k))
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 
 def vectors(values, device):

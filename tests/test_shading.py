@@ -15,18 +15,7 @@ FLOAT32 = 5e-6
 GRADIENT = 2e-3
 
 
-@pytest.fixture(autouse=True)
-def poison(monkeypatch):
-    """Fill what is allocated with NaN, so that what a kernel leaves unwritten or reads too early shows."""
-    empty = wp.empty
-
-    def poisoned(*args, **kwargs):
-        array = empty(*args, **kwargs)
-        array.fill_(np.nan)
-        return array
-
-    monkeypatch.setattr(wp, "empty", poisoned)
-    monkeypatch.setattr(wp, "empty_like", lambda a, **k: poisoned(a.shape, dtype=a.dtype, device=a.device, **k))
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 
 def unit_vectors(seed, *shape):

@@ -91,7 +91,9 @@ class Camera:
         forward = view / distance
         right = np.cross(forward, top)
         if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
-            raise ValueError(f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
+            raise ValueError(
+                f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}"
+            )
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         width, height = _size(size)

@@ -35,6 +35,9 @@ class LaneFunctions(NamedTuple):
     """Kernel functions on lanes that Warp's vectors lack."""
 
     load: wp.Function
+    load_products: wp.Function
+    add_vectors: wp.Function
+    total: wp.Function
     load_rows: wp.Function
     store_rows: wp.Function
     store_columns: wp.Function
@@ -59,6 +62,37 @@ def lane_functions(lanes: int) -> LaneFunctions:
             y[lane] = value[1]
             z[lane] = value[2]
         return x, y, z
+
+    @wp.func
+    def load_products(
+        a: wp.array2d(dtype=wp.float32),
+        b: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        group: int,
+        scratch: wp.array(dtype=Lane),
+    ):
+        """scratch[k] = a b of the group's vertices in ``count`` columns k from ``begin`` on; 0 past the last vertex."""
+        for k in range(begin, begin + count):
+            value = Lane()
+            for lane in range(wp.min(lanes, a.shape[0] - group * lanes)):
+                vertex = group * lanes + lane
+                value[lane] = a[vertex, k] * b[vertex, k]
+            scratch[k] = value
+
+    @wp.func
+    def add_vectors(x: Lane, y: Lane, z: Lane, group: int, values: wp.array(dtype=wp.vec3)):
+        """Add to a group's vectors."""
+        for lane in range(wp.min(lanes, values.shape[0] - group * lanes)):
+            wp.atomic_add(values, group * lanes + lane, wp.vec3(x[lane], y[lane], z[lane]))
+
+    @wp.func
+    def total(value: Lane):
+        """Sum over the lanes."""
+        sum_ = float(0.0)
+        for lane in range(lanes):
+            sum_ += value[lane]
+        return sum_
 
     @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
@@ -93,4 +127,4 @@ def lane_functions(lanes: int) -> LaneFunctions:
             root[lane] = wp.sqrt(value[lane])
         return root
 
-    return LaneFunctions(load, load_rows, store_rows, store_columns, sqrt)
+    return LaneFunctions(load, load_products, add_vectors, total, load_rows, store_rows, store_columns, sqrt)

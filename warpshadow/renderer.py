@@ -181,12 +181,14 @@ class Renderer:
         """Take transfer vectors from what the method computes in to what the light is expressed in."""
         if self.basis == self._own_basis:
             return transfer
-        if isinstance(self._own_basis, CellBasis):
+        if isinstance(self._own_basis, CellBasis) and not isinstance(self.basis, CellBasis):
             matrix = self.basis.functions(self._own_basis.directions)
-        else:  # the mean of the harmonics over a cell, from many directions in it
-            fine = fibonacci(64 * self.basis.size)
-            cells = self.basis.functions(fine)
-            matrix = self._own_basis.functions(fine).T @ cells * (4 * np.pi / len(fine))
+        else:  # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
+            fine = fibonacci(64 * max(self.basis.size, self._own_basis.size))
+            own, cells = self._own_basis.functions(fine), self.basis.functions(fine)
+            is_cellular = isinstance(self._own_basis, CellBasis)
+            weights = 1 / own.sum(axis=0)[:, None] if is_cellular else 4 * np.pi / len(fine)
+            matrix = weights * (own.T @ cells)
         return self._array(transfer.numpy() @ matrix.astype(np.float32), wp.float32)
 
     @functools.cached_property

@@ -112,10 +112,17 @@ class Body:
                 )
             texture = np.array(self.texture, np.float32)
             check.shape("texture", texture.shape, ("height", "width", 3))
+            if texture.size == 0:
+                raise ValueError(f"texture: got shape {texture.shape}, expected at least one texel")
             check.finite("texture", texture)
             object.__setattr__(self, "texture", texture)
-        if isinstance(self.blockers, int) and self.blockers < 0:
-            raise ValueError(f"blockers: got {self.blockers}, expected a number of spheres, 0 or more")
+        if not isinstance(self.blockers, Spheres):
+            is_count = isinstance(self.blockers, (int, np.integer)) and not isinstance(self.blockers, bool)
+            if not is_count or self.blockers < 0:
+                raise ValueError(
+                    f"blockers: got {self.blockers!r}, expected a number of spheres, 0 or more, or Spheres"
+                )
+            object.__setattr__(self, "blockers", int(self.blockers))
         for name in ("rotation", "translation"):
             vector = np.array(getattr(self, name), np.float64)
             check.shape(name, vector.shape, (3,))
@@ -136,7 +143,9 @@ class Body:
 
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""
-        return self.mesh.transformed(rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale)
+        return self.mesh.transformed(
+            rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +309,8 @@ def _body(table: dict[str, Any], folder: Path) -> Body:
         mesh = load_mesh(_file(table, "mesh", folder))
     place = {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
-        place["texture"] = read_image(_file(table, "texture", folder))[..., :3]
+        pixels = read_image(_file(table, "texture", folder))
+        place["texture"] = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
     for key in ("albedo", "rotation", "translation"):
         _vector(table, key)
     _integer(table, "blockers")

@@ -141,10 +141,11 @@ class _WarpFunction(torch.autograd.Function):
         return wp.to_torch(result, requires_grad=False)
 
     @staticmethod
+    @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
         with _current_stream(gradient):
             # copies, since memory shared with torch is reused behind the tape's back
-            wp.copy(ctx.result.grad, wp.from_torch(gradient.contiguous(), dtype=wp.vec3))
+            wp.copy(ctx.result.grad, wp.from_torch(gradient.detach().contiguous(), dtype=wp.vec3))
             ctx.tape.backward()
             result = wp.to_torch(ctx.argument.grad, requires_grad=False).clone()
             ctx.tape.zero()
@@ -165,5 +166,7 @@ def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shapes:
         raise ValueError(f"{name}: got device {tensor.device}, expected {device}")
     fitting = [shape for shape in shapes if len(shape) == tensor.ndim] or shapes[:1]
     check.shape(name, tuple(tensor.shape), fitting[0])
+    if tensor.numel() == 0:
+        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
     if not np.isfinite(float(tensor.detach().sum())):
         check.finite(name, tensor.detach().cpu().numpy())

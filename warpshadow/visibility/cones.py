@@ -60,3 +60,58 @@ def cone_function(lanes: int) -> wp.Function:
         return wp.cw_mul(dx, inverse), wp.cw_mul(dy, inverse), wp.cw_mul(dz, inverse), cosine, sine2, weight
 
     return cone
+
+
+@functools.cache
+def cone_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`cone_function`: offsets, radius, adjoints of the results → adjoints of the arguments.
+
+    Cosine, sin²θ and weight depend on X = D/r alone, and sin²θ = 1 − cos²θ, so with c' = dc/dX
+
+        X̄ = (c̄ − 2c s̄²) c' + w̄ w',   r̄ = −X̄ X / r,   d̄ = (ū − u (u·ū)) / D + u X̄ / r
+        c' = X⁻³ / c beyond 1.01 r, else the slope of the blend's cubic
+    """
+    Lane = lane_type(lanes)
+    sqrt = lane_functions(lanes).sqrt
+    cone = cone_function(lanes)
+    SINE2 = wp.constant(float(_SINE2))
+    COSINE = wp.constant(float(_COSINE))
+    RISE = wp.constant(float(_RISE))
+
+    @wp.func
+    def adjoint(
+        dx: Lane,
+        dy: Lane,
+        dz: Lane,
+        radius: float,
+        adj_ux: Lane,
+        adj_uy: Lane,
+        adj_uz: Lane,
+        adj_cosine: Lane,
+        adj_sine2: Lane,
+        adj_weight: Lane,
+    ):
+        ux, uy, uz, cosine, _sine2, _weight = cone(dx, dy, dz, radius)
+        distance = sqrt(wp.max(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz), Lane(1.0e-37)))
+        inverse = wp.cw_div(Lane(1.0), distance)
+        far = distance / radius
+        ratio2 = wp.min(wp.cw_mul(radius * inverse, radius * inverse), Lane(SINE2))
+        beyond = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
+        u = Lane(1.0) - wp.min(wp.max((far - Lane(1.0)) / BLEND, Lane(0.0)), Lane(1.0))
+        within = Lane(RISE) + wp.cw_mul(u, Lane(6.0 * COSINE - 4.0 * RISE) + (3.0 * RISE - 6.0 * COSINE) * u)
+        is_within = wp.min(wp.max((Lane(1.0 + BLEND) - far) * 1.0e20, Lane(0.0)), Lane(1.0))
+        cosine_slope = beyond + wp.cw_mul(is_within, within / BLEND - beyond)
+        near = wp.min(far / FADE, Lane(1.0))
+        weight_slope = (6.0 / FADE) * wp.cw_mul(near, Lane(1.0) - near)
+
+        adj_far = wp.cw_mul(adj_cosine - 2.0 * wp.cw_mul(cosine, adj_sine2), cosine_slope)
+        adj_far += wp.cw_mul(adj_weight, weight_slope)
+        adj_distance = adj_far / radius
+        along = wp.cw_mul(ux, adj_ux) + wp.cw_mul(uy, adj_uy) + wp.cw_mul(uz, adj_uz)
+        radial = adj_distance - wp.cw_mul(along, inverse)
+        adj_dx = wp.cw_mul(adj_ux, inverse) + wp.cw_mul(ux, radial)
+        adj_dy = wp.cw_mul(adj_uy, inverse) + wp.cw_mul(uy, radial)
+        adj_dz = wp.cw_mul(adj_uz, inverse) + wp.cw_mul(uz, radial)
+        return adj_dx, adj_dy, adj_dz, -wp.cw_mul(adj_distance, far)
+
+    return adjoint

@@ -18,7 +18,8 @@ import warp as wp
 from warpshadow import check
 from warpshadow.directions import CHUNK, cell_radius, check_count, chunk_cones
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
-from warpshadow.visibility.cones import cone_function
+from warpshadow.tape import record_adjoint
+from warpshadow.visibility.cones import cone_adjoint, cone_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
@@ -27,11 +28,75 @@ _OPAQUE = 1.0e-4  # below this transmittance a chunk is not looked at any more
 
 
 @functools.cache
-def _transmittance_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
+def _edge_function(lanes: int) -> wp.Function:
+    """Make the kernel function of a cone's soft edge: cos θ, sin θ, sin²θ, weight, w → lo, hi, 1/(hi−lo), A."""
+    Lane = lane_type(lanes)
+    sqrt = lane_functions(lanes).sqrt
+
+    @wp.func
+    def edge(cosine: Lane, sine: Lane, sine2: Lane, weight: Lane, cos_width: float, sin_width: float):
+        low = cos_width * cosine - sin_width * sine
+        # cos(max(θ − w, 0)): where θ < w the sine of the difference is cut off at 0
+        inner = wp.max(cos_width * sine - sin_width * cosine, Lane(0.0))
+        high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
+        slope = wp.cw_div(Lane(1.0), high - low)
+        solid_angle = wp.cw_div(sine2, Lane(1.0) + cosine)
+        opacity = wp.cw_div(solid_angle, Lane(1.0) - 0.5 * (high + low))
+        return low, high, slope, wp.cw_mul(weight, wp.min(opacity, Lane(1.0)))
+
+    return edge
+
+
+@functools.cache
+def _edge_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`_edge_function` → adjoints of cos θ, sin²θ and the weight.
+
+    With k = 1 − cos θ the solid angle over 2π, h = 1 − (hi+lo)/2, g = k/h and m = min(1, g):
+
+        w̄ = Ā m,  k̄ = Ā w/h and h̄ = −Ā w g/h where g < 1,  lo and hi each gain −h̄/2
+        lo = cos w cos θ − sin w sin θ,  hi = √(1 − inner²),  inner = cos w sin θ − sin w cos θ where that is positive
+    """
+    Lane = lane_type(lanes)
+    sqrt = lane_functions(lanes).sqrt
+
+    @wp.func
+    def adjoint(
+        cosine: Lane,
+        sine: Lane,
+        sine2: Lane,
+        weight: Lane,
+        cos_width: float,
+        sin_width: float,
+        adj_low: Lane,
+        adj_high: Lane,
+        adj_opacity: Lane,
+    ):
+        low = cos_width * cosine - sin_width * sine
+        inner = wp.max(cos_width * sine - sin_width * cosine, Lane(0.0))
+        high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
+        inverse = wp.cw_div(Lane(1.0), Lane(1.0) - 0.5 * (high + low))
+        share = wp.cw_mul(wp.cw_div(sine2, Lane(1.0) + cosine), inverse)
+        is_partial = wp.min(wp.max((Lane(1.0) - share) * 1.0e20, Lane(0.0)), Lane(1.0))
+        adj_weight = wp.cw_mul(adj_opacity, wp.min(share, Lane(1.0)))
+        adj_solid_angle = wp.cw_mul(wp.cw_mul(is_partial, wp.cw_mul(adj_opacity, weight)), inverse)
+        gain = 0.5 * wp.cw_mul(adj_solid_angle, share)
+        low_ = adj_low + gain
+        high_ = adj_high + gain
+        adj_inner = -wp.cw_div(wp.cw_mul(high_, inner), high)
+        adj_cosine = cos_width * low_ - sin_width * adj_inner - adj_solid_angle
+        adj_sine = cos_width * adj_inner - sin_width * low_
+        adj_sine2 = wp.cw_div(0.5 * adj_sine, wp.max(sine, Lane(1.0e-18)))
+        return adj_cosine, adj_sine2, adj_weight
+
+    return adjoint
+
+
+@functools.cache
+def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load, store_columns, sqrt = fn.load, fn.store_columns, fn.sqrt
-    cone = cone_function(lanes)
+    cone, edge = cone_function(lanes), _edge_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
@@ -48,9 +113,10 @@ def _transmittance_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
+        ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a chunk of 16 directions."""
+        """A thread owns a group of receivers and a chunk of 16 directions; ends are where it stopped looking."""
         batch, group, chunk = wp.tid()
         begin = chunk * CHUNK
         row = scratch[batch, group]
@@ -74,25 +140,15 @@ def _transmittance_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                     Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
                 )
                 sine = sqrt(sine2)
-                low = cos_width * cosine - sin_width * sine
                 # does the cone, widened, reach the chunk's?
-                reach = edge_cosine * low - edge_sine * (sin_width * cosine + cos_width * sine)
+                reach = edge_cosine * (cos_width * cosine - sin_width * sine)
+                reach -= edge_sine * (sin_width * cosine + cos_width * sine)
                 if wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - reach) > 0.0:
-                    # cos(max(θ − w, 0)): where θ < w the sine of the difference is cut off at 0
-                    inner = wp.max(cos_width * sine - sin_width * cosine, Lane(0.0))
-                    high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
-                    slope = wp.cw_div(Lane(1.0), high - low)
-                    offset = -wp.cw_mul(low, slope)
-                    ux = wp.cw_mul(ux, slope)
-                    uy = wp.cw_mul(uy, slope)
-                    uz = wp.cw_mul(uz, slope)
-                    solid_angle = wp.cw_div(sine2, Lane(1.0) + cosine)
-                    opacity = wp.cw_div(solid_angle, Lane(1.0) - 0.5 * (high + low))
-                    opacity = wp.cw_mul(weight, wp.min(opacity, Lane(1.0)))
+                    low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
                     most = Lane(0.0)
                     for q in range(begin, begin + CHUNK):
                         omega = directions[q]
-                        t = omega[0] * ux + omega[1] * uy + omega[2] * uz + offset
+                        t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
                         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
                         step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                         passing = wp.cw_mul(row[q], Lane(1.0) - wp.cw_mul(opacity, step))
@@ -100,9 +156,119 @@ def _transmittance_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                         row[q] = passing
                     brightest = wp.max(most)
             sphere += 1
+        ends[batch, group, chunk] = sphere
         store_columns(row, begin, CHUNK, group, transmittance[batch])
 
     return transmit
+
+
+@functools.cache
+def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
+    Lane = lane_type(lanes)
+    fn = lane_functions(lanes)
+    load, load_products, sqrt, add_vectors, total = fn.load, fn.load_products, fn.sqrt, fn.add_vectors, fn.total
+    cone, cone_adjoint_ = cone_function(lanes), cone_adjoint(lanes)
+    edge, edge_adjoint = _edge_function(lanes), _edge_adjoint(lanes)
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    def transmit_adjoint(
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        centers: wp.array2d(dtype=wp.vec3),
+        radii: wp.array2d(dtype=wp.float32),
+        directions: wp.array(dtype=wp.vec3),
+        chunk_axes: wp.array(dtype=wp.vec3),
+        chunk_edges: wp.array(dtype=wp.vec2),
+        cos_width: float,
+        sin_width: float,
+        ends: wp.array3d(dtype=wp.int32),
+        transmittance: wp.array3d(dtype=wp.float32),
+        adj_transmittance: wp.array3d(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        adj_points: wp.array2d(dtype=wp.vec3),
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers and a chunk of 16 directions.
+
+        With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
+        ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
+        ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
+        """
+        batch, group, chunk = wp.tid()
+        begin = chunk * CHUNK
+        row = scratch[batch, group]
+        load_products(transmittance[batch], adj_transmittance[batch], begin, CHUNK, group, row)
+        x, y, z = load(points[batch], group)
+        adj_x = Lane(0.0)
+        adj_y = Lane(0.0)
+        adj_z = Lane(0.0)
+        axis = chunk_axes[chunk]
+        edge_cosine = chunk_edges[chunk][0]
+        edge_sine = chunk_edges[chunk][1]
+        for sphere in range(ends[batch, group, chunk]):
+            radius = radii[batch, sphere]
+            center = centers[batch, sphere]
+            if radius > 0.0:
+                dx = Lane(center[0]) - x
+                dy = Lane(center[1]) - y
+                dz = Lane(center[2]) - z
+                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
+                sine = sqrt(sine2)
+                reach = edge_cosine * (cos_width * cosine - sin_width * sine)
+                reach -= edge_sine * (sin_width * cosine + cos_width * sine)
+                if wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - reach) > 0.0:
+                    low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
+                    sum_ = Lane(0.0)
+                    sum_t = Lane(0.0)
+                    sum_x = Lane(0.0)
+                    sum_y = Lane(0.0)
+                    sum_z = Lane(0.0)
+                    adj_opacity = Lane(0.0)
+                    for q in range(begin, begin + CHUNK):
+                        omega = directions[q]
+                        t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
+                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                        passing = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-20))
+                        adj_blocked = -wp.cw_div(row[q], passing)
+                        adj_opacity += wp.cw_mul(adj_blocked, step)
+                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), wp.cw_mul(t, Lane(1.0) - t))
+                        sum_ += adj_t
+                        sum_t += wp.cw_mul(adj_t, t)
+                        sum_x += omega[0] * adj_t
+                        sum_y += omega[1] * adj_t
+                        sum_z += omega[2] * adj_t
+                    adj_low = wp.cw_mul(slope, sum_t - sum_)
+                    adj_high = -wp.cw_mul(slope, sum_t)
+                    adj_cosine, adj_sine2, adj_weight = edge_adjoint(
+                        cosine, sine, sine2, weight, cos_width, sin_width, adj_low, adj_high, adj_opacity
+                    )
+                    adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
+                        dx,
+                        dy,
+                        dz,
+                        radius,
+                        wp.cw_mul(slope, sum_x),
+                        wp.cw_mul(slope, sum_y),
+                        wp.cw_mul(slope, sum_z),
+                        adj_cosine,
+                        adj_sine2,
+                        adj_weight,
+                    )
+                    adj_x -= adj_dx
+                    adj_y -= adj_dy
+                    adj_z -= adj_dz
+                    if adj_centers:
+                        wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(adj_dx), total(adj_dy), total(adj_dz)))
+                    if adj_radii:
+                        wp.atomic_add(adj_radii, batch, sphere, total(adj_radius))
+        if adj_points:
+            add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
+
+    return transmit_adjoint
 
 
 def transmittance(
@@ -131,7 +297,7 @@ def transmittance(
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
 
-    Differentiable: nothing yet.
+    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness.
     """
     check.shape("directions", directions.shape, ("direction", 3))
     check_count("directions", len(directions))
@@ -150,23 +316,39 @@ def transmittance(
     check.shape("radii", radii.shape, centers.shape)
     groups = group_count(vertex_count, lanes)
     axes, cosine, sine = chunk_cones(directions, width)
-    result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
-    wp.launch(
-        _transmittance_kernel(normals is not None, lanes),
-        dim=(batch_count, groups, len(axes)),
-        inputs=[
-            points,
-            normals,
-            centers,
-            radii,
-            wp.array(directions, dtype=wp.vec3, device=device),
-            wp.array(axes, dtype=wp.vec3, device=device),
-            wp.array(np.stack([cosine, sine], axis=-1), dtype=wp.vec2, device=device),
-            float(np.cos(width)),
-            float(np.sin(width)),
-            wp.empty((batch_count, groups, len(directions)), dtype=lane_type(lanes), device=device),
-        ],
-        outputs=[result],
+    cells = [
+        wp.array(directions, dtype=wp.vec3, device=device),
+        wp.array(axes, dtype=wp.vec3, device=device),
+        wp.array(np.stack([cosine, sine], axis=-1), dtype=wp.vec2, device=device),
+        float(np.cos(width)),
+        float(np.sin(width)),
+    ]
+    scratch = wp.empty((batch_count, groups, len(directions)), dtype=lane_type(lanes), device=device)
+    ends = wp.empty((batch_count, groups, len(axes)), dtype=wp.int32, device=device)
+    variables = [points, centers, radii]
+    result = wp.empty(
+        (batch_count, vertex_count, len(directions)),
+        dtype=wp.float32,
         device=device,
+        requires_grad=any(variable.requires_grad for variable in variables),
     )
+    wp.launch(
+        _transmit_kernel(normals is not None, lanes),
+        dim=ends.shape,
+        inputs=[points, normals, centers, radii, *cells, scratch],
+        outputs=[ends, result],
+        device=device,
+        record_tape=False,
+    )
+
+    def adjoint() -> None:
+        wp.launch(
+            _transmit_adjoint_kernel(lanes),
+            dim=ends.shape,
+            inputs=[points, centers, radii, *cells, ends, result, result.grad, scratch],
+            outputs=[variable.grad for variable in variables],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [*variables, result])
     return result

@@ -42,10 +42,11 @@ class Threshold(NamedTuple):
 THRESHOLDS = {
     "quadratic": Threshold(0.5, 1.0),
     "linear": Threshold(0.06, 1.0),
-    "optimal_linear": Threshold(0.25, 2.0),
+    "optimal_linear": Threshold(0.06, 2.0),
 }
-"""Base approximations of the exponential; beyond the limits, repeated squaring explodes (at twice the limit of
-`quadratic` the error is 12-fold, at four times 48 000-fold)."""
+"""Base approximations of the exponential. Beyond the limits, repeated squaring explodes: for `quadratic` the error is
+12-fold at twice its limit and 48 000-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.6%
+(`linear`) and 3% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
 _TABLE_SIZE = 2048
 

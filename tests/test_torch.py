@@ -1,0 +1,358 @@
+"""Rendering with tensors: the same image, exact gradients, nothing shared by accident, nothing kept too long."""
+
+import dataclasses
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import warpshadow as ws
+from warpshadow.torch import TorchRenderer
+
+METHODS = ("directional", "log-sh", "none", "ray-traced")
+# The same float32 products in another order.
+FLOAT32 = 2e-6
+# The image is linear in each input alone, so a central difference has no truncation error, only rounding: a loss of some
+# hundred float32 pixels over a step of 1.
+DIFFERENCE = 1e-4
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def small_scene(method: str = "directional", *, size: int = 12, supersampling: int = 2, **options) -> ws.Scene:
+    ball = ws.Body(
+        ws.icosphere(1.0, 2),
+        albedo=(0.7, 0.5, 0.3),
+        blockers=ws.Spheres([[0, 0, 0]], [1.0]),
+        translation=(0, 1, 0),
+        scale=0.8,
+    )
+    texture = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3))
+    ground = ws.Body(ws.plane(3.0, 12), texture=texture, blockers=0)
+    camera = ws.Camera.look_at((0, 2.5, 5), (0, 0.6, 0), size=(size, size))
+    visibility = ws.Visibility(method, samples=64, directions=32, order=4)
+    sky = ws.synthetic_sky(height=16, sun_radius=12)
+    return ws.Scene((ball, ground), sky, camera, dataclasses.replace(visibility, **options), supersampling)
+
+
+def random(*shape: int, device: str = "cpu", seed: int = 0, low: float = 0.1) -> torch.Tensor:
+    values = torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) + low
+    return values.to(device).requires_grad_()
+
+
+def torch_device(device: str) -> str:
+    return "cpu" if device == "cpu" else device
+
+
+@pytest.fixture(scope="module")
+def renderer() -> TorchRenderer:
+    """The CPU's, shared, which no test may change."""
+    return TorchRenderer(small_scene())
+
+
+def inputs_of(renderer: TorchRenderer) -> dict[str, torch.Tensor]:
+    """Everything that can be free at once."""
+    vertex_count = renderer.renderer.scene.bodies[0].mesh.vertex_count
+    return {
+        "light": random(renderer.renderer.basis.size, 3, seed=1),
+        "color": random(3, seed=2),
+        "vertices": random(vertex_count, 3, seed=3),
+        "texture": random(5, 7, 3, seed=4),
+    }
+
+
+def image_of(renderer: TorchRenderer, name: str, values: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The image as a function of all inputs; ``color`` and ``vertices`` both stand for the ball's albedo."""
+    ball = values["color"] if name == "color" else values["vertices"]
+    return renderer(values["light"], [ball, values["texture"]])
+
+
+# ---------------------------------------------------------------------------------------------- images
+
+
+@pytest.mark.parametrize("supersampling", [1, 3])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_image_is_the_renderers(device, method, supersampling):
+    scene = small_scene(method, supersampling=supersampling)
+    image = TorchRenderer(scene, device=torch_device(device))()
+    expected = ws.render(scene, device=device)
+    assert image.dtype == torch.float32 and image.device == torch.device(torch_device(device))
+    assert np.abs(image.cpu().numpy() - expected).max() < FLOAT32 * expected.max()
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
+def test_free_light_in_the_methods_own_basis_is_the_scenes_light(method):
+    light = np.random.default_rng(1).normal(size=(16, 3)).astype(np.float32)
+    scene = dataclasses.replace(small_scene(method), light=light)
+    renderer = TorchRenderer(scene)
+    coefficients = torch.from_numpy(renderer.renderer.basis.coefficients(light))
+    expected = ws.render(scene)
+    assert np.abs(renderer(coefficients).numpy() - expected).max() < FLOAT32 * 5 * np.abs(expected).max()
+
+
+def test_albedo_as_tensors_gives_the_same_image_as_in_the_scene(renderer):
+    scene = renderer.renderer.scene
+    ball, ground = scene.bodies
+    albedo = [torch.from_numpy(ball.albedo), torch.from_numpy(ground.texture)]
+    expected = renderer()
+    assert (renderer(albedo=albedo) - expected).abs().max() < FLOAT32
+    assert (renderer(albedo=[None, None]) - expected).abs().max() == 0
+    of_vertices = torch.from_numpy(np.tile(ball.albedo, (ball.mesh.vertex_count, 1)))
+    assert (renderer(albedo=[of_vertices, None]) - expected).abs().max() < FLOAT32 * 3
+    flat = renderer(albedo=[None, torch.tensor([0.2, 0.4, 0.6])])
+    scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=None, albedo=(0.2, 0.4, 0.6))))
+    assert np.abs(flat.numpy() - ws.render(scene)).max() < FLOAT32 * 3
+
+
+def test_vertex_albedo_of_the_second_body_stays_with_it():
+    scene = small_scene()
+    ball, ground = scene.bodies
+    colors = np.random.default_rng(2).uniform(size=(ball.mesh.vertex_count, 3)).astype(np.float32)
+    scene = dataclasses.replace(scene, bodies=(ground, dataclasses.replace(ball, albedo=colors)))
+    renderer = TorchRenderer(dataclasses.replace(scene, bodies=(ground, ball)))
+    image = renderer(albedo=[None, torch.from_numpy(colors)])
+    assert np.abs(image.numpy() - ws.render(scene)).max() < FLOAT32 * 3
+
+
+def test_writing_into_an_image_does_not_change_the_next_one():
+    for supersampling in (1, 2):
+        renderer = TorchRenderer(small_scene(supersampling=supersampling))
+        for light in (None, torch.ones(32, 3)):
+            first = renderer(light)
+            kept = first.clone()
+            first.fill_(float("nan"))
+            assert torch.equal(renderer(light), kept)
+
+
+# ---------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("name", ["light", "color", "vertices", "texture"])
+@pytest.mark.parametrize("method", METHODS)
+def test_gradients_are_central_differences(method, name):
+    renderer = TorchRenderer(small_scene(method))
+    values = inputs_of(renderer)
+    weights = torch.randn(12, 12, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+    def loss(changed: torch.Tensor) -> torch.Tensor:
+        return (image_of(renderer, name, {**values, name: changed}).double() * weights).sum()
+
+    (gradient,) = torch.autograd.grad(loss(values[name]), values[name])
+    assert gradient.isfinite().all() and gradient.abs().max() > 0
+    rng = np.random.default_rng(6)
+    scale = gradient.abs().max().item()
+    with torch.no_grad():
+        for index in rng.choice(gradient.numel(), size=min(12, gradient.numel()), replace=False):
+            step = torch.zeros_like(gradient).flatten()
+            step[int(index)] = 0.5
+            step = step.reshape(gradient.shape)
+            difference = (loss(values[name] + step) - loss(values[name] - step)).item()
+            assert abs(gradient.flatten()[int(index)].item() - difference) < DIFFERENCE * scale
+
+
+@pytest.mark.parametrize("name", ["light", "color", "vertices", "texture"])
+def test_forward_and_backward_are_adjoint(device, name):
+    """⟨J v, w⟩ = ⟨v, Jᵀ w⟩ for random v and w, J the linear map from one input to the image."""
+    renderer = TorchRenderer(small_scene(), device=torch_device(device))
+    values = {key: value.detach().to(torch_device(device)) for key, value in inputs_of(renderer).items()}
+    values[name].requires_grad_()
+    image = image_of(renderer, name, values)[..., :3]
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(7)).to(image.device)
+    if name in ("color", "vertices"):  # linear in the ball's albedo but for the ground, which is constant
+        zero = image_of(renderer, name, {**values, name: torch.zeros_like(values[name])})[..., :3]
+        image = image - zero
+    elif name == "texture":
+        image = image - image_of(renderer, name, {**values, name: torch.zeros_like(values[name])})[..., :3]
+    left = (image * weights).sum()
+    (gradient,) = torch.autograd.grad(left, values[name])
+    right = (gradient * values[name].detach()).sum()
+    assert abs(left.item() - right.item()) < DIFFERENCE * abs(left.item())
+
+
+def test_all_inputs_can_be_free_at_once(renderer):
+    values = inputs_of(renderer)
+    renderer(values["light"], [values["vertices"], values["texture"]]).square().sum().backward()
+    together = {name: values[name].grad for name in ("light", "vertices", "texture")}
+    for name, gradient in together.items():
+        alone = {key: value.detach() for key, value in values.items()}
+        alone[name].requires_grad_()
+        renderer(alone["light"], [alone["vertices"], alone["texture"]]).square().sum().backward()
+        torch.testing.assert_close(alone[name].grad, gradient)
+
+
+def test_backward_twice_gives_the_same(renderer):
+    values = inputs_of(renderer)
+    loss = renderer(values["light"], [values["vertices"], values["texture"]]).square().sum()
+    leaves = [values[name] for name in ("light", "vertices", "texture")]
+    first = torch.autograd.grad(loss, leaves, retain_graph=True)
+    kept = [gradient.clone() for gradient in first]
+    second = torch.autograd.grad(loss, leaves)
+    for before, after, untouched in zip(first, second, kept, strict=True):
+        assert torch.equal(before, after) and torch.equal(before, untouched)
+
+
+def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
+    light = random(renderer.renderer.basis.size, 3)
+    texture = random(8, 8, 3)
+    weights = torch.rand(12, 12, 4, generator=torch.Generator().manual_seed(8))
+
+    def loss(factor: float) -> torch.Tensor:
+        return (renderer(factor * light, [None, texture]) * weights).sum()
+
+    (alone,) = torch.autograd.grad(loss(1.0), texture)
+    first, second = loss(1.0), loss(3.0)
+    (of_first,) = torch.autograd.grad(first, texture)
+    (of_second,) = torch.autograd.grad(second, texture)
+    torch.testing.assert_close(of_first, alone)
+    torch.testing.assert_close(of_second, 3 * alone)
+
+
+def test_a_second_derivative_is_refused_instead_of_being_wrong(renderer):
+    light = random(renderer.renderer.basis.size, 3)
+    loss = renderer(light).square().sum()
+    (gradient,) = torch.autograd.grad(loss, light, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
+def test_without_gradients_nothing_is_recorded(renderer):
+    light = random(renderer.renderer.basis.size, 3)
+    with torch.no_grad():
+        image = renderer(light, [random(3), random(4, 4, 3)])
+    assert not image.requires_grad
+    assert renderer(light).requires_grad
+    assert not renderer(light.detach()).requires_grad
+
+
+def test_tensors_need_not_be_contiguous(renderer):
+    count = renderer.renderer.basis.size
+    light = random(3, count).detach().T.requires_grad_()
+    texture = random(3, 6, 5).detach().permute(1, 2, 0).requires_grad_()
+    vertices = random(3, 162).detach().T.requires_grad_()
+    assert not (light.is_contiguous() or texture.is_contiguous() or vertices.is_contiguous())
+    weights = torch.rand(12, 4, 12).permute(0, 2, 1)  # so the gradient is not either
+    (renderer(light, [vertices, texture]) * weights).sum().backward()
+    copies = [tensor.detach().contiguous().requires_grad_() for tensor in (light, vertices, texture)]
+    (renderer(copies[0], copies[1:]) * weights).sum().backward()
+    for tensor, copy in zip((light, vertices, texture), copies, strict=True):
+        torch.testing.assert_close(tensor.grad, copy.grad)
+
+
+def test_texels_that_no_pixel_sees_have_a_zero_gradient(renderer):
+    texture = random(400, 400, 3)
+    renderer(albedo=[None, texture]).sum().backward()
+    assert texture.grad.isfinite().all()
+    seen = (texture.grad != 0).any(dim=-1)
+    assert 0 < seen.sum() < 4 * 24 * 24 + 1
+
+
+# ---------------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    ("light", "message"),
+    [
+        (np.ones((32, 3), np.float32), "light: got ndarray, expected a tensor of torch.float32"),
+        (torch.ones(32, 3, dtype=torch.float64), "light: got torch.float64"),
+        (torch.ones(32, 3, dtype=torch.int32), "light: got torch.int32"),
+        (torch.ones(31, 3), r"light: got shape \(31, 3\), expected \[32, 3\]"),
+        (torch.ones(32), r"light: got shape \(32,\)"),
+        (torch.ones(1, 32, 3), r"light: got shape \(1, 32, 3\)"),
+        (torch.full((32, 3), float("nan")), "light: got 96 NaN or Inf"),
+        (torch.full((32, 3), float("-inf")), "light: got 96 NaN or Inf"),
+        (torch.ones(32, 3, device="meta"), "light: got device meta, expected cpu"),
+    ],
+)
+def test_light_that_does_not_fit_is_refused(renderer, light, message):
+    with pytest.raises(ValueError, match=message):
+        renderer(light)
+
+
+@pytest.mark.parametrize(
+    ("albedo", "message"),
+    [
+        ([None], "albedo: got 1 items, expected 2"),
+        ([torch.ones(4), None], r"albedo\[0\]: got shape \(4,\), expected \[3\]"),
+        ([torch.ones(161, 3), None], r"albedo\[0\]: got shape \(161, 3\), expected \[162, 3\]"),
+        ([torch.ones(4, 4, 3), None], r"albedo\[0\]: got shape \(4, 4, 3\)"),
+        ([None, torch.ones(4, 4, 4)], r"albedo\[1\]: got shape \(4, 4, 4\), expected \[height, width, 3\]"),
+        ([None, torch.ones(0, 4, 3)], r"albedo\[1\]: got shape \(0, 4, 3\)"),
+        ([None, torch.ones(4, 4, 3).double()], r"albedo\[1\]: got torch.float64"),
+        ([None, torch.tensor([0.5, float("nan"), 0.5])], r"albedo\[1\]: got 1 NaN"),
+        ([None, [0.5, 0.5, 0.5]], r"albedo\[1\]: got list"),
+    ],
+)
+def test_albedo_that_does_not_fit_is_refused(renderer, albedo, message):
+    with pytest.raises(ValueError, match=message):
+        renderer(albedo=albedo)
+
+
+def test_a_huge_finite_tensor_is_not_mistaken_for_infinity(renderer):
+    assert renderer(torch.full((32, 3), 3e38) / 1e3).isfinite().all()
+    with pytest.raises(ValueError, match="NaN or Inf"):
+        renderer(torch.full((32, 3), 3e38) * 10)
+
+
+# ---------------------------------------------------------------------------------------------- over time
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from Linux's /proc")
+def test_memory_does_not_grow_over_iterations(renderer):
+    values = inputs_of(renderer)
+
+    big = random(256, 256, 3)  # 0.8 MB, and its gradient, so that what is kept would be seen
+
+    def iterate(count: int) -> int:
+        """Resident memory afterwards [bytes]."""
+        for _ in range(count):
+            renderer(values["light"], [values["vertices"], big]).sum().backward()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    before = iterate(20)
+    grown = iterate(200) - before
+    assert grown < 20e6, f"{grown / 1e6:.0f} MB more after 200 iterations of 1.6 MB"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_light_is_recovered_from_an_image(method):
+    """Adam explains the image; a second-order method on this least-squares problem finds the light itself."""
+    truth = torch.tensor([[3.0, 2.5, 2.0], [1.0, 0.8, 0.6], [-0.5, 0.2, 0.3], [0.4, -0.3, 0.1]])
+    renderer = TorchRenderer(small_scene(method), basis=ws.HarmonicBasis(2))
+    with torch.no_grad():
+        wanted = renderer(truth)
+    light = torch.zeros(4, 3, requires_grad=True)
+
+    def loss() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = torch.nn.functional.mse_loss(renderer(light), wanted) / wanted.square().mean()
+        value.backward()
+        return value
+
+    optimizer = torch.optim.Adam([light], lr=0.2)
+    for _ in range(120):
+        optimizer.step(loss)
+    print("IMAGE", loss().sqrt())
+    assert loss().sqrt() < 0.03  # relative error of the image
+    optimizer = torch.optim.LBFGS([light], max_iter=100, tolerance_change=0, tolerance_grad=0, line_search_fn="strong_wolfe")
+    optimizer.step(loss)
+    conditioning = 0.02  # float32 rounding times the condition number: 0.003 measured
+    print("LIGHT", method, loss().sqrt(), (light.detach() - truth).abs().max())
+    assert (light.detach() - truth).abs().max() < conditioning
+
+
+def test_a_texture_is_recovered_under_known_shadows():
+    renderer = TorchRenderer(small_scene(size=24))
+    truth = random(4, 4, 3, seed=9).detach()
+    with torch.no_grad():
+        wanted = renderer(albedo=[None, truth])
+    texture = torch.full((4, 4, 3), 0.5, requires_grad=True)
+    optimizer = torch.optim.Adam([texture], lr=0.1)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
+    for _ in range(200):
+        optimizer.zero_grad()
+        torch.nn.functional.mse_loss(renderer(albedo=[None, texture]), wanted).backward()
+        optimizer.step()
+        schedule.step()
+    assert (texture.detach() - truth).abs().max() < 0.02
