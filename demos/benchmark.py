@@ -29,6 +29,7 @@ from warpshadow.renderer import Renderer
 from warpshadow.shading import directional_transfer, sh_transfer, shade
 from warpshadow.torch import TorchRenderer
 from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility.exponential import exponentiate
 
 
 def main(device: str, runs: int) -> None:
@@ -49,7 +50,7 @@ def main(device: str, runs: int) -> None:
 
     def shade_log_sh() -> None:
         log = log_sh.accumulate(points, normals, centers, radii, order=8)
-        shade(sh_transfer(log_sh.exponentiate(log), normals, order=8), sh_light)
+        shade(sh_transfer(exponentiate(log), normals, order=8), sh_light)
 
     def draw() -> None:
         clip = to_clip(renderer.geometry.positions, clip_matrices)

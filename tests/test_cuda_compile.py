@@ -3,6 +3,7 @@
 import ast
 import importlib
 import pkgutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from warp._src.context import user_modules
 
 import warpshadow
 from warpshadow import raster, shading
-from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility import directional, exponential, log_sh
 
 ARCHITECTURES = [75, 90]
 
@@ -21,36 +22,31 @@ LANES = 1
 # Warp's modules are named after the kernel that they hold, or after the file.
 FACTORIES = {
     **{
-        f"accumulate {order} {log} {'horizon' if has_horizon else 'all around'}": (
-            lambda order=order, log=log, has_horizon=has_horizon: log_sh._accumulate_kernel(
-                order, log, has_horizon, LANES
-            )
-        )
-        for order, log, has_horizon in [
-            (2, "eigen", False),
-            (2, "cap", True),
-            (8, "eigen", True),
-            (8, "cap", False),
-        ]
+        f"{make.__name__} {order} {horizon}": partial(make, order, horizon, LANES)
+        for make in (log_sh._accumulate_kernel, log_sh._accumulate_adjoint_kernel)
+        for order, horizon in [(2, False), (8, True)]
+    },
+    **{f"product {order}": partial(log_sh._product_kernel, order, LANES) for order in (2, 8)},
+    **{
+        f"exponentiate {order} {base} {keeps}": partial(exponential._exponentiate_kernel, order, base, keeps, LANES)
+        for order, base, keeps in [(2, "quadratic", True), *((8, base, False) for base in exponential.THRESHOLDS)]
     },
     **{
-        f"exponentiate {order} {base}": lambda order=order, base=base: log_sh._exponentiate_kernel(order, base, LANES)
-        for order, base in [(2, "quadratic"), *((8, base) for base in log_sh.THRESHOLDS)]
+        f"exponentiate adjoint {order} {base}": partial(exponential._exponentiate_adjoint_kernel, order, base, LANES)
+        for order, base in [(2, "quadratic"), *((8, base) for base in exponential.THRESHOLDS)]
     },
     **{
-        f"transmittance {has_horizon}": lambda has_horizon=has_horizon: directional._transmittance_kernel(
-            has_horizon, LANES
-        )
+        f"transmit {has_horizon}": partial(directional._transmit_kernel, has_horizon, LANES)
         for has_horizon in (False, True)
     },
+    "transmit adjoint": partial(directional._transmit_adjoint_kernel, LANES),
     **{
-        f"transfer {order} {is_shadowed}": lambda order=order, is_shadowed=is_shadowed: shading._sh_transfer_kernel(
-            order, is_shadowed, LANES
-        )
+        f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)
+        for make in (shading._sh_transfer_kernel, shading._sh_transfer_adjoint_kernel)
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{
-        f"interpolation {dtype.__name__}": lambda dtype=dtype: raster._interpolation(dtype)
+        f"interpolation {dtype.__name__}": partial(raster._interpolation, dtype)
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
 }

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow import directions as cells
 from warpshadow import sh, shading
-from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility import directional, exponential, log_sh
 
 # The golden log-SH has no corners rounded off (see test_log_sh.py: up to 0.6% of one cap near cos θ = 0.916), so
 # single rows may be off by 1.2e-4 (eigen; cap: 4e-7), all of them together by 3e-5.
@@ -43,7 +43,7 @@ def geometry(golden, device, *, has_normals):
 def log_sh_irradiance(golden, log, device, *, has_normals=False, **options):
     """∫ L V max(n·ω, 0) dω, all in SH of order 8 [receiver]."""
     arguments, normals = geometry(golden, device, has_normals=has_normals)
-    visibility = log_sh.exponentiate(log_sh.accumulate(*arguments, order=8, log=log), **options)
+    visibility = exponential.exponentiate(log_sh.accumulate(*arguments, order=8, log=log), **options)
     transfer = shading.sh_transfer(visibility, normals, order=8).numpy()[0]
     return np.pi * transfer @ golden["light_sh"]
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow import sh
-from warpshadow.visibility import log_sh
+from warpshadow.visibility import exponential, log_sh, zonal_logs
 
 # A sphere's coefficients reach 10 and carry some roundings each; sums of a dozen; relative to the row's norm. Where a
 # receiver is within 1% of a sphere's surface, cos θ is good to 5e-6 only (see test_cones.py).
@@ -24,8 +24,8 @@ EXPONENTIATE = 5e-5
 # The golden zonal vectors are given to 1e-6 of numbers up to 10.
 ZONAL = 1e-5
 
-LOGS = list(log_sh.LOGS)
-BASES = list(log_sh.THRESHOLDS)
+LOGS = list(zonal_logs.LOGS)
+BASES = list(exponential.THRESHOLDS)
 
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -51,7 +51,7 @@ def accumulate(points, normals, centers, radii, device="cpu", **options):
 
 
 def exponentiate(rows, device="cpu", **options):
-    return log_sh.exponentiate(wp.array(rows[None].astype(np.float32), device=device), **options).numpy()[0]
+    return exponential.exponentiate(wp.array(rows[None].astype(np.float32), device=device), **options).numpy()[0]
 
 
 def row_errors(got, expected):
@@ -66,13 +66,13 @@ def row_errors(got, expected):
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_zonal_caps_are_the_numeric_projections_of_caps(order):
     cosine = np.cos(np.linspace(1e-3, np.pi / 2, 50))
-    assert np.abs(log_sh.zonal_cap(order, cosine) - twins.zonal_cap(order, cosine)).max() < 1e-12  # float64
+    assert np.abs(zonal_logs.zonal_cap(order, cosine) - twins.zonal_cap(order, cosine)).max() < 1e-12  # float64
 
 
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_eigen_logs_are_those_of_the_twin(order):
     cosine = np.cos(np.linspace(1e-2, np.pi / 2, 50))
-    difference = log_sh.zonal_eigen_log(order, cosine) - twins.zonal_log(order, cosine, "eigen")
+    difference = zonal_logs.zonal_eigen_log(order, cosine) - twins.zonal_log(order, cosine, "eigen")
     assert np.abs(difference).max() < 1e-10  # float64; eigenvectors of near eigenvalues
 
 
@@ -80,8 +80,8 @@ def test_zonal_logs_are_the_golden_ones(shared_data):
     golden = json.loads((shared_data / "golden_zonal.json").read_text())
     for angle, logs in golden.items():
         cosine = np.cos(np.radians(float(angle)))
-        assert np.abs(-log_sh.CAP_DEPTH * log_sh.zonal_cap(8, cosine) - logs["cap"]).max() < ZONAL
-        assert np.abs(log_sh.zonal_eigen_log(8, cosine) - logs["eigen"]).max() < ZONAL
+        assert np.abs(-zonal_logs.CAP_DEPTH * zonal_logs.zonal_cap(8, cosine) - logs["cap"]).max() < ZONAL
+        assert np.abs(zonal_logs.zonal_eigen_log(8, cosine) - logs["eigen"]).max() < ZONAL
 
 
 def upright(angles, radius=1.0):
@@ -152,7 +152,7 @@ def test_sums_are_those_of_the_float64_twin(order, log, has_horizon, device):
 @pytest.mark.parametrize("order", [3, 8])
 def test_the_table_of_eigen_logs_is_exact_but_for_rounded_corners(order, device):
     """The table's rows are [interval, power, band]; it holds z / sin²θ over cos θ."""
-    table = log_sh._eigen_table(order, device).numpy().astype(float)
+    table = zonal_logs.zonal_table(order, "eigen", device).numpy().astype(float)
     cosine = (np.arange(30000) + 0.4) / 30000
     interval = (cosine * len(table)).astype(int)
     t = (cosine * len(table) - interval)[:, None]
@@ -192,7 +192,7 @@ def test_a_batch_of_three_is_three_single_calls(device):
     together = accumulate(*(np.stack(values) for values in zip(*scenes, strict=True)), device, order=4)
     for rows, scene in zip(together, scenes, strict=True):
         np.testing.assert_array_equal(rows, accumulate(*scene, device, order=4))
-    visibility = log_sh.exponentiate(wp.array(together, device=device)).numpy()
+    visibility = exponential.exponentiate(wp.array(together, device=device)).numpy()
     for rows, row in zip(visibility, together, strict=True):
         np.testing.assert_array_equal(rows, exponentiate(row, device))
 
@@ -284,7 +284,7 @@ def test_exponentials_are_those_of_the_float64_twin(base, order, device):
     rows[1] *= 1e-6
     rows[2] *= 4
     got = exponentiate(rows, device, base=base)
-    expected = twins.exponential(rows, base, log_sh.THRESHOLDS[base].default)
+    expected = twins.exponential(rows, base, exponential.THRESHOLDS[base].default)
     assert row_errors(got, expected).max() < EXPONENTIATE
 
 
@@ -309,7 +309,7 @@ def test_the_constant_part_scales_the_result_and_may_be_far_below_zero(device):
 @pytest.mark.parametrize("base", BASES)
 def test_a_threshold_beyond_stability_is_refused(base):
     rows = np.zeros((1, 16))
-    limit = log_sh.THRESHOLDS[base].limit
+    limit = exponential.THRESHOLDS[base].limit
     assert np.isfinite(exponentiate(rows, base=base, threshold=limit)).all()
     for threshold in (1.01 * limit, 4.0 * limit, 0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=rf"threshold: got .* for base '{base}', expected more than 0 and at most"):
@@ -320,7 +320,7 @@ def test_a_threshold_beyond_stability_is_refused(base):
 def test_the_largest_threshold_allowed_does_not_explode(base, device):
     rows = accumulate(*twins.random_scene(15, sphere_count=100), device).astype(float)
     converged = twins.exponential(rows, "quadratic", 1e-3)
-    got = exponentiate(rows, device, base=base, threshold=log_sh.THRESHOLDS[base].limit)
+    got = exponentiate(rows, device, base=base, threshold=exponential.THRESHOLDS[base].limit)
     assert np.linalg.norm(got - converged) < np.linalg.norm(converged)
 
 

@@ -9,7 +9,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warpshadow import sh
+from warpshadow import sh, sh_kernels
 from warpshadow.lanes import MODULE_OPTIONS, lane_functions, lane_type
 
 # Float64 recurrences and quadratures of low degree: a few hundred roundings.
@@ -248,10 +248,10 @@ def test_bands_left_out_of_the_second_factor_are_as_if_zero():
 
 @functools.cache
 def turn_and_multiply_kernel(order, lanes):
-    Lane, Zonal = lane_type(lanes), sh.zonal_type(order, lanes)
+    Lane, Zonal = lane_type(lanes), sh_kernels.zonal_type(order, lanes)
     fn = lane_functions(lanes)
     load, load_rows, store_rows = fn.load, fn.load_rows, fn.store_rows
-    add_rotated_zonal, multiply = sh.add_rotated_zonal(order, lanes), sh.multiply(order, lanes)
+    add_rotated_zonal, multiply = sh_kernels.add_rotated_zonal(order, lanes), sh_kernels.multiply(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def turn_and_multiply(
@@ -304,7 +304,7 @@ def test_kernel_functions_turn_add_and_multiply_like_numpy(order, lanes, device)
             wp.array(zonals, device=device),
             wp.array(directions, dtype=wp.vec3, device=device),
             wp.array(factors, device=device),
-            *sh.product_table(order, device),
+            *sh_kernels.product_table(order, device),
             wp.empty((groups, 4, order**2), dtype=lane_type(lanes), device=device),
         ],
         outputs=[turned, product],

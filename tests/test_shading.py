@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow import directions as cells
 from warpshadow import sh, shading
-from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility import directional, exponential, log_sh
 
 # Sums of up to 10⁴ float32 products of size 1/100.
 FLOAT32 = 5e-6
@@ -115,7 +115,7 @@ def test_a_blocked_receiver_is_darker_by_either_method_and_alike(device):
     normals = wp.array(normals, dtype=wp.vec3, device=device)
     centers = wp.array(np.float32([[[0, np.sqrt(2), 0]]]), dtype=wp.vec3, device=device)
     radii = wp.ones((1, 1), dtype=wp.float32, device=device)
-    visibility = log_sh.exponentiate(log_sh.accumulate(points, normals, centers, radii, order=8))
+    visibility = exponential.exponentiate(log_sh.accumulate(points, normals, centers, radii, order=8))
     assert (
         abs(shading.sh_transfer(visibility, normals, order=8).numpy()[0, 0, 0] * twins.UNIT - 0.5) < 0.03
     )  # truncated to 8 bands

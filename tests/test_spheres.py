@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow import spheres as module
 from warpshadow.directions import cell_radius, fibonacci
 from warpshadow.mesh import Mesh, icosphere, load_mesh
 from warpshadow.spheres import Spheres, exact_occlusion, fit_spheres, plot_spheres
+from warpshadow.spheres import cover as stage_1
+from warpshadow.spheres import refine as stage_2
+from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.visibility.cones import BLEND, FADE
 from warpshadow.visibility.directional import SOFTNESS, transmittance
 
 SEED = 3
@@ -44,15 +47,15 @@ def bumpy() -> Mesh:
 
 def twin_cone(distance):
     """Cosine of the cone by the distance in radii."""
-    edge = 1 + module.BLEND
+    edge = 1 + BLEND
     cosine, slope = np.sqrt(1 - edge**-2), edge**-3 / np.sqrt(1 - edge**-2)
-    t = np.clip((distance - 1) / module.BLEND, 0, 1)
-    blend = cosine * (3 * t**2 - 2 * t**3) + module.BLEND * slope * (t**3 - t**2)
+    t = np.clip((distance - 1) / BLEND, 0, 1)
+    blend = cosine * (3 * t**2 - 2 * t**3) + BLEND * slope * (t**3 - t**2)
     return np.where(distance >= edge, np.sqrt(1 - np.maximum(distance, edge) ** -2), blend)
 
 
 def twin_near(distance):
-    t = np.minimum(distance / module.FADE, 1)
+    t = np.minimum(distance / FADE, 1)
     return t**2 * (3 - 2 * t)
 
 
@@ -72,26 +75,103 @@ def twin_transmittance(points, directions, spheres, width):
     return result
 
 
+def normalized(mesh, device) -> NormalizedMesh:
+    diagonal = np.linalg.norm(np.ptp(mesh.positions, axis=0))
+    return NormalizedMesh((mesh.positions / diagonal).astype(np.float32), mesh.faces, wp.get_device(device))
+
+
 @pytest.fixture
 def refinement(device):
     """A refinement of a small body, and spheres that receivers see from near, far and inside."""
-    mesh = bumpy()
-    diagonal = np.linalg.norm(np.ptp(mesh.positions, axis=0))
-    body = module._Body((mesh.positions / diagonal).astype(np.float32), mesh.faces, wp.get_device(device))
+    mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
+    spheres, _ = stage_1.greedy_cover(mesh, 12, rng)
+    return stage_2.Refinement(mesh, rng), spheres.astype(np.float32).astype(np.float64)
+
+
+def differences(loss, spheres, step):
+    """Central differences of a loss by centers and logarithms of radii."""
+    result = np.zeros_like(spheres)
+    for index in np.ndindex(spheres.shape):
+        change = np.zeros_like(spheres)
+        change[index] = step
+        grown = np.where(np.arange(4) == 3, spheres * np.exp(change), spheres + change)
+        shrunk = np.where(np.arange(4) == 3, spheres * np.exp(-change), spheres - change)
+        result[index] = (loss(grown) - loss(shrunk)) / (2 * step)
+    return result
+
+
+# ------------------------------------------------------------------------------ stage 1
+
+
+def test_signed_distances_are_those_of_a_box_and_negative_inside(device):
+    half = np.array([0.5, 0.3, 0.4])
+    mesh = normalized(box(2 * half), device)
+    scale = np.linalg.norm(2 * half)
+    points = np.random.default_rng(SEED).uniform(-0.8, 0.8, size=(200, 3))
+    beyond = np.abs(points) - half
+    expected = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    got, slopes = mesh.signed_distances(points / scale)
+    np.testing.assert_allclose(got * scale, expected, atol=1e-5)
+    assert (expected < 0).sum() > 20
+    ahead, _ = mesh.signed_distances(points / scale + 1e-3 * slopes)
+    assert np.median(np.abs(ahead - got - 1e-3)) < 1e-5
+
+
+def twin_cover_energy(spheres, samples, points, area, distance):
+    """Both terms of warpshadow.spheres.cover, with a distance function."""
+    offsets = spheres[:, None, 3:] * samples
+    depth = distance(spheres[:, None, :3] + offsets) / (stage_1.EDGE * spheres[:, 3:])
+    t = np.clip((depth + 1) / 2, 0, 1)
+    outside = (4 / 3 * np.pi * spheres[:, 3] ** 3 * (t**2 * (3 - 2 * t)).mean(axis=1)).sum()
+    gaps = np.linalg.norm(points[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
+    return outside + stage_1.BARE * area * np.maximum(gaps.min(axis=1), 0).mean()
+
+
+def test_the_energy_of_a_cover_and_its_gradient_agree_with_float64(device):
+    """In a box much larger than the spheres, about one face of it, whose distance is that to a plane."""
+    mesh = normalized(box((1.0, 1.0, 1.0), segments=2), device)
+    height = mesh.high[1]
     rng = np.random.default_rng(SEED)
-    spheres, _ = module._start(body, 12, rng)
-    return module._Refinement(body, rng), spheres.astype(np.float32).astype(np.float64)
+    spheres = np.column_stack([0.04 * rng.normal(size=(6, 3)) + [0, height, 0], rng.uniform(0.02, 0.08, 6)])
+    samples = stage_1.ball_samples(64, rng)
+    points = rng.uniform(-0.2, 0.2, size=(200, 3)) * [1, 0, 1] + [0, height, 0]
+
+    def energy(balls):
+        return twin_cover_energy(balls, samples, points, mesh.area, lambda p: p[..., 1] - height)
+
+    got, gradient = stage_1.cover_energy(mesh, spheres, samples, points)
+    assert got == pytest.approx(energy(spheres), rel=1e-4)
+    expected = differences(energy, spheres, 1e-7)
+    assert (np.abs(expected).max(axis=0) > 1e-3 * np.abs(expected).max()).all()
+    np.testing.assert_allclose(gradient, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_descent_covers_more_of_the_surface_and_leaves_the_mesh_less(device):
+    mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
+    start, _ = stage_1.greedy_cover(mesh, 12, rng)
+    *_, cover = stage_1.descend_cover(mesh, start, 60, rng)
+    samples, points = stage_1.ball_samples(256, rng), mesh.sample(2000, rng)[0]
+    before, after = (stage_1.cover_energy(mesh, each, samples, points)[0] for each in (start, cover))
+    assert after < 0.6 * before
+
+
+def test_without_refinement_a_fit_covers_a_mesh_and_stays_in_it():
+    """On the box, that a few large and many small spheres fill."""
+    report = fit_spheres(box(), 64, refine=False, cache=False, progress=False).report
+    assert report.coverage > 0.75
+    assert report.outside_volume < 0.1
+
+
+# ------------------------------------------------------------------------------ stage 2
 
 
 def test_soft_transmittance_and_loss_agree_with_float64(refinement):
     fit, spheres = refinement
     chosen = np.arange(0, fit.RECEIVERS, 97)
     width = 0.1
-    batch = wp.array(chosen.astype(np.int32), dtype=wp.int32, device=fit.device)
-    balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=fit.device)
-    got = fit._transmittance(*fit._project(batch, balls, width))
+    got = fit.transmittance(spheres, chosen, width)
     points = fit.points.numpy()[chosen].astype(np.float64)
-    directions = np.einsum("qi,pij->pqj", module._hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
     np.testing.assert_allclose(got, twin_transmittance(points, directions, spheres, width), atol=2e-4)
 
 
@@ -100,7 +180,7 @@ def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
     chosen = np.arange(0, fit.RECEIVERS, 61)
     width = 0.1
     points = fit.points.numpy()[chosen].astype(np.float64)
-    directions = np.einsum("qi,pij->pqj", module._hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
 
     def loss(balls):
         error = twin_transmittance(points, directions, balls, width) - fit.visibility[chosen]
@@ -108,14 +188,7 @@ def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
 
     got_loss, got = fit.gradient(spheres, chosen, width)
     assert got_loss == pytest.approx(loss(spheres), rel=1e-4)
-    step = 1e-6
-    expected = np.zeros_like(spheres)
-    for index in np.ndindex(spheres.shape):
-        change = np.zeros_like(spheres)
-        change[index] = step
-        grown = np.where(np.arange(4) == 3, spheres * np.exp(change), spheres + change)
-        shrunk = np.where(np.arange(4) == 3, spheres * np.exp(-change), spheres - change)
-        expected[index] = (loss(grown) - loss(shrunk)) / (2 * step)
+    expected = differences(loss, spheres, 1e-6)
     np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
 
 
@@ -214,10 +287,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device):
 def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
     mesh = bumpy()
     moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
-    options = {
-        **QUICK,
-        "steps": 10,
-    }  # rounding of the moved positions changes last bits, which descent amplifies
+    options = {**QUICK, "steps": 10}  # rounding of the moved positions changes last bits, which descent amplifies
     here, there = (fit_spheres(each, 10, **options).spheres for each in (mesh, moved))
     np.testing.assert_allclose(here.transformed(translation=(300, -70, 20), scale=50).centers, there.centers, atol=1.0)
     np.testing.assert_allclose(50 * here.radii, there.radii, atol=1.0)
@@ -227,7 +297,7 @@ def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
 
 def test_refinement_and_more_spheres_lower_the_error():
     mesh = box()
-    start = fit_spheres(mesh, 32, **{**QUICK, "steps": 0}).report
+    start = fit_spheres(mesh, 32, **{**QUICK, "refine": False}).report
     few, some, many = (fit_spheres(mesh, count, **{**QUICK, "steps": 250}).report for count in (8, 32, 96))
     assert some.visibility_error < 0.6 * start.visibility_error
     assert few.visibility_error > some.visibility_error > many.visibility_error
@@ -250,7 +320,7 @@ def test_open_and_multi_part_meshes_are_fitted():
     sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
     two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
     for mesh in (bowl, sheet, two):
-        start = fit_spheres(mesh, 24, **{**QUICK, "steps": 0}).report
+        start = fit_spheres(mesh, 24, **{**QUICK, "steps": 1}).report
         fit = fit_spheres(mesh, 24, **{**QUICK, "steps": 200})
         assert 0 < len(fit.spheres) <= 24
         errors, start_errors = (each.ground_error**2 + each.surface_error**2 for each in (fit.report, start))
@@ -269,6 +339,7 @@ def test_no_spheres_are_an_empty_fit():
         ({"count": 2.5}, "count: got 2.5"),
         ({"error": 0.0}, "error: got 0.0"),
         ({"steps": None}, "steps: got None"),
+        ({"steps": 0}, "steps: got 0"),
     ],
 )
 def test_arguments_out_of_range_are_refused(arguments, message):
@@ -324,11 +395,3 @@ def test_64_spheres_on_the_bunny_meet_the_targets():
     report = fit_spheres(mesh, 64, cache=False, progress=False).report
     assert report.ground_error < 0.035
     assert report.surface_error < 0.045
-
-
-def test_kernels_compile_for_cuda_without_a_gpu(tmp_path):
-    try:
-        wp.compile_aot_module("warpshadow.spheres", device=None, arch=[75, 90], module_dir=tmp_path, use_ptx=True)
-    except RuntimeError as problem:
-        pytest.skip(f"this Warp cannot compile for CUDA: {problem}")
-    assert len(list(tmp_path.glob("*.ptx"))) == 2

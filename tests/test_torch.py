@@ -333,12 +333,12 @@ def test_light_is_recovered_from_an_image(method):
     optimizer = torch.optim.Adam([light], lr=0.2)
     for _ in range(120):
         optimizer.step(loss)
-    print("IMAGE", loss().sqrt())
     assert loss().sqrt() < 0.03  # relative error of the image
-    optimizer = torch.optim.LBFGS([light], max_iter=100, tolerance_change=0, tolerance_grad=0, line_search_fn="strong_wolfe")
+    optimizer = torch.optim.LBFGS(
+        [light], max_iter=100, tolerance_change=0, tolerance_grad=0, line_search_fn="strong_wolfe"
+    )
     optimizer.step(loss)
-    conditioning = 0.02  # float32 rounding times the condition number: 0.003 measured
-    print("LIGHT", method, loss().sqrt(), (light.detach() - truth).abs().max())
+    conditioning = 1e-4  # float32 rounding times the condition number: 2e-6 measured
     assert (light.detach() - truth).abs().max() < conditioning
 
 

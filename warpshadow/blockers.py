@@ -53,8 +53,8 @@ def _body_spheres(
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
     """The sphere that stands in for a flat mesh seen from its front, None if that is not how it is seen.
 
-    It touches the plane below the other bodies, and its radius is such that at their mean height it blocks the solid
-    angle of the mesh's bounding rectangle.
+    It touches the plane below the other bodies, and its radius is such that from their mean position it blocks the
+    solid angle that the mesh does.
     """
     corners = mesh.positions[mesh.faces].astype(np.float64)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
@@ -63,17 +63,22 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
     normal /= np.linalg.norm(normal)
     points = corners.reshape(-1, 3)
     middle = points.mean(axis=0)
-    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    *_, axes = np.linalg.svd(points - middle, full_matrices=False)
     seen_from = np.concatenate(others)
     heights = (seen_from - middle) @ normal
     size = np.ptp((points - middle) @ axes.T, axis=0)
     is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
     if not is_flat or heights.min() < -1e-2 * size[0] or heights.mean() <= 0:
         return None
-    height, (a, b) = heights.mean(), size[:2]
-    solid_angle = 4 * np.arctan(a * b / (2 * height * np.sqrt(4 * height**2 + a**2 + b**2)))
+    height = heights.mean()
+    a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
+    length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    numerator = (a * np.cross(b, c)).sum(axis=1)
+    denominator = length_a * length_b * length_c
+    denominator += (a * b).sum(axis=1) * length_c + (b * c).sum(axis=1) * length_a + (c * a).sum(axis=1) * length_b
+    solid_angle = 2 * np.abs(np.arctan2(numerator, denominator)).sum()
     cosine = 1 - solid_angle / (2 * np.pi)
-    sine = np.sqrt(1 - cosine**2)
+    sine = min(np.sqrt(1 - cosine**2), 0.999)  # beyond, float32 would not place a sphere so large on the plane
     radius = height * sine / (1 - sine)
     foot = seen_from.mean(axis=0) - height * normal
     return Spheres((foot - radius * normal)[None].astype(np.float32), np.array([radius], np.float32))

@@ -39,6 +39,7 @@ class LaneFunctions(NamedTuple):
     add_vectors: wp.Function
     total: wp.Function
     load_rows: wp.Function
+    add_rows: wp.Function
     store_rows: wp.Function
     store_columns: wp.Function
     sqrt: wp.Function
@@ -96,13 +97,20 @@ def lane_functions(lanes: int) -> LaneFunctions:
 
     @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
-        """scratch[k] = rows[the group's vertices, k]."""
-        last = rows.shape[0] - 1
+        """scratch[k] = rows[the group's vertices, k], 0 past the last vertex."""
         for k in range(rows.shape[1]):
             value = Lane()
-            for lane in range(lanes):
-                value[lane] = rows[wp.min(group * lanes + lane, last), k]
+            for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+                value[lane] = rows[group * lanes + lane, k]
             scratch[k] = value
+
+    @wp.func
+    def add_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the group's vertices, k] += scratch[k]."""
+        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+            vertex = group * lanes + lane
+            for k in range(rows.shape[1]):
+                rows[vertex, k] = rows[vertex, k] + scratch[k][lane]
 
     @wp.func
     def store_columns(
@@ -127,4 +135,4 @@ def lane_functions(lanes: int) -> LaneFunctions:
             root[lane] = wp.sqrt(value[lane])
         return root
 
-    return LaneFunctions(load, load_products, add_vectors, total, load_rows, store_rows, store_columns, sqrt)
+    return LaneFunctions(load, load_products, add_vectors, total, load_rows, add_rows, store_rows, store_columns, sqrt)

@@ -135,7 +135,7 @@ def sample_map(radiance: np.ndarray, count: int, *, seed: int = 0) -> LightSampl
     flat, u = _invert((conditional + np.arange(height)[:, None]).ravel(), points[..., 1] + rows)
     columns = flat - rows * width
     drawn = radiance[rows, columns] * (solid_angle / (count * probability))[rows, columns, None]
-    return LightSamples(_map_directions(rows + v, columns + u, height), drawn)
+    return LightSamples(_map_directions(rows, v, columns + u, height), drawn)
 
 
 def _invert(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -145,10 +145,11 @@ def _invert(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
     return index, np.clip((values - start) / np.maximum(distribution[index] - start, 1e-300), 0, 1)
 
 
-def _map_directions(rows: np.ndarray, columns: np.ndarray, height: int) -> np.ndarray:
-    """Directions of positions in an equirectangular map, the first pixel spanning 0 to 1."""
-    theta, phi = np.pi * rows / height, np.pi * columns / height
-    return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
+def _map_directions(rows: np.ndarray, v: np.ndarray, columns: np.ndarray, height: int) -> np.ndarray:
+    """Directions of positions in an equirectangular map, even in solid angle over the share v, 0 to 1, of a row."""
+    cosine = (1 - v) * np.cos(np.pi * rows / height) + v * np.cos(np.pi * (rows + 1) / height)
+    sine, phi = np.sqrt(np.maximum(1 - cosine**2, 0)), np.pi * columns / height
+    return np.stack([np.sin(phi) * sine, cosine, -np.cos(phi) * sine], axis=-1)
 
 
 @wp.kernel(enable_backward=False)

@@ -16,7 +16,7 @@ from warpshadow.mesh import vertex_normals
 from warpshadow.raster import Fragments, interpolate, rasterize
 from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
-from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility import directional, exponential, log_sh
 
 
 class Geometry(NamedTuple):
@@ -174,7 +174,7 @@ class Renderer:
         seen = None
         if visibility.method == "log-sh" and self.blockers.radii.size:
             log = log_sh.accumulate(points, normals, *self.blockers, order=visibility.order, log=visibility.log)
-            seen = log_sh.exponentiate(log, base=visibility.base)
+            seen = exponential.exponentiate(log, base=visibility.base)
         return shading.sh_transfer(seen, normals, order=visibility.order)
 
     def _to_basis(self, transfer: wp.array) -> wp.array:

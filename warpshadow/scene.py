@@ -17,7 +17,8 @@ from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import Mesh, icosphere, load_mesh, plane
 from warpshadow.spheres import Spheres
 from warpshadow.visibility.directional import SOFTNESS
-from warpshadow.visibility.log_sh import LOGS, THRESHOLDS
+from warpshadow.visibility.exponential import THRESHOLDS
+from warpshadow.visibility.zonal_logs import LOGS
 
 METHODS = ("directional", "log-sh", "none", "ray-traced")
 RECEIVERS = ("vertex", "pixel")

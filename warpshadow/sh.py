@@ -7,7 +7,7 @@ n² coefficients:
     l   0        1 1 1          2 2 2 2 2          3 …
     m   0       −1 0 1         −2 −1 0 1 2        −3 …
 
-Host functions are NumPy in float64; kernel functions work on lanes of float32 (see lanes.py).
+Functions are NumPy in float64; sh_kernels.py has what kernels use.
 """
 
 import functools
@@ -15,10 +15,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from warpshadow import check
-from warpshadow.lanes import lane_type
 
 ORDERS = range(2, 9)
 """Orders (numbers of bands) that the kernels are made for."""
@@ -286,103 +284,3 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     directions, weights = quadrature(3 * (order - 1))
     basis = evaluate(order, directions)
     return ((a @ basis.T) * (b @ basis.T) * weights) @ basis
-
-
-# ---------------------------------------------------------------------------------------------- in kernels
-
-
-@functools.cache
-def zonal_type(order: int, lanes: int) -> type:
-    """Zonal coefficients of a thread's receivers, [order, lanes]."""
-    return wp.types.matrix(shape=(order, lanes), dtype=wp.float32)
-
-
-@functools.cache
-def add_rotated_zonal(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function that turns lanes of zonal vectors to lanes of directions and adds them up."""
-    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    table = wp.types.matrix(shape=(order, order), dtype=wp.float32)
-    diagonal, up, back = schmidt_recurrence(order)
-    DIAGONAL = wp.types.vector(length=order, dtype=wp.float32)(*diagonal)
-    UP, BACK = table(*up.ravel()), table(*back.ravel())
-
-    @wp.func
-    def add_rotated_zonal_(x: Lane, y: Lane, z: Lane, zonal: Zonal, coefficients: wp.array(dtype=Lane)):
-        """coefficients[l² + l + m] += √(4π/(2l+1)) z_l y_lm(x, y, z)."""
-        cosine = Lane(1.0)
-        sine = Lane(0.0)
-        for m in range(order):
-            previous = Lane(0.0)
-            legendre = Lane(DIAGONAL[m])
-            for band in range(m, order):
-                weight = wp.cw_mul(zonal[band], legendre)
-                center = band * band + band
-                coefficients[center + m] = coefficients[center + m] + wp.cw_mul(weight, cosine)
-                if m > 0:
-                    coefficients[center - m] = coefficients[center - m] + wp.cw_mul(weight, sine)
-                above = UP[band, m] * wp.cw_mul(z, legendre) - BACK[band, m] * previous
-                previous = legendre
-                legendre = above
-            turned = wp.cw_mul(cosine, x) - wp.cw_mul(sine, y)
-            sine = wp.cw_mul(cosine, y) + wp.cw_mul(sine, x)
-            cosine = turned
-
-    return add_rotated_zonal_
-
-
-class ProductTable(NamedTuple):
-    """Triple products on a device: pairs (i, j) and values, those of k at first[k] … first[k+1]."""
-
-    first: wp.array
-    pairs: wp.array
-    values: wp.array
-
-
-@functools.cache
-def product_table(
-    order: int, device: str, bands_of_j: tuple[int, ...] | None = None, symmetric: bool = False
-) -> ProductTable:
-    """Copy :func:`triple_products` to a device."""
-    first, i, j, value = triple_products(order, bands_of_j, symmetric)
-    return ProductTable(
-        wp.array(first.astype(np.int32), device=device),
-        wp.array(np.stack([i, j], axis=-1).astype(np.int32), dtype=wp.vec2i, device=device),
-        wp.array(value.astype(np.float32), device=device),
-    )
-
-
-@functools.cache
-def multiply(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function product_k = Σ Γ_ijk a_i b_j of lanes of expansions; product must be neither factor.
-
-    Native, since plain Warp takes 2.7 times as long (10.3 ms against 3.8 ms for 10 327 squares of order 8): it
-    neither keeps the sum in a register nor fuses multiplication and addition.
-    """
-    Lane = lane_type(lanes)
-    snippet = f"""
-    const wp::float32 *a_lanes = (const wp::float32 *)a.data, *b_lanes = (const wp::float32 *)b.data;
-    wp::float32 *product_lanes = (wp::float32 *)product.data;
-    for (int k = 0; k < {order**2}; ++k) {{
-        wp::float32 total[{lanes}] = {{}};
-        for (int t = first.data[k]; t < first.data[k + 1]; ++t) {{
-            const wp::float32 *a_i = a_lanes + {lanes} * pairs.data[t][0];
-            const wp::float32 *b_j = b_lanes + {lanes} * pairs.data[t][1];
-            for (int lane = 0; lane < {lanes}; ++lane)
-                total[lane] += values.data[t] * a_i[lane] * b_j[lane];
-        }}
-        for (int lane = 0; lane < {lanes}; ++lane)
-            product_lanes[{lanes} * k + lane] = total[lane];
-    }}
-    """
-
-    @wp.func_native(snippet)
-    def multiply_(
-        a: wp.array(dtype=Lane),
-        b: wp.array(dtype=Lane),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
-        product: wp.array(dtype=Lane),
-    ): ...
-
-    return multiply_

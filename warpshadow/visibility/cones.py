@@ -14,6 +14,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.lanes import lane_functions, lane_type
 
 BLEND = 0.01
@@ -25,6 +26,15 @@ FADE = 0.25
 _SINE2 = (1 + BLEND) ** -2  # where the blend begins: sin²θ, cos θ, and d(cos θ)/d(D/r) times the blend's width
 _COSINE = np.sqrt(1 - _SINE2)
 _RISE = BLEND * (1 + BLEND) ** -3 / _COSINE
+
+
+def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array, radii: wp.array) -> None:
+    """Raise ValueError unless receivers [batch, vertex] and spheres [batch, sphere] fit each other."""
+    check.shape("points", points.shape, ("batch", "vertex"))
+    if normals is not None:
+        check.shape("normals", normals.shape, points.shape)
+    check.shape("centers", centers.shape, (points.shape[0], "sphere"))
+    check.shape("radii", radii.shape, centers.shape)
 
 
 @functools.cache

@@ -19,7 +19,7 @@ from warpshadow import check
 from warpshadow.directions import CHUNK, cell_radius, check_count, chunk_cones
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.tape import record_adjoint
-from warpshadow.visibility.cones import cone_adjoint, cone_function
+from warpshadow.visibility.cones import check_spheres, cone_adjoint, cone_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
@@ -307,13 +307,10 @@ def transmittance(
             f"softness: got {softness!r} for {len(directions)} directions, expected a half-width "
             f"softness·2/√directions above 0 and below π/4"
         )
+    check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    if normals is not None:
-        check.shape("normals", normals.shape, points.shape)
-    check.shape("centers", centers.shape, (batch_count, "sphere"))
-    check.shape("radii", radii.shape, centers.shape)
     groups = group_count(vertex_count, lanes)
     axes, cosine, sine = chunk_cones(directions, width)
     cells = [

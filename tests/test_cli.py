@@ -1,0 +1,279 @@
+"""The command line: what it writes, what it prints, and one clear line for each mistake."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import typer
+import warp as wp
+from typer.testing import CliRunner
+
+import warpshadow as ws
+from warpshadow import sh
+from warpshadow.cli import app, auto_exposure
+
+# Half a step of 8-bit sRGB where it is steepest.
+EIGHT_BITS = 0.006
+COMMANDS = ("render", "spheres", "envmap", "warmup")
+
+SCENE = """
+[camera]
+eye = [0, 2, 4]
+target = [0, 0.5, 0]
+size = [16, 12]
+[light]
+envmap = "sky.exr"
+[visibility]
+directions = 32
+samples = 64
+[[body]]
+primitive = "icosphere"
+subdivisions = 1
+translation = [0, 0.8, 0]
+scale = 0.6
+blockers = 0
+[[body]]
+primitive = "plane"
+size = 4
+segments = 8
+"""
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def fails(*arguments: object, parts: tuple[str, ...], status: int = 1):
+    """One line on stderr that holds all the parts, nothing on stdout, no traceback."""
+    result = run(*arguments)
+    assert result.exit_code == status, result.output
+    assert isinstance(result.exception, SystemExit), result.exception
+    assert "Traceback" not in result.output and not result.stdout
+    for part in parts:
+        assert part in result.stderr, f"{part!r} is not in {result.stderr!r}"
+    if status == 1:
+        assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+
+
+@pytest.fixture
+def scene(tmp_path):
+    ws.synthetic_sky(height=16, sun_radius=12).write(tmp_path / "sky.exr")
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+# ---------------------------------------------------------------------------------------------- render
+
+
+def test_render_writes_the_image_as_linear_rgba_float32(scene, tmp_path):
+    output = tmp_path / "out.exr"
+    result = run("render", scene, "-o", output)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"out\.exr: directional, 16 × 12, \d+\.\d\d s", result.stdout)
+    image = ws.read_image(output)
+    assert image.shape == (12, 16, 4) and image.dtype == np.float32
+    np.testing.assert_array_equal(image, ws.render(ws.load_scene(scene)))
+    import OpenEXR
+
+    with OpenEXR.File(str(output), separate_channels=True) as file:
+        channels = file.channels()
+        assert sorted(channels) == ["A", "B", "G", "R"]
+        assert {channel.pixels.dtype for channel in channels.values()} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh", "none", "ray-traced"])
+def test_the_method_can_be_changed(scene, tmp_path, method):
+    result = run("render", scene, "-o", tmp_path / "out.exr", "--method", method)
+    assert result.exit_code == 0 and f": {method}, " in result.stdout
+    assert f'"{method}"' not in SCENE
+    scene.write_text(SCENE.replace("[visibility]", f'[visibility]\nmethod = "{method}"'))
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "out.exr"), ws.render(ws.load_scene(scene)))
+
+
+def test_the_number_of_samples_can_be_changed(scene, tmp_path):
+    run("render", scene, "-o", tmp_path / "out.exr", "--method", "ray-traced", "--samples", 16)
+    scene.write_text(SCENE.replace("samples = 64", 'samples = 16\nmethod = "ray-traced"'))
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "out.exr"), ws.render(ws.load_scene(scene)))
+
+
+def test_render_also_writes_a_picture_at_a_given_exposure(scene, tmp_path):
+    output, png = tmp_path / "out.exr", tmp_path / "out.png"
+    result = run("render", scene, "-o", output, "--png", png, "--exposure", -1)
+    assert result.exit_code == 0 and "exposure -1.00 stops" in result.stdout
+    image, picture = ws.read_image(output), ws.read_image(png)
+    assert np.abs(picture[..., 3] - image[..., 3]).max() < EIGHT_BITS
+    assert np.abs(picture[..., :3] - np.clip(image[..., :3] / 2, 0, 1)).max() < EIGHT_BITS
+
+
+def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
+    output, png = tmp_path / "out.exr", tmp_path / "out.png"
+    result = run("render", scene, "-o", output, "--png", png)
+    image, picture = ws.read_image(output), ws.read_image(png)
+    stops = auto_exposure(image)
+    assert f"exposure {stops:+.2f} stops" in result.stdout
+    assert np.abs(picture[..., :3] - np.clip(image[..., :3] * 2**stops, 0, 1)).max() < EIGHT_BITS
+    brightest = (image * 2**stops)[image[..., 3] > 0][:, :3].max(axis=1)
+    assert 0 < (brightest > 1).mean() <= 0.011
+
+
+def test_exposure_is_that_of_the_covered_pixels():
+    image = np.zeros((10, 10, 4), np.float32)
+    assert auto_exposure(image) == 0
+    image[5:, :, :] = (4, 1, 1, 1)
+    assert auto_exposure(image) == -2
+    image[..., :3] = 0
+    assert auto_exposure(image) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (("directions", "direction"), ["scene.toml: [visibility]", "'direction'", "did you mean 'directions'"]),
+        (("eye = [0, 2, 4]", ""), ["[camera]", "eye: missing"]),
+        (("sky.exr", "night.exr"), ["[light]", "envmap", "night.exr"]),
+        (("scale = 0.6", "scale = -1"), ["[[body]] number 1", "scale: got -1", "positive"]),
+        (("[light]", "[light"), ["not valid TOML"]),
+    ],
+)
+def test_a_mistake_in_a_scene_is_one_line_and_status_1(scene, tmp_path, change, parts):
+    scene.write_text(SCENE.replace(*change))
+    fails("render", scene, "-o", tmp_path / "out.exr", parts=parts)
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test_a_missing_scene_is_one_line_and_status_1(tmp_path):
+    fails("render", tmp_path / "no.toml", "-o", tmp_path / "out.exr", parts=("no.toml",))
+    fails("render", tmp_path, "-o", tmp_path / "out.exr", parts=(str(tmp_path),))
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpshadow.scene.load_scene", lambda path: pytest.fail("the scene was read"))
+    missing = tmp_path / "nowhere" / "out.exr"
+    fails("render", scene, "-o", tmp_path / "out.png", parts=("out.png", "got extension '.png'", "expected .exr"))
+    fails("render", scene, "-o", missing, parts=("nowhere", "no such folder"))
+    good = ("render", scene, "-o", tmp_path / "out.exr")
+    fails(*good, "--png", tmp_path / "out.gif", parts=("out.gif", ".png or .jpg"))
+    fails(*good, "--png", missing.with_suffix(".png"), parts=("nowhere", "no such folder"))
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", ""])
+@pytest.mark.parametrize("command", ["render", "warmup"])
+def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
+    arguments = (scene, "-o", tmp_path / "out.exr") if command == "render" else ()
+    fails(command, *arguments, "--device", name, parts=(f"device: got '{name}'", "expected one of", "cpu"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("render", "scene.toml"), "--output"),
+        (("render", "scene.toml", "-o", "x.exr", "--method", "rays"), "rays"),
+        (("render", "scene.toml", "-o", "x.exr", "--samples", "0"), "samples"),
+        (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
+        (("envmap", "x.exr", "--order", "9"), "order"),
+        (("rendre",), "rendre"),
+    ],
+)
+def test_a_wrong_option_is_status_2_with_its_name(arguments, part):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert part in re.sub(r"\x1b\[[0-9;]*m", "", result.output)
+
+
+# ---------------------------------------------------------------------------------------------- the others
+
+
+def test_envmap_prints_statistics_and_writes_the_reconstruction(tmp_path):
+    light = ws.EnvironmentMap(np.random.default_rng(0).uniform(size=(16, 32, 3)).astype(np.float32))
+    light.write(tmp_path / "sky.exr")
+    result = run("envmap", tmp_path / "sky.exr", "--order", 3)
+    assert result.exit_code == 0
+    for name in light.statistics():
+        assert name.replace("_", " ") in result.stdout
+    assert f"{light.statistics()['mean_radiance'][0]:.4g}" in result.stdout
+    reconstruction = ws.read_image(tmp_path / "sky.sh3.exr")
+    np.testing.assert_allclose(reconstruction, sh.reconstruct_map(light.sh(3), 16), atol=1e-5)
+
+
+def test_envmap_refuses_or_repairs_bad_pixels(tmp_path):
+    pixels = np.ones((8, 16, 3), np.float32)
+    pixels[2, 3] = np.nan
+    ws.write_image(tmp_path / "bad.exr", pixels)
+    fails("envmap", tmp_path / "bad.exr", parts=("bad.exr", "NaN", "row 2, column 3"))
+    assert run("envmap", tmp_path / "bad.exr", "--sanitize", "neighbors").exit_code == 0
+    fails("envmap", tmp_path / "no.exr", parts=("no.exr",))
+    ws.write_image(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
+    fails("envmap", tmp_path / "square.exr", parts=("square.exr", "twice as wide as high"))
+
+
+def test_spheres_reports_writes_and_draws_the_fit(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "fits"))
+    ws.icosphere(1.0, 1).write(tmp_path / "ball.obj")
+    picture, output = tmp_path / "fit.png", tmp_path / "fit.npz"
+    result = run("spheres", tmp_path / "ball.obj", "--count", 1, "--picture", picture, "-o", output)
+    assert result.exit_code == 0, result.output
+    assert "42 vertices, 80 faces" in result.stdout
+    with np.load(output) as fit:
+        assert fit["centers"].shape == (1, 3) and fit["radii"].shape == (1,)
+        assert np.abs(fit["centers"]).max() < 0.1 and abs(fit["radii"][0] - 1) < 0.15  # it is nearly a ball
+    assert ws.read_image(picture).shape[2] >= 3
+
+
+def test_spheres_refuses_what_it_cannot_read_or_write(tmp_path):
+    mesh = tmp_path / "ball.obj"
+    fails("spheres", mesh, parts=("ball.obj",))
+    ws.icosphere(1.0, 1).write(mesh)
+    fails("spheres", mesh, "--picture", tmp_path / "x.txt", parts=("x.txt", "expected .png"))
+    fails("spheres", mesh, "-o", tmp_path / "x.csv", parts=("x.csv", "expected .npz"))
+    fails("spheres", mesh, "--device", "gpu", parts=("device: got 'gpu'",))
+    fails("spheres", mesh, "--error", -1, parts=("error",))
+
+
+def test_warmup_says_when_a_device_is_ready():
+    result = run("warmup")
+    assert result.exit_code == 0, result.output
+    assert re.search(r"cpu: ready in \d+\.\d s", result.stdout)
+
+
+# ---------------------------------------------------------------------------------------------- help
+
+
+def test_every_command_and_every_option_has_help():
+    group = typer.main.get_command(app)
+    assert sorted(group.commands) == sorted(COMMANDS)
+    for command in group.commands.values():
+        assert command.help
+        for parameter in command.params:
+            assert parameter.name == "help" or parameter.help, f"{command.name} {parameter.name}"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_lists_every_option(command):
+    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
+    assert result.exit_code == 0
+    for parameter in typer.main.get_command(app).commands[command].params:
+        for option in parameter.opts:
+            assert option.upper() in result.stdout.upper()
+
+
+def test_the_module_runs_as_a_program(tmp_path):
+    """A process of its own: help and a mistake, without a traceback and without Warp's messages."""
+    program = [sys.executable, "-m", "warpshadow"]
+    result = subprocess.run([*program, "--help"], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0
+    for command in COMMANDS:
+        assert command in result.stdout
+    missing = [*program, "render", str(tmp_path / "no.toml"), "-o", str(tmp_path / "x.exr")]
+    result = subprocess.run(missing, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    assert result.stdout == "" and result.stderr.startswith("error: ") and "no.toml" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_the_devices_that_a_message_names_exist():
+    result = run("warmup", "--device", "gpu")
+    for device in wp.get_devices():
+        assert device.alias in result.stderr

@@ -1,0 +1,199 @@
+"""Stage 1: spheres that cover a mesh and leave it little.
+
+    E(c, r) = Σ_i |S_i outside the mesh|  +  BARE ∫_surface max(min_i |p − c_i| − r_i, 0) dA
+
+Both terms are volumes: of each sphere outside the mesh, and between the surface and the spheres that miss it. The start
+are balls of the medial axis, picked greedily; Adam does the rest.    [Lyu et al. 2021, section 3.2; Wang et al. 2006]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import warp as wp
+
+from warpshadow.directions import fibonacci
+from warpshadow.spheres.adam import Adam
+from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
+
+BARE = 1.0
+"""Weight of the volume between the surface and the spheres next to that of spheres outside the mesh."""
+
+EDGE = 0.25
+"""The boundary between in- and outside is soft over this share of a sphere's radius, so that it has a gradient."""
+
+SAMPLES = 32
+"""Points of each sphere whose distance to the mesh tells how much of it is outside."""
+
+SURFACE_POINTS = 1024
+RATE = 0.003
+
+# ------------------------------------------------------------------------------------------------- start
+
+
+def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Balls inside the mesh that touch it at random points, as large as fit: [ball, (x, y, z, radius)].
+
+    A ball that touches the surface at p shrinks until it contains no other point of it.
+    """
+    touching, normals = mesh.sample(count, rng)
+    radii = np.full(count, 0.5)
+    for _ in range(12):
+        centers = touching - radii[:, None] * normals
+        distances, slopes = mesh.signed_distances(centers)
+        chord = centers - distances[:, None] * slopes - touching
+        depth = np.maximum(-2 * (chord * normals).sum(axis=1), 1e-9)
+        shrinks = np.abs(distances) < 0.98 * radii - 1e-5
+        shrinks &= np.linalg.norm(chord, axis=1) > 1e-4
+        radii = np.where(shrinks, np.minimum(radii, np.maximum((chord**2).sum(axis=1) / depth, 1e-3)), radii)
+    centers = touching - radii[:, None] * normals
+    radii = -mesh.signed_distances(centers)[0]
+    return np.column_stack([centers, radii])[radii > 1e-3]
+
+
+def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Pick balls greedily until they cover volume and surface: the picked, and all balls [ball, 4].
+
+    Balls of the medial axis fill what has an inside, balls on the surface cover what is thin or open.
+    """
+    spacing = np.sqrt(mesh.area / count)
+    on_surface, _ = mesh.sample(800, rng)
+    flat = np.column_stack([on_surface, np.full(len(on_surface), 0.35 * spacing)])
+    balls = np.concatenate([medial_balls(mesh, 2000, rng), flat])
+    in_box = mesh.low + rng.uniform(size=(20000, 3)) * (mesh.high - mesh.low)
+    in_volume = in_box[mesh.signed_distances(in_box)[0] < 0][:3000]
+    samples = np.concatenate([in_volume, on_surface])
+    shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (in_volume, on_surface)]
+    left = np.concatenate(shares).astype(np.float32)
+
+    reach = balls[:, 3] + 0.1 * spacing
+    squares = (balls[:, :3] ** 2).sum(axis=1)[:, None] + (samples**2).sum(axis=1) - 2 * balls[:, :3] @ samples.T
+    covers = (squares < reach[:, None] ** 2).astype(np.float32)
+    picked = np.zeros(len(balls), bool)
+    chosen = []
+    for _ in range(min(count, len(balls))):
+        gain = np.where(picked, -1.0, covers @ left)
+        best = int(np.argmax(gain))
+        if gain[best] < 1e-4:  # nothing left to cover: descent will find work for the rest
+            best = int(rng.choice(np.flatnonzero(~picked)))
+        picked[best] = True
+        chosen.append(best)
+        left *= 1 - 0.9 * covers[best]
+    return balls[chosen], balls
+
+
+# ------------------------------------------------------------------------------------------------- descent
+
+
+@wp.kernel(enable_backward=False)
+def _outside_volume(
+    # in
+    mesh: wp.uint64,
+    spheres: wp.array[wp.vec4],
+    samples: wp.array[wp.vec3],
+    # out
+    volumes: wp.array2d[float],
+    gradient: wp.array2d[wp.vec4],
+):
+    """Each thread owns a sphere and one sample of its inside, and with it a share of the sphere's volume."""
+    sphere, sample = wp.tid()
+    ball = spheres[sphere]
+    radius = ball[3]
+    offset = radius * samples[sample]
+    distance, slope = signed_distance(mesh, wp.vec3(ball[0], ball[1], ball[2]) + offset)
+
+    share = 4.0 / 3.0 * wp.pi * radius * radius * radius / float(samples.shape[0])
+    depth = distance / (EDGE * radius)  # from −1, inside, to 1, outside
+    t = wp.clamp(0.5 + 0.5 * depth, 0.0, 1.0)
+    outside = share * t * t * (3.0 - 2.0 * t)
+    rise = share * 3.0 * t * (1.0 - t)  # by the depth
+    by_center = rise / (EDGE * radius) * slope
+    volumes[sphere, sample] = outside
+    by_radius = 3.0 * outside + wp.dot(by_center, offset) - rise * depth
+    gradient[sphere, sample] = wp.vec4(by_center[0], by_center[1], by_center[2], by_radius)
+
+
+@wp.kernel(enable_backward=False)
+def _bare_gaps(
+    # in
+    points: wp.array[wp.vec3],
+    spheres: wp.array[wp.vec4],
+    # out
+    gaps: wp.array[float],
+    nearest: wp.array[int],
+    gradient: wp.array[wp.vec4],
+):
+    """Each thread owns a point of the surface: the gap to the sphere nearest to it, 0 if that covers the point."""
+    i = wp.tid()
+    gap = float(1.0e30)
+    chosen = int(0)
+    for sphere in range(spheres.shape[0]):
+        ball = spheres[sphere]
+        beyond = wp.length(points[i] - wp.vec3(ball[0], ball[1], ball[2])) - ball[3]
+        if beyond < gap:
+            gap = beyond
+            chosen = sphere
+    ball = spheres[chosen]
+    toward = wp.vec4(0.0)
+    if gap > 0.0:
+        away = wp.normalize(wp.vec3(ball[0], ball[1], ball[2]) - points[i])
+        toward = wp.vec4(away[0], away[1], away[2], -ball[3])
+    gaps[i] = wp.max(gap, 0.0)
+    nearest[i] = chosen
+    gradient[i] = toward
+
+
+def cover_energy(
+    mesh: NormalizedMesh, spheres: np.ndarray, samples: np.ndarray, points: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Energy of a cover, and its gradient.
+
+    Args:
+        mesh: What is covered.
+        spheres: Centers and radii [diagonals], shape [sphere, 4].
+        samples: Points evenly in the unit ball, shape [sample, 3].
+        points: Points evenly on the surface, shape [point, 3].
+
+    Returns:
+        The energy, and its gradient by centers and logarithms of radii, shape [sphere, 4].
+    """
+    device = mesh.device
+    balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=device)
+    shape = (len(spheres), len(samples))
+    volumes = wp.empty(shape, dtype=wp.float32, device=device)
+    by_volume = wp.empty(shape, dtype=wp.vec4, device=device)
+    inputs = [mesh.mesh.id, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
+    wp.launch(_outside_volume, dim=shape, inputs=inputs, outputs=[volumes, by_volume], device=device)
+
+    gaps = wp.empty(len(points), dtype=wp.float32, device=device)
+    nearest = wp.empty(len(points), dtype=wp.int32, device=device)
+    by_gap = wp.empty(len(points), dtype=wp.vec4, device=device)
+    inputs = [wp.array(points.astype(np.float32), dtype=wp.vec3, device=device), balls]
+    wp.launch(_bare_gaps, dim=len(points), inputs=inputs, outputs=[gaps, nearest, by_gap], device=device)
+
+    bare = BARE * mesh.area / len(points)
+    energy = volumes.numpy().sum(dtype=np.float64) + bare * gaps.numpy().sum(dtype=np.float64)
+    gradient = by_volume.numpy().sum(axis=1, dtype=np.float64)
+    np.add.at(gradient, nearest.numpy(), bare * by_gap.numpy())
+    return float(energy), gradient
+
+
+def ball_samples(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points evenly in the unit ball, turned at random, shape [count, 3]."""
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    shells = ((rng.permutation(count) + 0.5) / count) ** (1 / 3)
+    return shells[:, None] * (fibonacci(count) @ turn)
+
+
+def descend_cover(
+    mesh: NormalizedMesh, spheres: np.ndarray, steps: int, rng: np.random.Generator
+) -> Iterator[np.ndarray]:
+    """Improve a cover by Adam; yields the spheres [sphere, 4] after every step."""
+    spheres = spheres.astype(np.float64)
+    adam = Adam(len(spheres))
+    for step in range(steps):
+        samples, points = ball_samples(SAMPLES, rng), mesh.sample(SURFACE_POINTS, rng)[0]
+        _, gradient = cover_energy(mesh, spheres, samples, points)
+        adam.step(spheres, gradient, RATE * 0.5 * (1 + np.cos(np.pi * step / steps)))
+        yield spheres

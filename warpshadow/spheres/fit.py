@@ -1,0 +1,218 @@
+"""The stages of a fit in order, the search for a wanted error, and fits kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.mesh import Mesh
+from warpshadow.spheres.cover import descend_cover, greedy_cover
+from warpshadow.spheres.measure import FitReport, measure
+from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.spheres.refine import Refinement
+from warpshadow.spheres.sphere_set import Spheres
+
+ALGORITHM_VERSION = 3
+"""Part of the key of cached fits: raise it whenever a fit would come out differently."""
+
+COVER_STEPS = 200
+"""Steps of stage 1 where it is all there is."""
+
+COVER_STEPS_FIRST = 100
+"""Steps of stage 1 before stage 2."""
+
+MOST_SPHERES = 1024
+"""The search for an error ends here."""
+
+
+class SphereFit(NamedTuple):
+    """Spheres in the mesh's own coordinates, and how good they are."""
+
+    spheres: Spheres
+    report: FitReport
+
+
+def fit_spheres(
+    mesh: Mesh,
+    count: int = 64,
+    *,
+    error: float | None = None,
+    seed: int = 0,
+    refine: bool = True,
+    steps: int = 2000,
+    device: wp.DeviceLike = "cpu",
+    cache: bool = True,
+    progress: bool = True,
+) -> SphereFit:
+    """Fit spheres to a mesh so that they cast its shadows.
+
+    The same mesh, moved or scaled, gets the same spheres, moved or scaled (up to float32 rounding). The same
+    call on the same device gives the same bits.
+
+    Args:
+        mesh: The mesh [scene units], y up; open and multi-part meshes, too.
+        count: Number of spheres; 0 gives none.
+        error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
+            of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
+            comes with a warning.
+        seed: Seed of the random choices.
+        refine: Refine the spheres until they cast the mesh's shadows (stage 2). False keeps those that cover the mesh
+            (stage 1), the paper's fit.
+        steps: Steps of gradient descent of the refinement.
+        device: Where to fit.
+        cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
+            folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
+        progress: Show a progress bar when it takes longer than a second.
+
+    Returns:
+        The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+    for name, value, least in (("count", count, 0), ("seed", seed, 0), ("steps", steps, 1)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise ValueError(f"{name}: got {value!r}, expected an integer of at least {least}")
+    if error is not None and not (np.isfinite(error) and error > 0):
+        raise ValueError(f"error: got {error!r}, expected a positive number such as 0.05, or None")
+    positions = np.asarray(mesh.positions, np.float64)
+    faces = np.asarray(mesh.faces, np.int32)
+    check.shape("mesh.positions", positions.shape, ("vertex", 3))
+    check.shape("mesh.faces", faces.shape, ("face", 3))
+    if not len(faces):
+        raise ValueError("mesh: got no faces, expected at least one")
+    used, renumbered = np.unique(faces, return_inverse=True)
+    positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
+    check.finite("mesh.positions", positions)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    corners = positions[faces]
+    if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
+        raise ValueError("mesh: got only faces without area, expected a surface")
+
+    # the grid makes the normalized mesh, and so the fit and its cache key, independent of float32 rounding
+    normalized = (np.round((positions - middle) / diagonal * 2**18) / 2**18).astype(np.float32)
+    job = _Job(normalized, faces, seed, steps if refine else 0, wp.get_device(device))
+    fit = partial(_cached_fit if cache else _fit, job, progress)
+    balls, report = fit(int(count)) if error is None else _search(fit, error)
+    spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
+    return SphereFit(spheres, report)
+
+
+def _search(fit: Callable[[int], tuple[np.ndarray, FitReport]], error: float) -> tuple[np.ndarray, FitReport]:
+    """Find the least number of spheres, within an eighth, whose error is met."""
+    failed, count = 0, 16
+    best = fit(count)
+    while best[1].visibility_error > error and count < MOST_SPHERES:
+        failed, count = count, 2 * count
+        best = fit(count)
+    if best[1].visibility_error > error:
+        message = f"error: {error} is not met with {count} spheres; the fit has {best[1].visibility_error:.4f}"
+        warnings.warn(message, stacklevel=3)
+        return best
+    while count - failed > max(count // 8, 1):
+        middle = (failed + count) // 2
+        attempt = fit(middle)
+        if attempt[1].visibility_error <= error:
+            best, count = attempt, middle
+        else:
+            failed = middle
+    return best
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What decides a fit, but for the number of spheres."""
+
+    positions: np.ndarray
+    faces: np.ndarray
+    seed: int
+    steps: int
+    device: wp.Device
+
+    def key(self, count: int) -> str:
+        """Hash of all of it."""
+        kind = "cpu" if self.device.is_cpu else "cuda"
+        numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
+        key = hashlib.sha256(json.dumps(numbers).encode())
+        key.update(self.positions.tobytes())
+        key.update(self.faces.tobytes())
+        return key.hexdigest()
+
+
+def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
+    """Fit spheres [sphere, 4] to a normalized mesh."""
+    from tqdm import tqdm
+
+    began = time.perf_counter()
+    mesh = NormalizedMesh(job.positions, job.faces, job.device)
+    rng = np.random.default_rng(job.seed)
+    spheres = np.zeros((0, 4))
+    if count:
+        spheres, balls = greedy_cover(mesh, count, rng)
+        cover_steps = COVER_STEPS_FIRST if job.steps else COVER_STEPS
+        total = cover_steps + job.steps
+        with tqdm(total=total, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False) as bar:
+            for covering in descend_cover(mesh, spheres, cover_steps, rng):
+                spheres = covering
+                bar.update()
+            if job.steps:
+                for refined in Refinement(mesh, rng).run(spheres, balls, job.steps):
+                    spheres = refined
+                    bar.update()
+    spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
+    return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
+
+
+# -------------------------------------------------------------------------------- cache
+
+
+def _cache_folder() -> Path:
+    """Folder of cached fits: WARPSHADOW_CACHE_DIR, or the platform's place for caches."""
+    override = os.environ.get("WARPSHADOW_CACHE_DIR")
+    if override:
+        return Path(override) / "spheres"
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "warpshadow" / "spheres"
+
+
+def _cached_fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
+    """Read a fit from the cache, or make it and write it there."""
+    path = _cache_folder() / f"{job.key(count)}.npz"
+    if path.exists():
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
+            check.shape("spheres", spheres.shape, (report.sphere_count, 4))
+            return spheres, replace(report, cached=True)
+        except Exception as problem:  # whatever a damaged file raises: a fit can always be made again
+            warnings.warn(f"cached fit {path} cannot be read ({problem}); fitting again", stacklevel=4)
+    spheres, report = _fit(job, progress, count)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, spheres=spheres, report=json.dumps(asdict(report)))
+        os.replace(temporary, path)
+    except OSError as problem:
+        warnings.warn(f"the fit could not be cached in {path.parent} ({problem})", stacklevel=4)
+    return spheres, report

@@ -1,0 +1,104 @@
+"""How well spheres stand in for a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warpshadow.directions import fibonacci
+from warpshadow.reference import trace_visibility
+from warpshadow.spheres.cover import ball_samples
+from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.spheres.occlusion import exact_occlusion
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How well spheres stand in for a mesh.
+
+    The errors are ‖E_spheres − E_mesh‖ / ‖E_mesh‖ over receivers, E the irradiance under a sky with a sun of
+    10°, for four azimuths of the sun. Receivers whose hemisphere is less than 5% open, which hardly any
+    camera sees, are left out.
+    """
+
+    sphere_count: int
+    coverage: float
+    """Share of the surface inside the spheres, each grown by 1% of the bounding box's diagonal."""
+    outside_volume: float
+    """Share of the union's volume that lies outside the mesh (1 for a sheet, which has no inside)."""
+    ground_error: float
+    """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
+    surface_error: float
+    """On the mesh's own vertices, weighted by area."""
+    seconds: float
+    """Time that the fit took when it was made."""
+    cached: bool = False
+    """Whether the fit was read from the cache."""
+
+    @property
+    def visibility_error(self) -> float:
+        """The larger of the errors on the ground and on the surface."""
+        return max(self.ground_error, self.surface_error)
+
+
+def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
+    """Radiance of a bright sky over a dim ground, with a sun lobe of 10° at a height of 52°."""
+    sun = np.array([0.5, 0.7, 0.2]) / np.linalg.norm([0.5, 0.7, 0.2])
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    sun = np.array([c * sun[0] + s * sun[2], sun[1], c * sun[2] - s * sun[0]])
+    return 0.3 + 0.7 * np.maximum(directions[:, 1], 0) + 6 * np.exp((directions @ sun - 1) / 0.03)
+
+
+def _relative_error(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> float:
+    """Relative L2 error of the irradiance at receivers, over four azimuths of the sun."""
+    directions = fibonacci(1024)
+    array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
+    receivers, rays = array(points[None].astype(np.float32)), array(directions.astype(np.float32))
+    visible = trace_visibility(mesh.mesh, receivers, array(normals[None].astype(np.float32)), rays).numpy()[0]
+    centers = array(spheres[None, :, :3].astype(np.float32))
+    radii = wp.array(spheres[None, :, 3].astype(np.float32), dtype=wp.float32, device=mesh.device)
+    passing = 1 - exact_occlusion(receivers, rays, centers, radii).numpy()[0]
+    cosine = np.maximum(normals @ directions.T, 0)
+    light = np.stack([_sky(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
+    seen = 2 * visible.mean(axis=1) >= 0.05
+    expected = (cosine * visible)[seen] @ light
+    difference = (cosine * passing)[seen] @ light - expected
+    return float(np.sqrt((difference**2).sum() / max((expected**2).sum(), 1e-30)))
+
+
+def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitReport:
+    """Judge spheres [sphere, 4] by receivers that the refinement has not seen."""
+    rng = np.random.default_rng(2021)
+    grid = (np.arange(24) + 0.5) / 24 - 0.5
+    x, z = np.meshgrid(2.5 * mesh.longest * grid, 2.5 * mesh.longest * grid)
+    ground = np.column_stack([x.ravel(), np.full(x.size, mesh.low[1] - 1e-5), z.ravel()])
+    up = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
+
+    outside_volume = 0.0
+    if (spheres[:, 3] > 0).any():
+        samples = ball_samples(16 * max(1, 512 // len(spheres)), rng)
+        points = spheres[:, None, :3] + spheres[:, None, 3:] * samples
+        shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _containing(spheres, points)
+        outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
+        outside_volume = float(shares[outside].sum() / shares.sum())
+    surface, _ = mesh.sample(4000, rng)
+    grown = spheres + [0, 0, 0, 0.01]
+    return FitReport(
+        sphere_count=len(spheres),
+        coverage=float((_containing(grown, surface) > 0).mean()),
+        outside_volume=outside_volume,
+        ground_error=_relative_error(mesh, spheres, ground, up),
+        surface_error=_relative_error(mesh, spheres, *mesh.sample_vertices(600, rng)),
+        seconds=seconds,
+    )
+
+
+def _containing(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Number of spheres [sphere, 4] that contain each of the points [..., 3]."""
+    count = np.zeros(points.shape[:-1])
+    for sphere in spheres:
+        count += ((points - sphere[:3]) ** 2).sum(axis=-1) <= (sphere[3] * (1 + 1e-6)) ** 2
+    return count

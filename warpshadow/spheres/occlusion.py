@@ -1,0 +1,72 @@
+"""Exact occlusion by spheres, ray by ray: the reference of what smooths it or limits its bands."""
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.lanes import lane_type
+from warpshadow.visibility.cones import BLEND, cone_function
+
+_cone = cone_function(1)
+_Lane = lane_type(1)
+
+
+@wp.kernel(enable_backward=False)
+def _exact_occlusion(
+    # in
+    points: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
+    centers: wp.array2d[wp.vec3],
+    radii: wp.array2d[float],
+    # out
+    occlusion: wp.array3d[wp.uint8],
+):
+    """Each thread owns one ray: a receiver and a direction."""
+    batch, vertex, direction = wp.tid()
+    blocked = wp.uint8(0)
+    for sphere in range(radii.shape[1]):
+        radius = radii[batch, sphere]
+        toward = centers[batch, sphere] - points[batch, vertex]
+        along = wp.dot(toward, directions[direction])
+        if along > 0.0 and radius > 0.0:
+            distance = wp.length(toward)
+            if distance >= (1.0 + BLEND) * radius:  # the cone is exact, and this test needs no root
+                closest = wp.length_sq(toward - along * directions[direction])
+                if closest < radius * radius:
+                    blocked = wp.uint8(1)
+                    break
+            else:
+                _x, _y, _z, cosine, _sine2, weight = _cone(_Lane(toward[0]), _Lane(toward[1]), _Lane(toward[2]), radius)
+                if weight[0] > 0.5 and along > cosine[0] * distance:
+                    blocked = wp.uint8(1)
+                    break
+    occlusion[batch, vertex, direction] = blocked
+
+
+def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
+    """Test which rays spheres block, without any smoothing: the reference of the approximations.
+
+    A receiver on or inside a sphere sees it as warpshadow.visibility.cones has it: as a hemisphere around the
+    direction of its center, and not at all nearer than FADE/2 radii to the center.
+
+    Args:
+        points: Receiver positions [scene units], vec3, shape [batch, vertex].
+        directions: Unit directions toward the light, vec3, shape [direction].
+        centers: Sphere centers [scene units], vec3, shape [batch, sphere].
+        radii: Sphere radii [scene units], float32, shape [batch, sphere].
+
+    Returns:
+        1 where a sphere blocks the ray, else 0; uint8, shape [batch, vertex, direction].
+
+    Raises:
+        ValueError: naming the argument whose shape does not fit.
+
+    Differentiable: no.
+    """
+    check.shape("points", points.shape, ("batch", "vertex"))
+    check.shape("directions", directions.shape, ("direction",))
+    check.shape("centers", centers.shape, (points.shape[0], "sphere"))
+    check.shape("radii", radii.shape, centers.shape)
+    occlusion = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
+    inputs = [points, directions, centers, radii]
+    wp.launch(_exact_occlusion, dim=occlusion.shape, inputs=inputs, outputs=[occlusion], device=points.device)
+    return occlusion

@@ -1,0 +1,87 @@
+"""A set of spheres on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warpshadow import check
+
+
+@dataclass(frozen=True, eq=False)
+class Spheres:
+    """Spheres on the host, validated; the arrays are read-only copies.
+
+    Args:
+        centers: Centers [scene units], float32, shape [sphere, 3].
+        radii: Radii [scene units], not negative, float32, shape [sphere]; a radius of 0 blocks nothing.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    centers: np.ndarray = field(repr=False)
+    radii: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        """Copy, convert and validate the arrays."""
+        for name, shape in (("centers", ("sphere", 3)), ("radii", ("sphere",))):
+            values = np.array(getattr(self, name), dtype=np.float32)
+            check.shape(name, values.shape, shape)
+            check.finite(name, values)
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        if len(self.centers) != len(self.radii):
+            raise ValueError(f"radii: got {len(self.radii)} radii for {len(self.centers)} centers, expected one each")
+        if (self.radii < 0).any():
+            raise ValueError(f"radii: got {self.radii.min()}, expected radii that are not negative")
+
+    def __len__(self) -> int:
+        """Number of spheres."""
+        return len(self.radii)
+
+    def __repr__(self) -> str:
+        """How many."""
+        return f"Spheres({len(self)})"
+
+    def transformed(
+        self,
+        *,
+        rotation: np.ndarray | None = None,
+        translation: Iterable[float] = (0, 0, 0),
+        scale: float = 1.0,
+    ) -> Spheres:
+        """Apply a similarity x → scale · R x + t.
+
+        Args:
+            rotation: Rotation matrix R, shape [3, 3]; None for no rotation.
+            translation: Vector t [scene units], shape [3].
+            scale: Factor of lengths, positive.
+
+        Returns:
+            New spheres.
+
+        Raises:
+            ValueError: when the matrix is no rotation, or a number is not finite or the scale not positive.
+        """
+        rotation = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        translation = np.asarray(translation, np.float64)
+        check.shape("rotation", rotation.shape, (3, 3))
+        check.shape("translation", translation.shape, (3,))
+        check.finite("rotation", rotation)
+        check.finite("translation", translation)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise ValueError(f"rotation: got {rotation.tolist()}, expected an orthogonal matrix")
+        if not (np.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale: got {scale!r}, expected a positive number")
+        return Spheres(scale * self.centers.astype(np.float64) @ rotation.T + translation, scale * self.radii)
+
+    @staticmethod
+    def concatenate(parts: Iterable[Spheres]) -> Spheres:
+        """Put the spheres of several bodies into one set, in order."""
+        parts = list(parts)
+        centers = [np.zeros((0, 3), np.float32), *(part.centers for part in parts)]
+        radii = [np.zeros(0, np.float32), *(part.radii for part in parts)]
+        return Spheres(np.concatenate(centers), np.concatenate(radii))
