@@ -52,6 +52,23 @@ def main(device: str, runs: int) -> None:
         log = log_sh.accumulate(points, normals, centers, radii, order=8)
         shade(sh_transfer(exponentiate(log), normals, order=8), sh_light)
 
+    variables = [wp.clone(array, requires_grad=True) for array in (points, normals, centers, radii)]
+    free_cells, free_sh = (wp.clone(light, requires_grad=True) for light in (cell_light, sh_light))
+
+    def shade_directional_and_back() -> None:
+        with wp.Tape() as tape:
+            seen = directional.transmittance(*variables, cells.directions)
+            shaded = shade(directional_transfer(seen, variables[1], cells.directions), free_cells)
+        shaded.grad.fill_(1.0)
+        tape.backward()
+
+    def shade_log_sh_and_back() -> None:
+        with wp.Tape() as tape:
+            seen = exponentiate(log_sh.accumulate(*variables, order=8))
+            shaded = shade(sh_transfer(seen, variables[1], order=8), free_sh)
+        shaded.grad.fill_(1.0)
+        tape.backward()
+
     def draw() -> None:
         clip = to_clip(renderer.geometry.positions, clip_matrices)
         interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, shading)
@@ -68,6 +85,8 @@ def main(device: str, runs: int) -> None:
     rows: dict[str, Callable[[], None]] = {
         "visibility and shading, directional, 128 directions": shade_directional,
         "visibility and shading, log-SH eigen, order 8": shade_log_sh,
+        "directional, forward and backward": shade_directional_and_back,
+        "log-SH, forward and backward": shade_log_sh_and_back,
         "project, rasterize and interpolate": draw,
         "whole image from the scene, directional": whole_image,
         "one iteration of a light fit, forward and backward": fit_light,

@@ -1,5 +1,6 @@
 """The command line: what it writes, what it prints, and one clear line for each mistake."""
 
+import functools
 import re
 import subprocess
 import sys
@@ -210,6 +211,8 @@ def test_envmap_refuses_or_repairs_bad_pixels(tmp_path):
 
 
 def test_spheres_reports_writes_and_draws_the_fit(tmp_path, monkeypatch):
+    """Of few steps: how good a fit is, test_spheres.py asks."""
+    monkeypatch.setattr("warpshadow.spheres.fit_spheres", functools.partial(ws.fit_spheres, steps=100))
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "fits"))
     ws.icosphere(1.0, 1).write(tmp_path / "ball.obj")
     picture, output = tmp_path / "fit.png", tmp_path / "fit.npz"

@@ -76,6 +76,13 @@ def test_irradiance_of_log_sh_is_the_golden_one(log, name, golden, device):
     assert relative(log_sh_irradiance(golden, log, device, threshold=0.125), golden[name]) < IRRADIANCE
 
 
+def test_irradiance_of_the_product_of_spheres_is_the_golden_one(golden, device):
+    (points, _, centers, radii), normals = geometry(golden, device, has_normals=False)
+    visibility = log_sh.multiply_spheres(points, centers, radii, order=8)
+    transfer = shading.sh_transfer(visibility, normals, order=8).numpy()[0]
+    assert relative(np.pi * transfer @ golden["light_sh"], golden["irradiance_product"]) < IRRADIANCE
+
+
 def test_unshadowed_irradiance_is_the_golden_one(golden, device):
     """Of the full light the golden value is, of which order 8 keeps all but 0.1% here."""
     _, normals = geometry(golden, device, has_normals=True)

@@ -14,8 +14,8 @@ from warpshadow.torch import TorchRenderer
 METHODS = ("directional", "log-sh", "none", "ray-traced")
 # The same float32 products in another order.
 FLOAT32 = 2e-6
-# The image is linear in each input alone, so a central difference has no truncation error, only rounding: a loss of some
-# hundred float32 pixels over a step of 1.
+# The image is linear in each input alone, so a central difference has no truncation error, only rounding: that of a
+# loss over some hundred float32 pixels, for a step of 1.
 DIFFERENCE = 1e-4
 
 WHITE = (1.0, 1.0, 1.0)
@@ -302,7 +302,7 @@ def test_a_huge_finite_tensor_is_not_mistaken_for_infinity(renderer):
 def test_memory_does_not_grow_over_iterations(renderer):
     values = inputs_of(renderer)
 
-    big = random(256, 256, 3)  # 0.8 MB, and its gradient, so that what is kept would be seen
+    big = random(160, 160, 3)  # 0.3 MB, and as much its gradient, so that what is kept would be seen
 
     def iterate(count: int) -> int:
         """Resident memory afterwards [bytes]."""
@@ -312,7 +312,7 @@ def test_memory_does_not_grow_over_iterations(renderer):
 
     before = iterate(20)
     grown = iterate(200) - before
-    assert grown < 20e6, f"{grown / 1e6:.0f} MB more after 200 iterations of 1.6 MB"
+    assert grown < 20e6, f"{grown / 1e6:.0f} MB more after 200 iterations of 0.6 MB"
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -331,9 +331,9 @@ def test_light_is_recovered_from_an_image(method):
         return value
 
     optimizer = torch.optim.Adam([light], lr=0.2)
-    for _ in range(120):
+    for _ in range(80):
         optimizer.step(loss)
-    assert loss().sqrt() < 0.03  # relative error of the image
+    assert loss().sqrt() < 0.05  # relative error of the image: 3% measured
     optimizer = torch.optim.LBFGS(
         [light], max_iter=100, tolerance_change=0, tolerance_grad=0, line_search_fn="strong_wolfe"
     )

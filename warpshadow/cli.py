@@ -186,7 +186,7 @@ def warmup(device: Device = "cpu") -> None:
         mesh = icosphere(subdivisions=1)
         start = time.perf_counter()
         with tqdm(total=len(METHODS) + 1, desc="compiling", unit="stage") as bar:
-            fit_spheres(mesh, 1, device=where, cache=False, progress=False)
+            fit_spheres(mesh, 1, steps=100, device=where, cache=False, progress=False)
             bar.update()
             for method in METHODS:
                 scene = Scene(

@@ -1,0 +1,172 @@
+"""Rigid poses and embedded deformation: against float64 twins, and their gradients against central differences."""
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from warpshadow import deform
+
+# Rounding of float32.
+FLOAT32 = 1e-5
+# Gradients of float32 kernels against float64 differences.
+GRADIENT = 1e-3
+
+
+def put(values, dtype, device, requires_grad=True):
+    return wp.array(np.asarray(values, np.float32), dtype=dtype, device=device, requires_grad=requires_grad)
+
+
+def differences(function, argument, step=1e-6):
+    gradient = np.zeros_like(argument)
+    for index in np.ndindex(argument.shape):
+        ends = []
+        for sign in (1, -1):
+            moved = argument.copy()
+            moved[index] += sign * step
+            ends.append(function(moved))
+        gradient[index] = (ends[0] - ends[1]) / (2 * step)
+    return gradient
+
+
+def sixd_twin(columns):
+    x = columns[..., :3] / np.linalg.norm(columns[..., :3], axis=-1, keepdims=True)
+    y = columns[..., 3:] - np.sum(columns[..., 3:] * x, axis=-1, keepdims=True) * x
+    y /= np.linalg.norm(y, axis=-1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+TWINS = {
+    "quaternion": (wp.vec4, 4, lambda q: Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)),
+    "axis-angle": (
+        wp.vec3,
+        3,
+        lambda v: Rotation.from_rotvec(v.reshape(-1, 3)).as_matrix().reshape(*v.shape[:-1], 3, 3),
+    ),
+    "columns": (deform.Vec6, 6, sixd_twin),
+}
+
+
+@pytest.mark.parametrize("kind", TWINS)
+def test_rotations_and_their_gradients_are_those_of_the_twin(kind, device, verified_tape):
+    dtype, size, twin = TWINS[kind]
+    rng = np.random.default_rng(0)
+    parameters = rng.normal(size=(3, 4, size))
+    if kind == "axis-angle":
+        parameters[0] *= [[1e-9], [1e-3], [0.3], [2.0]]  # both sides of the series, and near zero
+    weights = rng.normal(size=(3, 4, 3, 3))
+    array = put(parameters, dtype, device)
+    with wp.Tape() as tape:
+        rotations = deform.rotation_matrices(array)
+    np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)
+    rotations.grad.assign(weights.astype(np.float32))
+    tape.backward()
+    expected = differences(lambda p: np.sum(weights * twin(p)), parameters)
+    assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+def test_no_rotation_is_the_identity_with_a_finite_gradient(device):
+    array = put(np.zeros((1, 1, 3)), wp.vec3, device)
+    with wp.Tape() as tape:
+        rotations = deform.rotation_matrices(array)
+    np.testing.assert_array_equal(rotations.numpy()[0, 0], np.eye(3))
+    rotations.grad.assign(np.float32([[[[0, -1, 0], [1, 0, 0], [0, 0, 0]]]]))
+    tape.backward()
+    np.testing.assert_allclose(array.grad.numpy()[0, 0], [0, 0, 2], atol=1e-6)
+
+
+def test_rotations_of_another_type_are_refused(device):
+    with pytest.raises(ValueError, match="parameters: got dtype vec2f?, expected vec4, vec3 or deform.Vec6"):
+        deform.rotation_matrices(wp.zeros((1, 1), dtype=wp.vec2, device=device))
+
+
+def test_bodies_move_as_one_and_their_gradients_are_those_of_the_twin(device, verified_tape):
+    rng = np.random.default_rng(1)
+    rest, radii, bodies = rng.normal(size=(9, 3)), rng.random(9), np.arange(9) % 3
+    rotations = Rotation.random(6, random_state=1).as_matrix().reshape(2, 3, 3, 3)
+    translations, scales = rng.normal(size=(2, 3, 3)), rng.uniform(0.5, 2, (2, 3))
+    weights, radius_weights = rng.normal(size=(2, 9, 3)), rng.normal(size=(2, 9))
+
+    def twin(rest, rotations, translations, scales, radii):
+        moved = (
+            np.einsum("bpij,pj->bpi", rotations[:, bodies], rest) * scales[:, bodies, None] + translations[:, bodies]
+        )
+        return np.sum(weights * moved) + np.sum(radius_weights * scales[:, bodies] * radii)
+
+    values = [rest, rotations, translations, scales, radii]
+    dtypes = [wp.vec3, wp.mat33, wp.vec3, wp.float32, wp.float32]
+    arrays = [put(value, dtype, device) for value, dtype in zip(values, dtypes, strict=True)]
+    members = wp.array(bodies.astype(np.int32), device=device)
+    with wp.Tape() as tape:
+        poses = deform.Poses(*arrays[1:4])
+        points, posed_radii = poses.points(arrays[0], members), poses.radii(arrays[4], members)
+    points.grad.assign(weights.astype(np.float32))
+    posed_radii.grad.assign(radius_weights.astype(np.float32))
+    tape.backward()
+    total = np.sum(weights * points.numpy()) + np.sum(radius_weights * posed_radii.numpy())
+    assert abs(total - twin(*values)) < 10 * FLOAT32
+    for k, array in enumerate(arrays):
+        expected = differences(lambda v, k=k: twin(*values[:k], v, *values[k + 1 :]), values[k])
+        assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+@pytest.fixture
+def graph(device):
+    rng = np.random.default_rng(2)
+    return deform.DeformationGraph.bind(rng.normal(size=(30, 3)), rng.normal(size=(12, 3)), count=3, device=device)
+
+
+def test_weights_are_shares_of_the_nearest_nodes(graph):
+    weights, nodes = graph.weights.numpy(), graph.nodes.numpy()
+    assert (weights > 0).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=FLOAT32)
+    distances = np.linalg.norm(graph.rest.numpy()[:, None] - graph.node_positions.numpy(), axis=2)
+    np.testing.assert_array_equal(np.sort(nodes), np.sort(np.argsort(distances, axis=1)[:, :3]))
+    assert (np.diff(weights, axis=1) <= FLOAT32).all()  # nearer nodes carry more
+
+
+def test_a_rigid_motion_of_all_nodes_is_one_of_the_points_and_costs_nothing(graph, device):
+    rotation = Rotation.random(random_state=3).as_matrix()
+    nodes, rest = graph.node_positions.numpy(), graph.rest.numpy()
+    shift = np.array([0.3, -1.0, 2.0])
+    matrices = put(np.broadcast_to(rotation, (1, 12, 3, 3)), wp.mat33, device)
+    translations = put((nodes @ rotation.T + shift - nodes)[None], wp.vec3, device)
+    np.testing.assert_allclose(graph.points(matrices, translations).numpy()[0], rest @ rotation.T + shift, atol=1e-5)
+    np.testing.assert_allclose(graph.centers(translations).numpy()[0], nodes @ rotation.T + shift, atol=1e-5)
+    assert graph.rigidity(matrices, translations).numpy()[0] < 1e-9
+    assert graph.shear(matrices).numpy()[0] < 1e-9
+
+
+def test_gradients_of_a_deformation_are_those_of_the_twin(graph, device, verified_tape):
+    rng = np.random.default_rng(4)
+    values = [np.eye(3) + 0.3 * rng.normal(size=(2, 12, 3, 3)), rng.normal(size=(2, 12, 3))]
+    weights = rng.normal(size=(2, 30, 3))
+    centers, rest = graph.node_positions.numpy().astype(float), graph.rest.numpy().astype(float)
+    nodes, shares, neighbors = (a.numpy() for a in (graph.nodes, graph.weights, graph.neighbors))
+
+    def twin(matrices, translations):
+        offset = rest[:, None] - centers[nodes]
+        moved = np.einsum("bpkij,pkj->bpki", matrices[:, nodes], offset) + centers[nodes] + translations[:, nodes]
+        edge = centers[neighbors] - centers[:, None]
+        gap = np.einsum("bnij,nkj->bnki", matrices, edge) - edge + translations[:, :, None] - translations[:, neighbors]
+        shear = np.einsum("bnji,bnjk->bnik", matrices, matrices) - np.eye(3)
+        points = np.sum(weights * np.einsum("pk,bpki->bpi", shares, moved))
+        return points + np.sum(gap**2) + 0.5 * np.sum(shear**2) + np.sum((centers + translations) ** 2)
+
+    arrays = [put(values[0], wp.mat33, device), put(values[1], wp.vec3, device)]
+    with wp.Tape() as tape:
+        points, moved = graph.points(*arrays), graph.centers(arrays[1])
+        rigidity, shear = graph.rigidity(*arrays), graph.shear(arrays[0])
+    points.grad.assign(weights.astype(np.float32))
+    moved.grad.assign(2 * moved.numpy())
+    rigidity.grad.fill_(1.0)
+    shear.grad.fill_(0.5)
+    tape.backward()
+    for k, array in enumerate(arrays):
+        expected = differences(lambda v, k=k: twin(*values[:k], v, *values[k + 1 :]), values[k])
+        assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+def test_too_few_nodes_are_refused():
+    with pytest.raises(ValueError, match="count: got 4 for 3 nodes, expected 1 to 2"):
+        deform.DeformationGraph.bind(np.zeros((5, 3)), np.eye(3))

@@ -1,0 +1,383 @@
+"""Motion: rigid poses of bodies and embedded deformation, of vertices and spheres together.
+
+Arrays at rest have no batch dimension; what moves has one: an instance for every pose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+
+Vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+# ---------------------------------------------------------------------------------------------- rotations
+
+
+@wp.kernel
+def _rotate_by_quaternions(
+    # in
+    quaternions: wp.array2d(dtype=wp.vec4),
+    # out
+    rotations: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a rotation."""
+    batch, body = wp.tid()
+    q = wp.normalize(quaternions[batch, body])
+    x = q[0]
+    y = q[1]
+    z = q[2]
+    w = q[3]
+    rotations[batch, body] = wp.mat33(
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - z * w),
+        2.0 * (x * z + y * w),
+        2.0 * (x * y + z * w),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - x * w),
+        2.0 * (x * z - y * w),
+        2.0 * (y * z + x * w),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+
+
+@wp.kernel
+def _rotate_by_axis_angles(
+    # in
+    vectors: wp.array2d(dtype=wp.vec3),
+    # out
+    rotations: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a rotation: R = I + sin θ/θ K + (1 − cos θ)/θ² K², by series near θ = 0."""
+    batch, body = wp.tid()
+    v = vectors[batch, body]
+    t = wp.dot(v, v)
+    a = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
+    b = 0.5 - t / 24.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0)))
+    if t > 0.25:
+        angle = wp.sqrt(t)
+        a = wp.sin(angle) / angle
+        b = (1.0 - wp.cos(angle)) / t
+    k = wp.skew(v)
+    rotations[batch, body] = wp.identity(n=3, dtype=wp.float32) + a * k + b * (k * k)
+
+
+@wp.kernel
+def _rotate_by_columns(
+    # in
+    columns: wp.array2d(dtype=Vec6),
+    # out
+    rotations: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a rotation: Gram–Schmidt of its first two columns."""
+    batch, body = wp.tid()
+    c = columns[batch, body]
+    x = wp.normalize(wp.vec3(c[0], c[1], c[2]))
+    y = wp.vec3(c[3], c[4], c[5])
+    y = wp.normalize(y - wp.dot(x, y) * x)
+    rotations[batch, body] = wp.matrix_from_cols(x, y, wp.cross(x, y))
+
+
+_ROTATION_KERNELS = {
+    wp.vec4: _rotate_by_quaternions,
+    wp.vec3: _rotate_by_axis_angles,
+    Vec6: _rotate_by_columns,
+}
+
+
+def rotation_matrices(parameters: wp.array) -> wp.array:
+    """Make rotation matrices of free parameters.
+
+    Args:
+        parameters: Shape [batch, body]; the dtype says what they are:
+            vec4, quaternions (x, y, z, w) of any length but 0;
+            vec3, axis-angle vectors [radians], smooth at 0;
+            :data:`Vec6`, the first two columns, of which Gram–Schmidt makes a rotation (Zhou et al. 2019).
+
+    Returns:
+        Rotations, mat33 of shape [batch, body].
+
+    Raises:
+        ValueError: for another dtype.
+
+    Differentiable: parameters. A quaternion of length 0, or parallel columns, are no rotation and have no gradient.
+    """
+    if parameters.dtype not in _ROTATION_KERNELS:
+        raise ValueError(f"parameters: got dtype {parameters.dtype.__name__}, expected vec4, vec3 or deform.Vec6")
+    rotations = wp.empty(
+        parameters.shape, dtype=wp.mat33, device=parameters.device, requires_grad=parameters.requires_grad
+    )
+    wp.launch(
+        _ROTATION_KERNELS[parameters.dtype],
+        dim=parameters.shape,
+        inputs=[parameters],
+        outputs=[rotations],
+        device=parameters.device,
+    )
+    return rotations
+
+
+# ---------------------------------------------------------------------------------------------- rigid bodies
+
+
+@wp.kernel
+def _pose_points(
+    # in
+    rest: wp.array(dtype=wp.vec3),
+    bodies: wp.array(dtype=wp.int32),
+    rotations: wp.array2d(dtype=wp.mat33),
+    translations: wp.array2d(dtype=wp.vec3),
+    scales: wp.array2d(dtype=wp.float32),
+    # out
+    posed: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a point of an instance."""
+    batch, point = wp.tid()
+    body = bodies[point]
+    posed[batch, point] = scales[batch, body] * (rotations[batch, body] * rest[point]) + translations[batch, body]
+
+
+@wp.kernel
+def _pose_radii(
+    # in
+    rest: wp.array(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.int32),
+    scales: wp.array2d(dtype=wp.float32),
+    # out
+    posed: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a sphere of an instance."""
+    batch, sphere = wp.tid()
+    posed[batch, sphere] = scales[batch, bodies[sphere]] * rest[sphere]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Similarities x → s R x + t of every body of every instance.
+
+    Args:
+        rotations: mat33 of shape [batch, body], from :func:`rotation_matrices`.
+        translations: Offsets [scene units], vec3 of shape [batch, body].
+        scales: Factors, float32 of shape [batch, body].
+
+    Raises:
+        ValueError: where the shapes differ.
+    """
+
+    rotations: wp.array
+    translations: wp.array
+    scales: wp.array
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check.shape("translations", self.translations.shape, self.rotations.shape)
+        check.shape("scales", self.scales.shape, self.rotations.shape)
+
+    def points(self, rest: wp.array, bodies: wp.array) -> wp.array:
+        """Move points with their bodies.
+
+        Args:
+            rest: Vertices or centers at rest [scene units], vec3 of shape [point].
+            bodies: Body of each point, int32 of shape [point].
+
+        Returns:
+            vec3 of shape [batch, point].
+
+        Differentiable: rest, rotations, translations, scales.
+        """
+        check.shape("bodies", bodies.shape, rest.shape)
+        inputs = [rest, bodies, self.rotations, self.translations, self.scales]
+        return _launch(_pose_points, (self.scales.shape[0], rest.shape[0]), wp.vec3, inputs)
+
+    def radii(self, rest: wp.array, bodies: wp.array) -> wp.array:
+        """Scale radii with their bodies: float32 [sphere] to float32 [batch, sphere]. Differentiable: rest, scales."""
+        check.shape("bodies", bodies.shape, rest.shape)
+        return _launch(_pose_radii, (self.scales.shape[0], rest.shape[0]), wp.float32, [rest, bodies, self.scales])
+
+
+# ---------------------------------------------------------------------------------------------- embedded deformation
+
+
+@wp.kernel
+def _deform_points(
+    # in
+    rest: wp.array(dtype=wp.vec3),
+    nodes: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.float32),
+    node_positions: wp.array(dtype=wp.vec3),
+    matrices: wp.array2d(dtype=wp.mat33),
+    translations: wp.array2d(dtype=wp.vec3),
+    # out
+    deformed: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a point of an instance: the weighted mean of where its nodes would take it."""
+    batch, point = wp.tid()
+    total = wp.vec3()
+    for k in range(nodes.shape[1]):
+        node = nodes[point, k]
+        center = node_positions[node]
+        moved = matrices[batch, node] * (rest[point] - center) + center + translations[batch, node]
+        total += weights[point, k] * moved
+    deformed[batch, point] = total
+
+
+@wp.kernel
+def _move_nodes(
+    # in
+    node_positions: wp.array(dtype=wp.vec3),
+    translations: wp.array2d(dtype=wp.vec3),
+    # out
+    moved: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a node of an instance."""
+    batch, node = wp.tid()
+    moved[batch, node] = node_positions[node] + translations[batch, node]
+
+
+@wp.kernel
+def _sum_rigidity(
+    # in
+    node_positions: wp.array(dtype=wp.vec3),
+    neighbors: wp.array2d(dtype=wp.int32),
+    matrices: wp.array2d(dtype=wp.mat33),
+    translations: wp.array2d(dtype=wp.vec3),
+    # out
+    energy: wp.array(dtype=wp.float32),
+):
+    """A thread owns a node and one of its neighbors: where the node would take it, against where it goes."""
+    batch, node, k = wp.tid()
+    other = neighbors[node, k]
+    edge = node_positions[other] - node_positions[node]
+    gap = matrices[batch, node] * edge - edge + translations[batch, node] - translations[batch, other]
+    wp.atomic_add(energy, batch, wp.dot(gap, gap))
+
+
+@wp.kernel
+def _sum_shear(
+    # in
+    matrices: wp.array2d(dtype=wp.mat33),
+    # out
+    energy: wp.array(dtype=wp.float32),
+):
+    """A thread owns a node: how far its matrix is from a rotation, |MᵀM − I|²."""
+    batch, node = wp.tid()
+    m = matrices[batch, node]
+    gap = wp.transpose(m) * m - wp.identity(n=3, dtype=wp.float32)
+    wp.atomic_add(energy, batch, wp.ddot(gap, gap))
+
+
+@dataclass(frozen=True)
+class DeformationGraph:
+    """Nodes that carry the points around them (Sumner et al. 2007; the paper's nodes are its spheres).
+
+    Args:
+        node_positions: Nodes at rest [scene units], vec3 of shape [node].
+        neighbors: The nodes next to each node, int32 of shape [node, neighbor].
+        rest: Points at rest [scene units], vec3 of shape [point].
+        nodes: The nodes that carry each point, int32 of shape [point, k].
+        weights: Their shares, positive with sum 1, float32 of shape [point, k].
+    """
+
+    node_positions: wp.array
+    neighbors: wp.array
+    rest: wp.array
+    nodes: wp.array
+    weights: wp.array
+
+    @staticmethod
+    def bind(
+        points: np.ndarray, nodes: np.ndarray, *, count: int = 4, device: wp.DeviceLike = "cpu"
+    ) -> "DeformationGraph":
+        """Bind points to their nearest nodes, with the weights (1 − d/d_max)² of Sumner et al., section 3.
+
+        Args:
+            points: Vertices at rest [scene units], shape [point, 3].
+            nodes: Node positions, such as the centers of spheres, shape [node, 3].
+            count: Nodes that carry a point, and neighbors of a node; d_max is the distance of the next one.
+            device: Where the graph lives.
+
+        Raises:
+            ValueError: naming the argument; so when there are too few nodes.
+        """
+        from scipy.spatial import cKDTree
+
+        points, nodes = np.asarray(points, np.float64), np.asarray(nodes, np.float64)
+        for name, values in (("points", points), ("nodes", nodes)):
+            check.shape(name, values.shape, (name[:-1], 3))
+            check.finite(name, values)
+        if not 1 <= count < len(nodes):
+            raise ValueError(f"count: got {count!r} for {len(nodes)} nodes, expected 1 to {len(nodes) - 1}")
+        tree = cKDTree(nodes)
+        distances, nearest = tree.query(points, k=count + 1)
+        reach = np.maximum(distances[:, -1:], 1e-30)
+        weights = (1 - distances[:, :-1] / reach) ** 2 + 1e-9  # a point as far from all of them is carried by all
+        weights /= weights.sum(axis=1, keepdims=True)
+        _, neighbors = tree.query(nodes, k=count + 1)
+        others = np.stack([row[row != node][:count] for node, row in enumerate(neighbors)])
+        return DeformationGraph(
+            wp.array(nodes, dtype=wp.vec3, device=device),
+            wp.array(others.astype(np.int32), device=device),
+            wp.array(points, dtype=wp.vec3, device=device),
+            wp.array(nearest[:, :-1].astype(np.int32), device=device),
+            wp.array(weights.astype(np.float32), device=device),
+        )
+
+    def points(self, matrices: wp.array, translations: wp.array) -> wp.array:
+        """Deform the bound points.
+
+        Args:
+            matrices: Of the nodes, mat33 of shape [batch, node]: rotations, or free matrices with :meth:`shear`.
+            translations: Of the nodes [scene units], vec3 of shape [batch, node].
+
+        Returns:
+            vec3 of shape [batch, point].
+
+        Differentiable: matrices, translations.
+        """
+        self._check(matrices, translations)
+        inputs = [self.rest, self.nodes, self.weights, self.node_positions, matrices, translations]
+        return _launch(_deform_points, (matrices.shape[0], self.rest.shape[0]), wp.vec3, inputs)
+
+    def centers(self, translations: wp.array) -> wp.array:
+        """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
+        check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
+        return _launch(_move_nodes, translations.shape, wp.vec3, [self.node_positions, translations])
+
+    def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
+        """As-rigid-as-possible energy Σ |M_j (g_k − g_j) + g_j + t_j − (g_k + t_k)|² over neighbors (E_reg of Sumner).
+
+        Returns:
+            float32 of shape [batch] [scene units²].
+
+        Differentiable: matrices, translations.
+        """
+        self._check(matrices, translations)
+        inputs = [self.node_positions, self.neighbors, matrices, translations]
+        return _launch(_sum_rigidity, (matrices.shape[0], *self.neighbors.shape), wp.float32, inputs, is_sum=True)
+
+    def shear(self, matrices: wp.array) -> wp.array:
+        """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
+
+        Differentiable: matrices.
+        """
+        check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
+        return _launch(_sum_shear, matrices.shape, wp.float32, [matrices], is_sum=True)
+
+    def _check(self, matrices: wp.array, translations: wp.array) -> None:
+        check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
+        check.shape("translations", translations.shape, matrices.shape)
+
+
+def _launch(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array], is_sum: bool = False):
+    """Launch a kernel whose result has the shape of the launch, or of its batch where threads add to a sum."""
+    device = inputs[0].device
+    make = wp.zeros if is_sum else wp.empty
+    result = make(
+        dim[:1] if is_sum else dim,
+        dtype=dtype,
+        device=device,
+        requires_grad=any(array.requires_grad for array in inputs),
+    )
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=device)
+    return result
