@@ -46,6 +46,15 @@ def torch_device(device: str) -> str:
     return "cpu" if device == "cpu" else device
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
+
+
 @pytest.fixture(scope="module")
 def renderer() -> TorchRenderer:
     """The CPU's, shared, which no test may change."""

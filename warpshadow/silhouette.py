@@ -62,6 +62,20 @@ def _facing(clip_positions: wp.array(dtype=wp.vec4), face: wp.vec3i):
     return wp.sign(volume)
 
 
+@wp.func
+def _depth(face: int, weights: wp.vec3, faces: wp.array(dtype=wp.vec3i), clip_positions: wp.array(dtype=wp.vec4)):
+    """Distance of a pixel's point along the view, infinite for the background."""
+    depth = float(wp.inf)
+    if face >= 0:
+        corners = faces[face]
+        depth = (
+            weights[0] * clip_positions[corners[0]][3]
+            + weights[1] * clip_positions[corners[1]][3]
+            + weights[2] * clip_positions[corners[2]][3]
+        )
+    return depth
+
+
 @wp.kernel(enable_backward=False)
 def _find_crossings(
     # in
@@ -71,43 +85,31 @@ def _find_crossings(
     neighbors: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array2d(dtype=wp.vec4),
     # out
-    crossings: wp.array4d(dtype=wp.vec3i),
+    crossings: wp.array4d(dtype=wp.vec2i),
 ):
     """A thread owns a pixel and its right (axis 0) or lower (axis 1) neighbor: the edge between them, if there is one.
 
-    A crossing is the edge's two vertices, and which of the pixels is the nearer: 0 or 1; −1 for no edge.
+    A crossing is the edge's two vertices, −1 for no edge.
     """
     batch, row, column = wp.tid()
     height = face_ids.shape[1]
     width = face_ids.shape[2]
     here = face_ids[batch, row, column]
     for axis in range(2):
-        crossing = wp.vec3i(0, 0, -1)
+        crossing = wp.vec2i(-1, -1)
         other_row = row + axis
         other_column = column + 1 - axis
         if other_row < height and other_column < width:
             there = face_ids[batch, other_row, other_column]
             if here != there:
-                depth_here = float(wp.inf)
-                depth_there = float(wp.inf)
-                if here >= 0:
-                    weights = barycentrics[batch, row, column]
-                    for k in range(3):
-                        depth_here = wp.where(k == 0, 0.0, depth_here)
-                        depth_here += weights[k] * clip_positions[batch, faces[here][k]][3]
-                if there >= 0:
-                    weights = barycentrics[batch, other_row, other_column]
-                    for k in range(3):
-                        depth_there = wp.where(k == 0, 0.0, depth_there)
-                        depth_there += weights[k] * clip_positions[batch, faces[there][k]][3]
+                depth_here = _depth(here, barycentrics[batch, row, column], faces, clip_positions[batch])
+                depth_there = _depth(there, barycentrics[batch, other_row, other_column], faces, clip_positions[batch])
                 x0 = float(2 * column + 1 - width) / float(width)
                 y0 = float(2 * row + 1 - height) / float(height)
                 x1 = float(2 * other_column + 1 - width) / float(width)
                 y1 = float(2 * other_row + 1 - height) / float(height)
-                nearer = int(0)
                 front = here
                 if depth_there < depth_here:
-                    nearer = 1
                     front = there
                 corners = faces[front]
                 facing = _facing(clip_positions[batch], corners)
@@ -116,21 +118,26 @@ def _find_crossings(
                     is_silhouette = across < 0
                     if across >= 0:
                         is_silhouette = _facing(clip_positions[batch], faces[across]) * facing <= 0.0
-                    if is_silhouette and crossing[2] < 0:
+                    if is_silhouette and crossing[0] < 0:
                         i = corners[(k + 1) % 3]
                         j = corners[(k + 2) % 3]
                         a = clip_positions[batch, i]
                         b = clip_positions[batch, j]
                         if a[3] > 0.0 and b[3] > 0.0:
-                            # the pixels on two sides of the edge, and its ends on two sides of the pixels' line
+                            # steep edges cut rows, flat ones columns, so that no share is counted twice; the pixels
+                            # lie on two sides of the edge, and its ends on two sides of the pixels' line
+                            across_x = wp.abs(b[0] * a[3] - a[0] * b[3]) * float(width)
+                            across_y = wp.abs(b[1] * a[3] - a[1] * b[3]) * float(height)
+                            is_steep = across_y >= across_x
                             start = a[1 - axis] - wp.where(axis == 0, y0, x0) * a[3]
                             end = b[1 - axis] - wp.where(axis == 0, y0, x0) * b[3]
                             if (
-                                _side(a, b, x0, y0) * _side(a, b, x1, y1) < 0.0
+                                is_steep == (axis == 0)
+                                and _side(a, b, x0, y0) * _side(a, b, x1, y1) < 0.0
                                 and wp.min(start, end) <= 0.0
                                 and wp.max(start, end) > 0.0
                             ):
-                                crossing = wp.vec3i(i, j, nearer)
+                                crossing = wp.vec2i(i, j)
         crossings[batch, axis, row, column] = crossing
 
 
@@ -138,7 +145,7 @@ def _find_crossings(
 def _blend_kernel(dtype: type) -> wp.Kernel:
     @wp.func
     def share(
-        crossings: wp.array4d(dtype=wp.vec3i),
+        crossings: wp.array4d(dtype=wp.vec2i),
         clip_positions: wp.array2d(dtype=wp.vec4),
         batch: int,
         axis: int,
@@ -151,7 +158,7 @@ def _blend_kernel(dtype: type) -> wp.Kernel:
         """What a pixel takes of its neighbor's color; place says whether it is the first or the second of the pair."""
         taken = float(0.0)
         crossing = crossings[batch, axis, row, column]
-        if crossing[2] >= 0:
+        if crossing[0] >= 0:
             a = clip_positions[batch, crossing[0]]
             b = clip_positions[batch, crossing[1]]
             x = float(2 * column + 1 - width) / float(width)
@@ -161,7 +168,8 @@ def _blend_kernel(dtype: type) -> wp.Kernel:
             t = first / (first - second)  # from the first pixel's center
             if place == 0:
                 t = 1.0 - t
-            # t is now from the neighbor's center: where the pair's edge lies beyond the middle, its color reaches here
+            # t is now from the neighbor's center: where the edge lies beyond the middle, its color reaches here, be
+            # the neighbor in front (its face juts out) or behind (this pixel's face ends short)
             taken = wp.max(t - 0.5, 0.0)
         return taken
 
@@ -169,7 +177,7 @@ def _blend_kernel(dtype: type) -> wp.Kernel:
     def blend(
         # in
         image: wp.array3d(dtype=dtype),
-        crossings: wp.array4d(dtype=wp.vec3i),
+        crossings: wp.array4d(dtype=wp.vec2i),
         clip_positions: wp.array2d(dtype=wp.vec4),
         # out
         smoothed: wp.array3d(dtype=dtype),
@@ -222,7 +230,7 @@ def smooth_silhouettes(
     check.shape("neighbors", neighbors.shape, faces.shape)
     batch_count, height, width = image.shape
     device = image.device
-    crossings = wp.empty((batch_count, 2, height, width), dtype=wp.vec3i, device=device)
+    crossings = wp.empty((batch_count, 2, height, width), dtype=wp.vec2i, device=device)
     wp.launch(
         _find_crossings,
         dim=image.shape,
