@@ -151,7 +151,7 @@ def test_a_missing_scene_is_one_line_and_status_1(tmp_path):
 
 
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warpshadow.scene.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("warpshadow.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
     missing = tmp_path / "nowhere" / "out.exr"
     fails("render", scene, "-o", tmp_path / "out.png", parts=("out.png", "got extension '.png'", "expected .exr"))
     fails("render", scene, "-o", missing, parts=("nowhere", "no such folder"))

@@ -11,7 +11,7 @@ import warp as wp
 from warp._src.context import user_modules
 
 import warpshadow
-from warpshadow import raster, shading
+from warpshadow import raster, shading, silhouette
 from warpshadow.visibility import directional, exponential, log_sh
 
 ARCHITECTURES = [75, 90]
@@ -46,7 +46,8 @@ FACTORIES = {
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{
-        f"interpolation {dtype.__name__}": partial(raster._interpolation, dtype)
+        f"{make.__name__} {dtype.__name__}": partial(make, dtype)
+        for make in (raster._interpolation, silhouette._blend_kernel)
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
 }

@@ -11,6 +11,7 @@ from warpshadow.directions import cell_radius, fibonacci
 from warpshadow.mesh import Mesh, icosphere, load_mesh
 from warpshadow.spheres import Spheres, exact_occlusion, fit_spheres, plot_spheres
 from warpshadow.spheres import cover as stage_1
+from warpshadow.spheres import fit as fit_module
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.visibility.cones import BLEND, FADE
@@ -40,6 +41,12 @@ def bumpy() -> Mesh:
     x, y, z = ball.positions.astype(np.float64).T
     grow = 1 + 0.3 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.2 * np.sin(4 * z)
     return Mesh(ball.positions * grow[:, None] * [1.3, 1.0, 0.7], ball.faces)
+
+
+@pytest.fixture
+def short_cover(monkeypatch):
+    """Fewer steps of stage 1 for tests that do not look at its result."""
+    monkeypatch.setattr(fit_module, "COVER_STEPS_FIRST", 5)
 
 
 # ------------------------------------------------------------------------------ float64 twins
@@ -275,7 +282,7 @@ def test_a_ball_is_one_sphere():
     assert fit.report.visibility_error < 0.03
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device):
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, short_cover):
     options = {**QUICK, "steps": 120, "device": device}  # enough for spheres to be relocated
     first, second = (fit_spheres(bumpy(), 10, **options).spheres for _ in range(2))
     np.testing.assert_array_equal(first.centers, second.centers)
@@ -284,7 +291,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device):
     assert not np.array_equal(first.centers, other.centers)
 
 
-def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
+def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
     mesh = bumpy()
     moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
     options = {**QUICK, "steps": 10}  # rounding of the moved positions changes last bits, which descent amplifies
@@ -296,14 +303,13 @@ def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
 
 
 def test_refinement_and_more_spheres_lower_the_error():
-    mesh = box()
-    start = fit_spheres(mesh, 32, **{**QUICK, "refine": False}).report
-    few, some, many = (fit_spheres(mesh, count, **{**QUICK, "steps": 250}).report for count in (8, 32, 96))
-    assert some.visibility_error < 0.6 * start.visibility_error
+    cover = fit_spheres(bumpy(), 16, **{**QUICK, "refine": False}).report
+    few, some, many = (fit_spheres(bumpy(), count, **{**QUICK, "steps": 250}).report for count in (4, 16, 64))
+    assert some.visibility_error < 0.8 * cover.visibility_error
     assert few.visibility_error > some.visibility_error > many.visibility_error
 
 
-def test_a_requested_error_is_met_with_as_few_spheres_as_needed():
+def test_a_requested_error_is_met_with_as_few_spheres_as_needed(short_cover):
     fit = fit_spheres(bumpy(), error=0.06, **{**QUICK, "steps": 150})
     assert fit.report.visibility_error <= 0.06
     assert fit.report.sphere_count == len(fit.spheres) <= 64
@@ -319,12 +325,10 @@ def test_open_and_multi_part_meshes_are_fitted():
     quads = np.stack(corners, axis=-1).reshape(-1, 4)
     sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
     two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
-    for mesh in (bowl, sheet, two):
-        start = fit_spheres(mesh, 24, **{**QUICK, "steps": 1}).report
+    for mesh, ground_limit, surface_limit in ((bowl, 0.03, 0.03), (sheet, 0.15, 0.05), (two, 0.05, 0.05)):
         fit = fit_spheres(mesh, 24, **{**QUICK, "steps": 200})
         assert 0 < len(fit.spheres) <= 24
-        errors, start_errors = (each.ground_error**2 + each.surface_error**2 for each in (fit.report, start))
-        assert errors < max(0.5 * start_errors, 0.05**2)
+        assert fit.report.ground_error < ground_limit and fit.report.surface_error < surface_limit
 
 
 def test_no_spheres_are_an_empty_fit():
@@ -358,7 +362,7 @@ def test_a_mesh_without_surface_is_refused():
 # ------------------------------------------------------------------------------ cache and picture
 
 
-def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch):
+def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch, short_cover):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     options = {**QUICK, "cache": True, "steps": 5}
     made = fit_spheres(bumpy(), 6, **options)

@@ -6,7 +6,8 @@ from warpshadow.image import ImageError, read_image, write_image
 from warpshadow.light import EnvironmentMap, synthetic_sky
 from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane
 from warpshadow.renderer import Renderer, render
-from warpshadow.scene import Body, Scene, SceneError, Visibility, load_scene
+from warpshadow.scene import Body, Scene, Visibility
+from warpshadow.scene_file import SceneError, load_scene
 from warpshadow.spheres import Spheres, fit_spheres
 
 __version__ = "0.1.0"

@@ -68,7 +68,7 @@ def render(
     """Render a scene file to an image with soft shadows."""
     from warpshadow.image import write_image
     from warpshadow.renderer import Renderer
-    from warpshadow.scene import load_scene
+    from warpshadow.scene_file import load_scene
 
     with _clear_errors():
         _check_output(output, ".exr")

@@ -15,6 +15,9 @@ import warp as wp
 from warpshadow import check
 from warpshadow.raster import Fragments
 
+MOST_STEPS = 32
+"""Faces that are walked over between the centers of two pixels before the search for an edge is given up."""
+
 _NOT_MANIFOLD = -2
 
 
@@ -76,6 +79,18 @@ def _depth(face: int, weights: wp.vec3, faces: wp.array(dtype=wp.vec3i), clip_po
     return depth
 
 
+@wp.func
+def _crosses(a: wp.vec4, b: wp.vec4, x0: float, y0: float, x1: float, y1: float):
+    """Whether an edge before the eye runs between two screen points: they on two sides of it, its ends of theirs."""
+    result = False
+    if a[3] > 0.0 and b[3] > 0.0 and _side(a, b, x0, y0) * _side(a, b, x1, y1) < 0.0:
+        # the line through the points is a row or a column
+        start = wp.where(y0 == y1, a[1] - y0 * a[3], a[0] - x0 * a[3])
+        end = wp.where(y0 == y1, b[1] - y0 * b[3], b[0] - x0 * b[3])
+        result = wp.min(start, end) <= 0.0 and wp.max(start, end) > 0.0
+    return result
+
+
 @wp.kernel(enable_backward=False)
 def _find_crossings(
     # in
@@ -87,57 +102,62 @@ def _find_crossings(
     # out
     crossings: wp.array4d(dtype=wp.vec2i),
 ):
-    """A thread owns a pixel and its right (axis 0) or lower (axis 1) neighbor: the edge between them, if there is one.
+    """A thread owns a pixel and its right (axis 0) or lower (axis 1) neighbor: the silhouette edge between them.
 
-    A crossing is the edge's two vertices, −1 for no edge.
+    It walks over the surface from the nearer pixel towards the other, from face to face, until it leaves it. A crossing
+    is the edge's two vertices, −1 for none.
     """
     batch, row, column = wp.tid()
     height = face_ids.shape[1]
     width = face_ids.shape[2]
     here = face_ids[batch, row, column]
+    clip = clip_positions[batch]
     for axis in range(2):
         crossing = wp.vec2i(-1, -1)
         other_row = row + axis
         other_column = column + 1 - axis
+        there = here
         if other_row < height and other_column < width:
             there = face_ids[batch, other_row, other_column]
-            if here != there:
-                depth_here = _depth(here, barycentrics[batch, row, column], faces, clip_positions[batch])
-                depth_there = _depth(there, barycentrics[batch, other_row, other_column], faces, clip_positions[batch])
-                x0 = float(2 * column + 1 - width) / float(width)
-                y0 = float(2 * row + 1 - height) / float(height)
-                x1 = float(2 * other_column + 1 - width) / float(width)
-                y1 = float(2 * other_row + 1 - height) / float(height)
-                front = here
-                if depth_there < depth_here:
-                    front = there
-                corners = faces[front]
-                facing = _facing(clip_positions[batch], corners)
+        if here != there:
+            x0 = float(2 * column + 1 - width) / float(width)
+            y0 = float(2 * row + 1 - height) / float(height)
+            x1 = float(2 * other_column + 1 - width) / float(width)
+            y1 = float(2 * other_row + 1 - height) / float(height)
+            face = here
+            depth = _depth(here, barycentrics[batch, row, column], faces, clip)
+            if _depth(there, barycentrics[batch, other_row, other_column], faces, clip) < depth:
+                face = there
+            came_from = int(-1)
+            step = int(0)
+            while face >= 0 and step < MOST_STEPS:
+                corners = faces[face]
+                facing = _facing(clip, corners)
+                onward = int(-1)
                 for k in range(3):
-                    across = neighbors[front][k]
-                    is_silhouette = across < 0
-                    if across >= 0:
-                        is_silhouette = _facing(clip_positions[batch], faces[across]) * facing <= 0.0
-                    if is_silhouette and crossing[0] < 0:
-                        i = corners[(k + 1) % 3]
-                        j = corners[(k + 2) % 3]
-                        a = clip_positions[batch, i]
-                        b = clip_positions[batch, j]
-                        if a[3] > 0.0 and b[3] > 0.0:
-                            # steep edges cut rows, flat ones columns, so that no share is counted twice; the pixels
-                            # lie on two sides of the edge, and its ends on two sides of the pixels' line
+                    across = neighbors[face][k]
+                    i = corners[(k + 1) % 3]
+                    j = corners[(k + 2) % 3]
+                    if (across < 0 or across != came_from) and _crosses(clip[i], clip[j], x0, y0, x1, y1):
+                        is_silhouette = across < 0
+                        if across >= 0:
+                            is_silhouette = _facing(clip, faces[across]) * facing <= 0.0
+                        if is_silhouette:
+                            # steep edges cut rows, flat ones columns, so that no share is counted twice
+                            a = clip[i]
+                            b = clip[j]
                             across_x = wp.abs(b[0] * a[3] - a[0] * b[3]) * float(width)
                             across_y = wp.abs(b[1] * a[3] - a[1] * b[3]) * float(height)
-                            is_steep = across_y >= across_x
-                            start = a[1 - axis] - wp.where(axis == 0, y0, x0) * a[3]
-                            end = b[1 - axis] - wp.where(axis == 0, y0, x0) * b[3]
-                            if (
-                                is_steep == (axis == 0)
-                                and _side(a, b, x0, y0) * _side(a, b, x1, y1) < 0.0
-                                and wp.min(start, end) <= 0.0
-                                and wp.max(start, end) > 0.0
-                            ):
+                            if (across_y >= across_x) == (axis == 0):
                                 crossing = wp.vec2i(i, j)
+                            onward = -1
+                        elif crossing[0] < 0:
+                            onward = across
+                came_from = face
+                face = onward
+                if crossing[0] >= 0:
+                    face = -1
+                step += 1
         crossings[batch, axis, row, column] = crossing
 
 

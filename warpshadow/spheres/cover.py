@@ -28,6 +28,7 @@ SAMPLES = 32
 
 SURFACE_POINTS = 1024
 RATE = 0.003
+"""First learning rate of the centers of 64 spheres or fewer."""
 
 # ------------------------------------------------------------------------------------------------- start
 
@@ -192,8 +193,9 @@ def descend_cover(
     """Improve a cover by Adam; yields the spheres [sphere, 4] after every step."""
     spheres = spheres.astype(np.float64)
     adam = Adam(len(spheres))
+    first_rate = RATE * min(1.0, np.sqrt(64 / len(spheres)))
     for step in range(steps):
         samples, points = ball_samples(SAMPLES, rng), mesh.sample(SURFACE_POINTS, rng)[0]
         _, gradient = cover_energy(mesh, spheres, samples, points)
-        adam.step(spheres, gradient, RATE * 0.5 * (1 + np.cos(np.pi * step / steps)))
+        adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * step / steps)))
         yield spheres

@@ -225,10 +225,11 @@ class Refinement:
     """Receivers around a body, what they see past it, and how the spheres' view differs."""
 
     DIRECTIONS = 128
-    GROUND = 0.6
     RECEIVERS = 12288
+    GROUND, SHELL = 0.6, 0.15
+    """Shares of the receivers on grounds and around the mesh; the others lie on it."""
     BATCH = 256
-    WIDTHS = (0.1, 0.02)
+    WIDTHS = (0.1, 0.04)
     """Soft edge of the cones [radians], first and last."""
     RATE = 0.003
     """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
@@ -266,7 +267,7 @@ class Refinement:
         """Draw receivers on the surface, on grounds at and below the lowest point, and in a shell around."""
         rng = self.rng
         ground_count = int(self.GROUND * self.RECEIVERS)
-        shell_count = int(0.15 * self.RECEIVERS)
+        shell_count = int(self.SHELL * self.RECEIVERS)
         surface_count = self.RECEIVERS - ground_count - shell_count
         at_vertices = mesh.sample_vertices(surface_count // 2, rng)
         between = mesh.sample(surface_count - surface_count // 2, rng)
