@@ -325,10 +325,15 @@ def test_open_and_multi_part_meshes_are_fitted():
     quads = np.stack(corners, axis=-1).reshape(-1, 4)
     sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
     two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
-    for mesh, ground_limit, surface_limit in ((bowl, 0.03, 0.03), (sheet, 0.15, 0.05), (two, 0.05, 0.05)):
-        fit = fit_spheres(mesh, 24, **{**QUICK, "steps": 200})
+    for mesh, share in (
+        (bowl, 0.15),
+        (sheet, 0.5),
+        (two, 0.15),
+    ):  # small spheres are a poor sheet: they have a thickness
+        none, fit = (fit_spheres(mesh, count, **{**QUICK, "steps": 200}) for count in (0, 24))
         assert 0 < len(fit.spheres) <= 24
-        assert fit.report.ground_error < ground_limit and fit.report.surface_error < surface_limit
+        unshadowed, error = (np.hypot(each.report.ground_error, each.report.surface_error) for each in (none, fit))
+        assert error < share * unshadowed
 
 
 def test_no_spheres_are_an_empty_fit():

@@ -20,7 +20,7 @@ class Blockers(NamedTuple):
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Blockers:
     """Gather the spheres of all bodies, fitting those that are wanted.
 
-    A flat body with every other body on its front side is a ground (or a wall): one sphere that touches it from
+    A flat body with (nearly) everything else on its front side is a ground (or a wall): one sphere that touches it from
     behind stands in for it, since small spheres in a sheet would bulge out of it.
     """
     meshes = [body.world_mesh() for body in scene.bodies]
@@ -68,7 +68,8 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
     heights = (seen_from - middle) @ normal
     size = np.ptp((points - middle) @ axes.T, axis=0)
     is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
-    if not is_flat or heights.min() < -1e-2 * size[0] or heights.mean() <= 0:
+    is_behind = np.mean(heights < -1e-2 * size[0])  # a body may stand a little in the ground
+    if not is_flat or is_behind > 0.1 or heights.mean() <= 0:
         return None
     height = heights.mean()
     a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
