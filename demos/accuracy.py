@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 from scenes import image_error, on_ground, shipped_mesh
 
 import warpshadow as ws
@@ -30,7 +29,7 @@ METHODS = {
 
 
 def main(data: Path | None, sphere_count: int, samples: int) -> None:
-    wp.config.quiet = True
+    ws.quiet()
     warnings.filterwarnings("ignore", module="warpshadow")  # meshes with unreferenced vertices
     meshes, skies = load_meshes(data), load_skies(data)
     pairs = [(meshes[i % len(meshes)], skies[i % len(skies)]) for i in range(max(len(meshes), len(skies)))]

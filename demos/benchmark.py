@@ -33,7 +33,7 @@ from warpshadow.visibility.exponential import exponentiate
 
 
 def main(device: str, runs: int) -> None:
-    wp.config.quiet = True
+    ws.quiet()
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
     points, normals, *_ = renderer.receivers
@@ -122,7 +122,7 @@ def time_compilation(device: str) -> None:
     """Compile what each method of rendering needs in a new process with an empty kernel cache."""
     for method in ("directional", "log-sh", "none"):
         program = (
-            "import time, warp as wp; wp.config.quiet = True; import warpshadow as ws\n"
+            "import time, warpshadow as ws; ws.quiet()\n"
             "scene = ws.Scene((ws.Body(ws.icosphere(), blockers=ws.Spheres([[0, 0, 0]], [1])), "
             "ws.Body(ws.plane(), blockers=0)), "
             "ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 1, 5), (0, 0, 0)), "

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 from scenes import image_error, on_ground, shipped_mesh
 
@@ -28,17 +27,17 @@ METHODS = {
     "log-SH, eigen": ws.Visibility(method="log-sh"),
     "directional": ws.Visibility(method="directional"),
 }
-RAY_TRACED = ws.Visibility(method="ray-traced", samples=512)
+RAY_TRACED = ws.Visibility(method="ray-traced", samples=400)
 LIGHT_ORDER = 5
 
 
 def main(output: Path, iterations: int) -> None:
-    wp.config.quiet = True
+    ws.quiet()
     start = time.perf_counter()
     output.mkdir(parents=True, exist_ok=True)
 
     sky_file = output / "sky.exr"
-    ws.synthetic_sky((0.55, 0.6, 0.45), sun_strength=1.5, sun_radius=6.0).write(sky_file)
+    ws.synthetic_sky((-0.75, 0.6, -0.1), sun_strength=2.0, sun_radius=5.0).write(sky_file)
     sky = ws.EnvironmentMap.read(sky_file)
     ground = ws.Body(ws.plane(6.0, 64), texture=checkers())
     bunny, bear = (on_ground(shipped_mesh(name), sky, ground=ground) for name in ("bunny", "bear"))
@@ -114,7 +113,7 @@ def contact_sheet(rows: list[list[tuple[np.ndarray, str]]], margin: int = 44) ->
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
     for top, row in enumerate(rows):
         truth = row[-1][0]
-        white = np.percentile(truth[truth[..., 3] > 0, :3], 98)
+        white = np.percentile(truth[truth[..., 3] > 0, :3], 99.5)
         for left, (image, caption) in enumerate(row):
             color = np.clip(image[..., :3] / white, 0, 1) + (1 - image[..., 3:])
             picture = Image.fromarray((255 * linear_to_srgb(np.minimum(color, 1)) + 0.5).astype(np.uint8))
@@ -127,6 +126,6 @@ def contact_sheet(rows: list[list[tuple[np.ndarray, str]]], margin: int = 44) ->
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the pictures")
-    parser.add_argument("--iterations", type=int, default=200, help="Adam steps of each recovery")
+    parser.add_argument("--iterations", type=int, default=150, help="Adam steps of each recovery")
     arguments = parser.parse_args()
     main(arguments.output, arguments.iterations)

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+import warpshadow
+
+warpshadow.quiet()
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

@@ -1,5 +1,7 @@
 """warpshadow: differentiable soft shadows on meshes under environment light, in NVIDIA Warp."""
 
+import warp as _wp
+
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.camera import Camera
 from warpshadow.image import ImageError, read_image, write_image
@@ -31,8 +33,15 @@ __all__ = [
     "load_mesh",
     "load_scene",
     "plane",
+    "quiet",
     "read_image",
     "render",
     "synthetic_sky",
     "write_image",
 ]
+
+
+def quiet() -> None:
+    """Keep Warp's messages about devices and modules off the terminal; warnings and errors stay."""
+    _wp.config.log_level = getattr(_wp, "LOG_WARNING", 30)
+    _wp.config.quiet = True  # what releases before log_level read

@@ -11,6 +11,8 @@ import numpy as np
 import typer
 import warp as wp
 
+from warpshadow import quiet
+
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
@@ -24,7 +26,7 @@ Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 @app.callback()
 def main() -> None:
     """Keep Warp's own messages off the terminal."""
-    wp.config.quiet = True
+    quiet()
 
 
 @contextlib.contextmanager
@@ -139,7 +141,13 @@ def spheres(
         wanted = {"count": count} if error is None else {"error": error}
         fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **wanted)
         typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
-        typer.echo(str(fit.report))
+        report = fit.report
+        kept = ", read from the cache" if report.cached else ""
+        typer.echo(f"{report.sphere_count} spheres, fitted in {report.seconds:.1f} s{kept}")
+        typer.echo(f"irradiance error on the ground   {report.ground_error:6.1%}")
+        typer.echo(f"irradiance error on the surface  {report.surface_error:6.1%}")
+        typer.echo(f"surface covered                  {report.coverage:6.1%}")
+        typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")
         if output is not None:
             np.savez(output, centers=fit.spheres.centers, radii=fit.spheres.radii)
         if picture is not None:
