@@ -45,13 +45,16 @@ def main(data: Path | None, sphere_count: int, samples: int) -> None:
 
 
 def load_meshes(data: Path | None) -> list[ws.Mesh]:
-    """Meshes that ship with Warp, shapes with flat and curved sides, and those of the folder."""
+    """Meshes that ship with Warp, shapes with flat and curved sides, and those of the folder.
+
+    Shapes with sharp edges have vertices of their own for each face, as CAD files do, and so flat shading.
+    """
     create = trimesh.creation
     shapes = {
-        "box": create.box((1, 1, 1)).subdivide().subdivide().subdivide(),
+        "box": sharp(create.box((1, 1, 1))),
         "torus": create.torus(1, 0.35),
         "cylinder": create.cylinder(0.4, 2).subdivide().subdivide(),
-        "table": table(),
+        "table": sharp(table()),
     }
     meshes = [shipped_mesh(name) for name in ("bunny", "bear", "rocks")]
     if data is not None:
@@ -64,7 +67,14 @@ def table() -> trimesh.Trimesh:
     box = trimesh.creation.box
     legs = [box((0.12, 1, 0.12)).apply_translation((x, 0.5, z)) for x in (-0.9, 0.9) for z in (-0.5, 0.5)]
     parts = [box((2, 0.1, 1.2)).apply_translation((0, 1, 0)), *legs]
-    return trimesh.util.concatenate(parts).subdivide().subdivide().subdivide()
+    return trimesh.util.concatenate(parts)
+
+
+def sharp(shape: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Subdivide, and give every face its own vertices."""
+    shape = shape.subdivide().subdivide().subdivide()
+    shape.unmerge_vertices()
+    return shape
 
 
 def load_skies(data: Path | None) -> list[tuple[str, ws.EnvironmentMap]]:

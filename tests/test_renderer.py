@@ -1,6 +1,7 @@
 """The pipeline as a whole: images against rays, against formulas, and against each other."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -330,3 +331,16 @@ def test_no_light_is_lost_between_cells_of_different_size(device, count):
     assert (transfer[on_ground].max(axis=0)[upward] > 0).all()
     if count == 128:
         assert np.abs(transfer - own).max() < FLOAT32
+
+
+def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
+    floor = ws.Body(ws.plane(4.0, 1), blockers=0)
+    camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(64, 64))
+    scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
+    with pytest.warns(
+        UserWarning, match=r"body number 1 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""
+    ):
+        ws.render(scene)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ws.render(dataclasses.replace(scene, bodies=(dataclasses.replace(floor, receivers="pixel"),)))

@@ -120,6 +120,14 @@ def test_edges_know_their_neighbors_by_position():
     assert [row[2] for row in across[4:].tolist()] == [-2, -2, -2]  # three faces meet at 7-8
 
 
+def test_vertices_at_one_place_count_as_one_when_asked():
+    mesh = ws.icosphere(1.0, 1)
+    apart = mesh.positions[mesh.faces].reshape(-1, 3)
+    faces = np.arange(len(apart)).reshape(-1, 3)
+    assert (edge_neighbors(faces) == -1).all()
+    np.testing.assert_array_equal(edge_neighbors(faces, apart), edge_neighbors(mesh.faces))
+
+
 def test_a_closed_sphere_has_silhouettes_only_around_it(device):
     mesh = ws.icosphere(1.0, 3)
     alpha = coverage(*setup(mesh.positions, mesh.faces, CAMERA, device), CAMERA).numpy()[0]

@@ -1,6 +1,7 @@
 """The pipeline: from a scene to an image, each stage computed once while what it depends on stands still."""
 
 import functools
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ from warpshadow.raster import Fragments, interpolate, rasterize
 from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
 from warpshadow.visibility import directional, exponential, log_sh
+
+COARSE_FACE = 400
+"""Pixels of an average face beyond which shading at its corners draws a warning."""
 
 
 class Geometry(NamedTuple):
@@ -114,6 +118,7 @@ class Renderer:
         geometry, fragments = self.geometry, self.fragments
         is_traced = self.scene.visibility.method == "ray-traced"
         wants_pixels = np.array([is_traced or body.receivers == "pixel" for body in self.scene.bodies])
+        self._warn_of_coarse_faces(~wants_pixels)
         if not wants_pixels.any():
             return Receivers(geometry.positions, geometry.normals, geometry.faces, fragments)
         keeps_vertices = np.repeat(~wants_pixels, np.diff(geometry.first_vertex))
@@ -138,6 +143,21 @@ class Renderer:
             self._array(faces, wp.vec3i),
             Fragments(self._array(face_ids, wp.int32), self._array(weights, wp.vec3)),
         )
+
+    def _warn_of_coarse_faces(self, keeps_vertices: np.ndarray) -> None:
+        """Say which bodies show faces so large that light at their corners alone misses shadows."""
+        face_ids = self.fragments.face_ids.numpy()[0]
+        shown = np.unique(face_ids[face_ids >= 0])
+        face_counts = np.bincount(self.geometry.body_of_face[shown], minlength=len(keeps_vertices))
+        pixel_counts = np.bincount(self.body_ids[self.body_ids >= 0], minlength=len(keeps_vertices))
+        pixels_per_face = pixel_counts / np.maximum(face_counts, 1) / self.scene.supersampling**2
+        for number in np.flatnonzero(keeps_vertices & (pixels_per_face > COARSE_FACE)):
+            warnings.warn(
+                f"body number {number + 1} ({self.scene.bodies[number].mesh.name!r}): a face covers "
+                f"{pixels_per_face[number]:.0f} pixels on average, and light is evaluated at its corners alone; "
+                'receivers = "pixel" evaluates it at every pixel',
+                stacklevel=2,
+            )
 
     @functools.cached_property
     def blockers(self) -> Blockers:

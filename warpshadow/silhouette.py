@@ -21,17 +21,22 @@ MOST_STEPS = 32
 _NOT_MANIFOLD = -2
 
 
-def edge_neighbors(faces: np.ndarray) -> np.ndarray:
+def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
     """Find the face on the other side of each edge.
 
     Args:
         faces: Indices of positions, shape [face, 3]: edges belong together by position topology, whatever the uvs.
+        positions: Vertices, shape [vertex, 3]; when given, those at the same place count as one, as a mesh needs
+            whose faces have vertices of their own.
 
     Returns:
         Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
         than two faces meet. Both are silhouettes from everywhere.
     """
     check.shape("faces", faces.shape, ("face", 3))
+    if positions is not None:
+        *_, place = np.unique(positions, axis=0, return_inverse=True)
+        faces = place.reshape(-1)[faces]
     count = len(faces)
     ends = np.sort(np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
     _, edge, sharing = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
