@@ -223,7 +223,7 @@ def test_directions_that_are_no_vectors_are_refused(device):
 
 @pytest.mark.parametrize("softness", [0.0, -0.35, 2.0, float("nan")])
 def test_a_softness_without_meaning_is_refused(softness, device):
-    with pytest.raises(ValueError, match="softness: got .* for 16 directions, expected a half-width"):
+    with pytest.raises(ValueError, match="softness: got .* for 16 directions, expected 0.004 to 1.57"):
         transmittance(*twins.random_scene(0), cells.fibonacci(16), device, softness=softness)
 
 

@@ -14,6 +14,10 @@ class HarmonicBasis:
 
     order: int
 
+    def __post_init__(self) -> None:
+        """Validate."""
+        sh.check_order(self.order)
+
     @property
     def size(self) -> int:
         """Number of coefficients."""

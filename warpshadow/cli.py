@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Optional
@@ -27,6 +28,7 @@ Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 def main() -> None:
     """Keep Warp's own messages off the terminal."""
     quiet()
+    warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
 
 
 @contextlib.contextmanager
@@ -118,7 +120,7 @@ def _device(name: str) -> wp.Device:
 @app.command()
 def spheres(
     mesh: Annotated[Path, typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .gltf or .usd.")],
-    count: Annotated[int, typer.Option(help="Number of spheres.", min=1)] = 64,
+    count: Annotated[Optional[int], typer.Option(help="Number of spheres; 64 by default.", min=1)] = None,
     error: Annotated[
         Optional[float],
         typer.Option(help="In place of --count: as many spheres as this relative error takes."),
@@ -138,7 +140,9 @@ def spheres(
         if output is not None:
             _check_output(output, ".npz")
         loaded = load_mesh(mesh)
-        wanted = {"count": count} if error is None else {"error": error}
+        if count is not None and error is not None:
+            raise ValueError("--count, --error: got both, expected one of them")
+        wanted = {"count": count or 64} if error is None else {"error": error}
         fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **wanted)
         typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
         report = fit.report
@@ -161,6 +165,10 @@ def envmap(
     sanitize: Annotated[
         Optional[Literal["zero", "neighbors"]], typer.Option(help="Repair NaN, Inf and negative pixels.")
     ] = None,
+    output: Annotated[
+        Optional[Path],
+        typer.Option("-o", "--output", help="Where to write the map; beside FILE by default."),
+    ] = None,
 ) -> None:
     """Print an environment map's statistics and write its spherical-harmonic reconstruction beside it."""
     from warpshadow import sh
@@ -168,11 +176,13 @@ def envmap(
     from warpshadow.light import EnvironmentMap
 
     with _clear_errors():
+        if output is not None:
+            _check_output(output, ".exr")
         light = EnvironmentMap.read(file, sanitize=sanitize)
         for name, value in light.statistics().items():
             shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
             typer.echo(f"{name.replace('_', ' '):26}{shown}")
-        beside = file.with_name(f"{file.stem}.sh{order}.exr")
+        beside = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
         write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
         typer.echo(f"{beside}: reconstruction from {order**2} coefficients")
 
@@ -206,7 +216,3 @@ def warmup(device: Device = "cpu") -> None:
                 Renderer(scene, device=where).render()
                 bar.update()
         typer.echo(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s")
-
-
-if __name__ == "__main__":
-    app()

@@ -51,6 +51,21 @@ def cell_radius(count: int) -> float:
     return 2 / np.sqrt(count)
 
 
+def edge_width(softness: float, count: int) -> float:
+    """Half-width w = κ·ρ of a shadow's soft edge towards ``count`` cells [rad].
+
+    Raises:
+        ValueError: for a width of π/4 or more, where an edge is no edge, and below 0.002, where float32 loses it.
+    """
+    width = softness * cell_radius(count)
+    if not 2e-3 <= width < np.pi / 4:
+        raise ValueError(
+            f"softness: got {softness!r} for {count} directions, expected {2e-3 / cell_radius(count):.3g} to "
+            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from 0.002 to π/4)"
+        )
+    return width
+
+
 class ChunkCones(NamedTuple):
     """The cone around each chunk: axes [chunk, 3], cosine and sine of the half-angle [chunk].
 

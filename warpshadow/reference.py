@@ -199,11 +199,12 @@ def trace_shading(
     directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
     shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         wp.launch(
             _trace_shading,
             dim=part.stop - part.start,
-            inputs=[mesh.id, points[part], normals[part], ray_offset(mesh), directions, radiance],
+            inputs=[mesh.id, points[part], normals[part], offset, directions, radiance],
             outputs=[shading[part]],
             device=device,
         )
@@ -232,13 +233,14 @@ def trace_transfer(
     towards = wp.array(directions, dtype=wp.vec3, device=points.device)
     functions = (4 / len(directions) * basis.functions(directions)).astype(np.float32)
     transfer = np.empty((points.shape[0], basis.size), np.float32)
+    offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**22 // len(directions), progress):
         visibility = trace_visibility(
             mesh,
             points[part].reshape((1, -1)),
             normals[part].reshape((1, -1)),
             towards,
-            offset=ray_offset(mesh),
+            offset=offset,
         )
         cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
         transfer[part] = (visibility.numpy()[0] * cosine) @ functions

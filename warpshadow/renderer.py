@@ -144,14 +144,14 @@ class Renderer:
             Fragments(self._array(face_ids, wp.int32), self._array(weights, wp.vec3)),
         )
 
-    def _warn_of_coarse_faces(self, keeps_vertices: np.ndarray) -> None:
+    def _warn_of_coarse_faces(self, is_vertex_lit: np.ndarray) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
         face_ids = self.fragments.face_ids.numpy()[0]
         shown = np.unique(face_ids[face_ids >= 0])
-        face_counts = np.bincount(self.geometry.body_of_face[shown], minlength=len(keeps_vertices))
-        pixel_counts = np.bincount(self.body_ids[self.body_ids >= 0], minlength=len(keeps_vertices))
+        face_counts = np.bincount(self.geometry.body_of_face[shown], minlength=len(is_vertex_lit))
+        pixel_counts = np.bincount(self.body_ids[self.body_ids >= 0], minlength=len(is_vertex_lit))
         pixels_per_face = pixel_counts / np.maximum(face_counts, 1) / self.scene.supersampling**2
-        for number in np.flatnonzero(keeps_vertices & (pixels_per_face > COARSE_FACE)):
+        for number in np.flatnonzero(is_vertex_lit & (pixels_per_face > COARSE_FACE)):
             warnings.warn(
                 f"body number {number + 1} ({self.scene.bodies[number].mesh.name!r}): a face covers "
                 f"{pixels_per_face[number]:.0f} pixels on average, and light is evaluated at its corners alone; "
@@ -184,6 +184,9 @@ class Renderer:
 
     def _cell_transfer(self, directions: np.ndarray) -> wp.array:
         points, normals, *_ = self.receivers
+        if not self.blockers.radii.size:
+            seen = wp.full((*points.shape, len(directions)), 1.0, dtype=wp.float32, device=self.device)
+            return shading.directional_transfer(seen, normals, directions)
         softness = self.scene.visibility.softness
         seen = directional.transmittance(points, normals, *self.blockers, directions, softness=softness)
         return shading.directional_transfer(seen, normals, directions)

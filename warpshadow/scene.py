@@ -6,7 +6,7 @@ import numpy as np
 
 from warpshadow import check, sh
 from warpshadow.camera import Camera
-from warpshadow.directions import check_count
+from warpshadow.directions import check_count, edge_width
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import Mesh
 from warpshadow.spheres import Spheres
@@ -27,10 +27,10 @@ class Visibility:
             visibility of the meshes, the reference.
         directions: Number of direction cells of "directional", a multiple of 16.
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
-        order: Number of SH bands of "log-sh", 2 to 8.
+        order: Number of SH bands, 2 to 8: of "log-sh", and of the light that "none" shades with.
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
-        samples: Number of directions of "ray-traced".
+        samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -51,10 +51,13 @@ class Visibility:
         sh.check_order(self.order)
         check.choice("log", self.log, LOGS)
         check.choice("base", self.base, THRESHOLDS)
+        for name in ("directions", "order", "samples"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+                raise ValueError(f"{name}: got {value!r}, expected a whole number")
         if self.samples < 1:
             raise ValueError(f"samples: got {self.samples!r}, expected a positive number of directions")
-        if not (np.isfinite(self.softness) and self.softness > 0):
-            raise ValueError(f"softness: got {self.softness!r}, expected a positive number of cell radii")
+        edge_width(self.softness, self.directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,8 @@ class Body:
         mesh: The mesh.
         albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3].
         texture: Reflectance as an image in place of ``albedo``, linear RGB of shape [height, width, 3]; needs uvs.
-        blockers: Number of spheres to fit to the mesh, or the spheres themselves; 0 casts no shadow.
+        blockers: Number of spheres to fit to the mesh, or the spheres themselves; 0 casts no shadow. A flat body
+            with all else on its front side is a ground, for which any number means one sphere touching it from behind.
         rotation: Axis-angle vector [degrees], shape [3].
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
@@ -93,8 +97,10 @@ class Body:
                 f"albedo: got shape {albedo.shape}, expected [3] or [{self.mesh.vertex_count}, 3] (one for each vertex)"
             )
         check.finite("albedo", albedo)
-        if (albedo < 0).any():
-            raise ValueError(f"albedo: got {albedo.min()}, expected reflectances of 0 or more")
+        if (albedo < 0).any() or (albedo > 1).any():
+            raise ValueError(
+                f"albedo: got values from {albedo.min()} to {albedo.max()}, expected reflectances in [0, 1]"
+            )
         object.__setattr__(self, "albedo", albedo)
         if self.texture is not None:
             if self.mesh.uvs is None:

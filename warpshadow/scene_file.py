@@ -45,6 +45,8 @@ def load_scene(path: str | Path) -> Scene:
         import tomli as tomllib
 
     path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such scene file")
     try:
         with path.open("rb") as file:
             tables = tomllib.load(file)

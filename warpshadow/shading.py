@@ -162,6 +162,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int) -
             inputs=[*variables, *table, transfer.grad, scratch],
             outputs=[None if variable is None else variable.grad for variable in variables],
             device=device,
+            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, transfer])
@@ -267,6 +268,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
             inputs=[seen, normals, towards, 4.0 / count, _as_chunks(transfer.grad, shape)],
             outputs=[_as_chunks(transmittance.grad, shape), normals.grad],
             device=device,
+            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, transfer])

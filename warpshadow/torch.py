@@ -40,7 +40,7 @@ class TorchRenderer(torch.nn.Module):
     ):
         super().__init__()
         self.renderer = Renderer(scene, device=str(device), basis=basis, progress=progress)
-        self.device = torch.device(device)
+        self.device = torch.device(wp.device_to_torch(self.renderer.device))
 
     @functools.cached_property
     def transfer(self) -> torch.Tensor:
@@ -154,7 +154,7 @@ class _WarpFunction(torch.autograd.Function):
 
 def _current_stream(tensor: torch.Tensor) -> wp.ScopedStream:
     """Launch on torch's current stream."""
-    return wp.ScopedStream(wp.stream_from_torch() if tensor.is_cuda else None)
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)) if tensor.is_cuda else None)
 
 
 def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shapes: list[tuple]) -> None:

@@ -23,6 +23,9 @@ BLEND = 0.01
 FADE = 0.25
 """The sphere fades out from D = FADE·r to its center."""
 
+TINY_RADIUS = 1.0e-30
+"""Spheres no larger block nothing: float32 could not divide by them."""
+
 _SINE2 = (1 + BLEND) ** -2  # where the blend begins: sin²θ, cos θ, and d(cos θ)/d(D/r) times the blend's width
 _COSINE = np.sqrt(1 - _SINE2)
 _RISE = BLEND * (1 + BLEND) ** -3 / _COSINE

@@ -16,10 +16,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.directions import CHUNK, cell_radius, check_count, chunk_cones
+from warpshadow.directions import CHUNK, check_count, chunk_cones, edge_width
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.tape import record_adjoint
-from warpshadow.visibility.cones import check_spheres, cone_adjoint, cone_function
+from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, cone_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
@@ -135,7 +135,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         while sphere < centers.shape[1] and brightest > _OPAQUE:
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
-            if radius > 0.0:
+            if radius > TINY_RADIUS:
                 ux, uy, uz, cosine, sine2, weight = cone(
                     Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
                 )
@@ -211,7 +211,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
         for sphere in range(ends[batch, group, chunk]):
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
-            if radius > 0.0:
+            if radius > TINY_RADIUS:
                 dx = Lane(center[0]) - x
                 dy = Lane(center[1]) - y
                 dz = Lane(center[2]) - z
@@ -232,7 +232,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
                         t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
                         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
                         step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                        passing = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-20))
+                        passing = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
                         adj_blocked = -wp.cw_div(row[q], passing)
                         adj_opacity += wp.cw_mul(adj_blocked, step)
                         adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), wp.cw_mul(t, Lane(1.0) - t))
@@ -301,12 +301,7 @@ def transmittance(
     """
     check.shape("directions", directions.shape, ("direction", 3))
     check_count("directions", len(directions))
-    width = softness * cell_radius(len(directions))
-    if not 0 < width < np.pi / 4:
-        raise ValueError(
-            f"softness: got {softness!r} for {len(directions)} directions, expected a half-width "
-            f"softness·2/√directions above 0 and below π/4"
-        )
+    width = edge_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
@@ -345,6 +340,7 @@ def transmittance(
             inputs=[points, centers, radii, *cells, ends, result, result.grad, scratch],
             outputs=[variable.grad for variable in variables],
             device=device,
+            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, result])

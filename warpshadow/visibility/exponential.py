@@ -4,6 +4,7 @@ exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, secti
 """
 
 import functools
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +33,14 @@ THRESHOLDS = {
 12-fold at twice its limit and 48 000-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.6%
 (`linear`) and 3% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
+LEAST_THRESHOLD = 0.01
+"""Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
+
 MOST_SQUARINGS = 20
-"""Limit of p; |f̂| would have to be half a million to reach it."""
+"""Limit of p."""
+
+LOUD = 1.5
+"""A coefficient this many times √4π draws a warning: no visibility from 0 to 1 has one above √4π."""
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
@@ -125,8 +132,12 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
         # out
         powers: wp.array4d(dtype=Lane),
         visibility: wp.array3d(dtype=wp.float32),
+        faults: wp.array(dtype=wp.int32),
     ):
-        """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings."""
+        """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
+
+        Faults count the receivers whose visibility is loud, and those whose is not finite.
+        """
         batch, group = wp.tid()
         row = scratch[batch, group, 0]
         square = scratch[batch, group, 1]
@@ -151,6 +162,16 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
             for i in range(wp.static(order**2)):
                 row[i] = row[i] + wp.cw_mul(is_due, square[i] - row[i])
+        sum_ = Lane(0.0)
+        largest = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            sum_ += row[i]
+            largest = wp.max(largest, wp.abs(row[i]))
+        for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
+            if not wp.isfinite(sum_[lane]):
+                wp.atomic_add(faults, 1, 1)
+            elif largest[lane] > LOUD * _UNIT:
+                wp.atomic_add(faults, 0, 1)
         store_rows(row, group, visibility[batch])
 
     return exponentiate_log_sh
@@ -246,17 +267,19 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         SH visibility, float32 of shape [batch, vertex, order²].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts.
+        ValueError: naming the argument, what it got and what it accepts; so for log-visibility whose exponential is not
+            finite. One that is far above 1, as where hundreds of spheres overlap, draws a warning. (Reading the counts
+            waits for the device. While a CUDA graph is captured that cannot be, and nothing is checked.)
 
     Differentiable: log_sh, for the p that it has.
     """
     check.choice("base", base, THRESHOLDS)
     default, limit = THRESHOLDS[base]
     threshold = default if threshold is None else threshold
-    if not 0 < threshold <= limit:
+    if not LEAST_THRESHOLD <= threshold <= limit:
         raise ValueError(
-            f"threshold: got {threshold!r} for base {base!r}, expected more than 0 and at most {limit}: "
-            "repeated squaring is unstable beyond it"
+            f"threshold: got {threshold!r} for base {base!r}, expected {LEAST_THRESHOLD} to {limit}: beyond it "
+            "repeated squaring is unstable, below it drowns in rounding"
         )
     check.shape("log_sh", log_sh.shape, ("batch", "vertex", "order²"))
     order = int(round(np.sqrt(log_sh.shape[2])))
@@ -273,14 +296,28 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     scratch = wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device)
     visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
+    faults = wp.zeros(2, dtype=wp.int32, device=device)
     wp.launch(
         _exponentiate_kernel(order, base, needs_gradient, lanes),
         dim=(batch_count, groups),
         inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal, scratch],
-        outputs=[powers, visibility],
+        outputs=[powers, visibility, faults],
         device=device,
         record_tape=False,
     )
+    if not device.is_capturing:
+        loud, broken = faults.numpy().tolist()
+        if broken:
+            raise ValueError(
+                f"log_sh: the exponential of {broken} of {batch_count * vertex_count} receivers is not finite; "
+                "expected log-visibility of fewer overlapping spheres (directional transmittance has no such limit)"
+            )
+        if loud:
+            warnings.warn(
+                f"log-SH visibility of {loud} of {batch_count * vertex_count} receivers is far above 1, since many "
+                "spheres overlap; fewer spheres, or directional transmittance, are accurate",
+                stacklevel=2,
+            )
 
     def adjoint() -> None:
         table = product_table(order, str(device))
@@ -290,6 +327,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad, scratch],
             outputs=[log_sh.grad],
             device=device,
+            record_tape=False,
         )
 
     record_adjoint(adjoint, [log_sh, visibility])

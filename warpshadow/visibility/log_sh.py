@@ -12,7 +12,7 @@ from warpshadow import check, sh
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
-from warpshadow.visibility.cones import check_spheres, cone_adjoint, cone_function
+from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, cone_function
 from warpshadow.visibility.zonal_logs import LOGS, band_type, look_up, look_up_slope, zonal_table
 
 HORIZON_FADE = 0.5
@@ -57,19 +57,23 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and sums the log-visibility of all spheres."""
         batch, group = wp.tid()
         x, y, z = load(points[batch], group)
+        nx = Lane(0.0)
+        ny = Lane(0.0)
+        nz = Lane(0.0)
+        if wp.static(has_horizon):
+            nx, ny, nz = load(normals[batch], group)
         row = total[batch, group]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
         for sphere in range(centers.shape[1]):
             radius = radii[batch, sphere]
-            if radius > 0.0:
+            if radius > TINY_RADIUS:
                 center = centers[batch, sphere]
                 dx = Lane(center[0]) - x
                 dy = Lane(center[1]) - y
                 dz = Lane(center[2]) - z
                 ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
                 if wp.static(has_horizon):
-                    nx, ny, nz = load(normals[batch], group)
                     fade, _slope = horizon(wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz), radius)
                     weight = wp.cw_mul(weight, fade)
                 if wp.max(weight) > 0.0:
@@ -118,6 +122,11 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         row = scratch[batch, group]
         load_rows(adj_log_sh[batch], group, row)
         x, y, z = load(points[batch], group)
+        nx = Lane(0.0)
+        ny = Lane(0.0)
+        nz = Lane(0.0)
+        if wp.static(has_horizon):
+            nx, ny, nz = load(normals[batch], group)
         adj_x = Lane(0.0)
         adj_y = Lane(0.0)
         adj_z = Lane(0.0)
@@ -126,20 +135,16 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         adj_nz = Lane(0.0)
         for sphere in range(centers.shape[1]):
             radius = radii[batch, sphere]
-            if radius > 0.0:
+            if radius > TINY_RADIUS:
                 center = centers[batch, sphere]
                 dx = Lane(center[0]) - x
                 dy = Lane(center[1]) - y
                 dz = Lane(center[2]) - z
                 ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
-                nx = Lane(0.0)
-                ny = Lane(0.0)
-                nz = Lane(0.0)
                 height = Lane(0.0)
                 fade = Lane(1.0)
                 fade_slope = Lane(0.0)
                 if wp.static(has_horizon):
-                    nx, ny, nz = load(normals[batch], group)
                     height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
                     fade, fade_slope = horizon(height, radius)
                 faded = wp.cw_mul(weight, fade)
@@ -254,6 +259,7 @@ def accumulate(
             inputs=[*variables, table, log_sh.grad, scratch],
             outputs=[None if variable is None else variable.grad for variable in variables],
             device=device,
+            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, log_sh])
@@ -298,7 +304,7 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
         x, y, z = load(points[batch], group)
         for sphere in range(centers.shape[1]):
             radius = radii[batch, sphere]
-            if radius > 0.0:
+            if radius > TINY_RADIUS:
                 center = centers[batch, sphere]
                 ux, uy, uz, cosine, sine2, weight = cone(
                     Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
