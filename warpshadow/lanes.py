@@ -37,7 +37,7 @@ class LaneFunctions(NamedTuple):
     load: wp.Function
     load_products: wp.Function
     add_vectors: wp.Function
-    total: wp.Function
+    add_to_sphere: wp.Function
     load_rows: wp.Function
     add_rows: wp.Function
     store_rows: wp.Function
@@ -96,6 +96,23 @@ def lane_functions(lanes: int) -> LaneFunctions:
         return sum_
 
     @wp.func
+    def add_to_sphere(
+        dx: Lane,
+        dy: Lane,
+        dz: Lane,
+        radius: Lane,
+        batch: int,
+        sphere: int,
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+    ):
+        """Add a group's share to the gradients of a sphere, those that are wanted."""
+        if adj_centers:
+            wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(dx), total(dy), total(dz)))
+        if adj_radii:
+            wp.atomic_add(adj_radii, batch, sphere, total(radius))
+
+    @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
         """scratch[k] = rows[the group's vertices, k], 0 past the last vertex."""
         for k in range(rows.shape[1]):
@@ -135,4 +152,6 @@ def lane_functions(lanes: int) -> LaneFunctions:
             root[lane] = wp.sqrt(value[lane])
         return root
 
-    return LaneFunctions(load, load_products, add_vectors, total, load_rows, add_rows, store_rows, store_columns, sqrt)
+    return LaneFunctions(
+        load, load_products, add_vectors, add_to_sphere, load_rows, add_rows, store_rows, store_columns, sqrt
+    )

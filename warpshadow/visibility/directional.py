@@ -28,6 +28,31 @@ _OPAQUE = 1.0e-4  # below this transmittance a chunk is not looked at any more
 
 
 @functools.cache
+def _reach_function(lanes: int) -> wp.Function:
+    """Make the kernel function that says whether a cone, widened by w, reaches that of a chunk for any receiver."""
+    Lane = lane_type(lanes)
+
+    @wp.func
+    def reaches(
+        ux: Lane,
+        uy: Lane,
+        uz: Lane,
+        cosine: Lane,
+        sine: Lane,
+        axis: wp.vec3,
+        chunk_edge: wp.vec2,
+        cos_width: float,
+        sin_width: float,
+    ):
+        # u·axis > cos(θ + w + the chunk's half-angle)
+        limit = chunk_edge[0] * (cos_width * cosine - sin_width * sine)
+        limit -= chunk_edge[1] * (sin_width * cosine + cos_width * sine)
+        return wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - limit) > 0.0
+
+    return reaches
+
+
+@functools.cache
 def _edge_function(lanes: int) -> wp.Function:
     """Make the kernel function of a cone's soft edge: cos θ, sin θ, sin²θ, weight, w → lo, hi, 1/(hi−lo), A."""
     Lane = lane_type(lanes)
@@ -96,7 +121,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load, store_columns, sqrt = fn.load, fn.store_columns, fn.sqrt
-    cone, edge = cone_function(lanes), _edge_function(lanes)
+    cone, edge, reaches = cone_function(lanes), _edge_function(lanes), _reach_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
@@ -124,12 +149,10 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
             row[q] = Lane(1.0)
         x, y, z = load(points[batch], group)
         axis = chunk_axes[chunk]
-        edge_cosine = chunk_edges[chunk][0]
-        edge_sine = chunk_edges[chunk][1]
         brightest = float(1.0)
         if wp.static(has_horizon):
             nx, ny, nz = load(normals[batch], group)
-            if wp.max(axis[0] * nx + axis[1] * ny + axis[2] * nz) < -edge_sine:
+            if wp.max(axis[0] * nx + axis[1] * ny + axis[2] * nz) < -chunk_edges[chunk][1]:
                 brightest = 0.0  # wholly below the horizon: the cosine is zero there
         sphere = int(0)
         while sphere < centers.shape[1] and brightest > _OPAQUE:
@@ -140,10 +163,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                     Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
                 )
                 sine = sqrt(sine2)
-                # does the cone, widened, reach the chunk's?
-                reach = edge_cosine * (cos_width * cosine - sin_width * sine)
-                reach -= edge_sine * (sin_width * cosine + cos_width * sine)
-                if wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - reach) > 0.0:
+                if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
                     low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
                     most = Lane(0.0)
                     for q in range(begin, begin + CHUNK):
@@ -166,9 +186,10 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
 def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    load, load_products, sqrt, add_vectors, total = fn.load, fn.load_products, fn.sqrt, fn.add_vectors, fn.total
+    load, load_products, sqrt = fn.load, fn.load_products, fn.sqrt
+    add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_ = cone_function(lanes), cone_adjoint(lanes)
-    edge, edge_adjoint = _edge_function(lanes), _edge_adjoint(lanes)
+    edge, edge_adjoint, reaches = _edge_function(lanes), _edge_adjoint(lanes), _reach_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit_adjoint(
@@ -206,8 +227,6 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
         adj_y = Lane(0.0)
         adj_z = Lane(0.0)
         axis = chunk_axes[chunk]
-        edge_cosine = chunk_edges[chunk][0]
-        edge_sine = chunk_edges[chunk][1]
         for sphere in range(ends[batch, group, chunk]):
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
@@ -217,9 +236,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
                 dz = Lane(center[2]) - z
                 ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
                 sine = sqrt(sine2)
-                reach = edge_cosine * (cos_width * cosine - sin_width * sine)
-                reach -= edge_sine * (sin_width * cosine + cos_width * sine)
-                if wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - reach) > 0.0:
+                if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
                     low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
                     sum_ = Lane(0.0)
                     sum_t = Lane(0.0)
@@ -261,10 +278,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
                     adj_x -= adj_dx
                     adj_y -= adj_dy
                     adj_z -= adj_dz
-                    if adj_centers:
-                        wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(adj_dx), total(adj_dy), total(adj_dz)))
-                    if adj_radii:
-                        wp.atomic_add(adj_radii, batch, sphere, total(adj_radius))
+                    add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
 

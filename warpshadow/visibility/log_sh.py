@@ -91,7 +91,7 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
 def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
     fn = lane_functions(lanes)
-    load, load_rows, add_vectors, total = fn.load, fn.load_rows, fn.add_vectors, fn.total
+    load, load_rows, add_vectors, add_to_sphere = fn.load, fn.load_rows, fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_, horizon = cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
     look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
@@ -185,10 +185,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
                     adj_x -= adj_dx
                     adj_y -= adj_dy
                     adj_z -= adj_dz
-                    if adj_centers:
-                        wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(adj_dx), total(adj_dy), total(adj_dz)))
-                    if adj_radii:
-                        wp.atomic_add(adj_radii, batch, sphere, total(adj_radius))
+                    add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
         if adj_normals:
