@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 import warpshadow as ws
 from warpshadow import sh
-from warpshadow.cli import app, auto_exposure
+from warpshadow.cli import app
+from warpshadow.image import auto_exposure
 
 # Half a step of 8-bit sRGB where it is steepest.
 EIGHT_BITS = 0.006

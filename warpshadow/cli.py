@@ -70,7 +70,7 @@ def render(
     device: Device = "cpu",
 ) -> None:
     """Render a scene file to an image with soft shadows."""
-    from warpshadow.image import write_image
+    from warpshadow.image import auto_exposure, exposed, write_image
     from warpshadow.renderer import Renderer
     from warpshadow.scene_file import load_scene
 
@@ -91,21 +91,8 @@ def render(
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
         if png is not None:
             stops = auto_exposure(image) if exposure is None else exposure
-            write_image(png, _exposed(image, stops))
+            write_image(png, exposed(image, stops))
             typer.echo(f"{png}: exposure {stops:+.2f} stops")
-
-
-def auto_exposure(image: np.ndarray) -> float:
-    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
-    covered = image[image[..., 3] > 0]
-    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
-    return float(-np.log2(bright)) if bright > 0 else 0.0
-
-
-def _exposed(image: np.ndarray, stops: float) -> np.ndarray:
-    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
-    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
-    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
 
 
 def _device(name: str) -> wp.Device:

@@ -250,6 +250,19 @@ def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int
 # ----------------------------------------------------------------------------------------------- PNG and JPEG
 
 
+def auto_exposure(image: np.ndarray) -> float:
+    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
+    covered = image[image[..., 3] > 0]
+    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
+    return float(-np.log2(bright)) if bright > 0 else 0.0
+
+
+def exposed(image: np.ndarray, stops: float) -> np.ndarray:
+    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
+    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
+    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
+
+
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Decode sRGB values in [0, 1] (IEC 61966-2-1), in the precision of the argument."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

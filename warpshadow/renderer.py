@@ -2,7 +2,7 @@
 
 import functools
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -290,13 +290,21 @@ class Renderer:
         color = interpolate(receivers.fragments, receivers.faces, lit).numpy()[0] * self.albedo.numpy()[0]
         coverage = (self.body_ids >= 0).astype(np.float32)
         samples = np.concatenate([color, coverage[..., None]], axis=-1)
-        factor = self.scene.supersampling
-        height, width, _ = samples.shape
-        blocks = samples.reshape(height // factor, factor, width // factor, factor, 4)
-        return blocks.mean(axis=(1, 3)) if factor > 1 else samples
+        return average_samples(samples, self.scene.supersampling)
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
+
+
+def average_samples(samples: Any, factor: int) -> Any:
+    """Average the samples of each pixel: [height·factor, width·factor, channel] to [height, width, channel].
+
+    Args:
+        samples: A NumPy array or a torch tensor.
+        factor: Samples of a pixel across and down.
+    """
+    height, width, channels = samples.shape
+    return samples.reshape(height // factor, factor, width // factor, factor, channels).mean(axis=(1, 3))
 
 
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:

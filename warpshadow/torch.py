@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.basis import Basis
 from warpshadow.raster import interpolate
-from warpshadow.renderer import Renderer
+from warpshadow.renderer import Renderer, average_samples
 from warpshadow.scene import Scene
 from warpshadow.shading import sample_texture
 
@@ -76,9 +76,7 @@ class TorchRenderer(torch.nn.Module):
         shaded = apply(lambda values: interpolate(receivers.fragments, receivers.faces, values), shading)
         color = shaded[0] * self._albedo_image(albedo)
         samples = torch.cat([color, self.coverage], dim=-1)
-        factor = self.renderer.scene.supersampling
-        height, width, _ = samples.shape
-        return samples.reshape(height // factor, factor, width // factor, factor, 4).mean(dim=(1, 3))
+        return average_samples(samples, self.renderer.scene.supersampling)
 
     def _shade(self, light: torch.Tensor) -> torch.Tensor:
         _check_tensor("light", light, self.device, [(self.renderer.basis.size, 3)])
