@@ -26,7 +26,8 @@ from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
 from warpshadow.raster import interpolate, rasterize
 from warpshadow.renderer import Renderer
-from warpshadow.shading import directional_transfer, sh_transfer, shade
+from warpshadow.shading import shade
+from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.torch import TorchRenderer
 from warpshadow.visibility import directional, log_sh
 from warpshadow.visibility.exponential import exponentiate
@@ -36,13 +37,13 @@ def main(device: str, runs: int) -> None:
     ws.quiet()
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
-    points, normals, *_ = renderer.receivers
-    centers, radii = renderer.blockers
+    points, normals, *_ = renderer.scene_view.receivers
+    _, centers, radii = renderer.geometry
     cells = CellBasis(fibonacci(128))
     cell_light = wp.array(cells.coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     sh_light = wp.array(HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     clip_matrices = wp.array(scene.camera.clip_matrix()[None], dtype=wp.mat44, device=device)
-    faces, shading = renderer.geometry.faces, renderer.scene_shading
+    faces, shading = renderer.assembly.faces, renderer.scene_shading
 
     def shade_directional() -> None:
         seen = directional.transmittance(points, normals, centers, radii, cells.directions)

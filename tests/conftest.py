@@ -40,7 +40,8 @@ def poisoned_outputs(monkeypatch):
 
     def poisoned(*args, **kwargs):
         array = empty(*args, **kwargs)
-        array.fill_(-1 if array.dtype in (wp.int32, wp.int64, wp.uint8) else float("nan"))
+        is_real = getattr(array.dtype, "_wp_scalar_type_", array.dtype) in (wp.float32, wp.float64)
+        array.fill_(float("nan") if is_real else -1)
         return array
 
     monkeypatch.setattr(wp, "empty", poisoned)

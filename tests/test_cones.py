@@ -8,7 +8,7 @@ import twins
 import warp as wp
 
 from warpshadow.lanes import MODULE_OPTIONS, lane_functions, lane_type
-from warpshadow.visibility.cones import BLEND, FADE, cone_function
+from warpshadow.visibility.cones import BLEND, FADE, TINY_RADIUS, cone_function
 
 # cos θ and sin²θ where they are exact: a few float32 roundings.
 FLOAT32 = 3e-7
@@ -151,6 +151,21 @@ def test_cones_are_finite_and_in_range_at_any_scale(lanes, device):
         lengths = np.linalg.norm(direction, axis=1)
         assert lengths.max() < 1 + FLOAT32
         assert np.abs(lengths[weight > 1e-3] - 1).max() < FLOAT32
+
+
+@pytest.mark.parametrize("lanes", [16, 1])
+def test_cones_are_finite_over_all_distances_and_radii_that_are_accepted(lanes, device):
+    """Where (D/r)² is beyond float32, a sphere has no size, so it needs no direction."""
+    for radius in (1.1 * TINY_RADIUS, 1e-9, 1.0, 1e9, 1e18):
+        distances = np.r_[0, 1e-44, 1e-30, np.geomspace(1e-20, 1.99e18, 77)]
+        direction, cosine, sine2, weight = kernel_cones(along((1, 0, 0), distances), radius, device, lanes)
+        for values in (direction, cosine, sine2, weight):
+            assert np.isfinite(values).all()
+        lengths = np.linalg.norm(direction, axis=1)
+        ratios = distances / radius
+        assert np.abs(lengths[(ratios > 1e-18) & (ratios < 1e19)] - 1).max() < FLOAT32
+        assert lengths.max() < 1 + FLOAT32
+        assert (sine2[ratios > 1e19] < 1e-37).all()
 
 
 def test_the_cone_depends_on_the_ratio_alone_over_twelve_decades(device):

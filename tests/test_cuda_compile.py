@@ -11,7 +11,7 @@ import warp as wp
 from warp._src.context import user_modules
 
 import warpshadow
-from warpshadow import raster, shading, silhouette
+from warpshadow import batch, raster, silhouette, transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
 ARCHITECTURES = [75, 90]
@@ -42,14 +42,20 @@ FACTORIES = {
     "transmit adjoint": partial(directional._transmit_adjoint_kernel, LANES),
     **{
         f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)
-        for make in (shading._sh_transfer_kernel, shading._sh_transfer_adjoint_kernel)
+        for make in (transfer._sh_transfer_kernel, transfer._sh_transfer_adjoint_kernel)
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
-        for make in (raster._interpolation, silhouette._blend_kernel)
+        for make in (
+            raster._interpolation,
+            silhouette._add_kernel,
+            silhouette._blend_kernel,
+            silhouette._blend_adjoint_kernel,
+        )
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
+    **{f"copy {dtype.__name__}": partial(batch._copy_kernel, dtype) for dtype in (wp.float32, wp.vec3)},
 }
 
 

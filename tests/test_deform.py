@@ -75,6 +75,73 @@ def test_no_rotation_is_the_identity_with_a_finite_gradient(device):
     np.testing.assert_allclose(array.grad.numpy()[0, 0], [0, 0, 2], atol=1e-6)
 
 
+@pytest.mark.parametrize("length", [1e-17, 1e-9, 1.0, 1e9, 1e17])
+@pytest.mark.parametrize("kind", ["quaternion", "columns"])
+def test_rotations_and_their_gradients_do_not_depend_on_the_length_of_parameters(kind, length, device):
+    """But that gradients are as much longer as parameters are shorter. Squares of these lengths overflow float32."""
+    dtype, size, twin = TWINS[kind]
+    rng = np.random.default_rng(5)
+    parameters, weights = rng.normal(size=(1, 6, size)), rng.normal(size=(1, 6, 3, 3))
+    array = put(length * parameters, dtype, device)
+    with wp.Tape() as tape:
+        rotations = deform.rotation_matrices(array)
+    np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)
+    rotations.grad.assign(weights.astype(np.float32))
+    tape.backward()
+    expected = differences(lambda p: np.sum(weights * twin(p)), parameters)
+    assert np.linalg.norm(length * array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("angle", [1e-5, 1e-3])
+def test_nearly_parallel_columns_are_a_rotation_with_a_gradient(angle, device):
+    x, across = np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])
+    array = put([[[*x, *(x + angle * across)]]], deform.Vec6, device)
+    with wp.Tape() as tape:
+        rotations = deform.rotation_matrices(array)
+    expected = np.stack([x, across, np.cross(x, across)], axis=-1)
+    # the columns are rounded to 6e-8, which is that much more of the angle between them
+    np.testing.assert_allclose(rotations.numpy()[0, 0], expected, atol=2e-7 / angle)
+    rotations.grad.assign(np.ones((1, 1, 3, 3), np.float32))
+    tape.backward()
+    assert 0.1 / angle < np.linalg.norm(array.grad.numpy()) < 10 / angle
+
+
+@pytest.mark.parametrize("angle", [1e-30, 1e3, 1e6, 1e17])
+def test_axis_angles_of_any_length_are_rotations_with_finite_gradients(angle, device):
+    array = put([[[0.36 * angle, 0.48 * angle, -0.8 * angle]]], wp.vec3, device)
+    with wp.Tape() as tape:
+        rotations = deform.rotation_matrices(array)
+    rotation = rotations.numpy()[0, 0]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=FLOAT32)
+    rotations.grad.assign(np.random.default_rng(0).normal(size=(1, 1, 3, 3)).astype(np.float32))
+    tape.backward()
+    assert np.isfinite(array.grad.numpy()).all() and np.abs(array.grad.numpy()).max() < 100
+
+
+@pytest.mark.parametrize(
+    "values, dtype, message",
+    [
+        (
+            [0, 0, 0, 0],
+            wp.vec4,
+            r"got 1 quaternions shorter than 1e-18 \(first at index \(1, 2\)\), expected rotations",
+        ),
+        ([1e-19, 0, 0, 0], wp.vec4, "got 1 quaternions shorter than 1e-18"),
+        ([0, 0, 0, 0, 1, 0], deform.Vec6, "got 1 columns shorter than 1e-18"),
+        ([0, 1, 0, 0, 0, 0], deform.Vec6, "got 1 columns shorter than 1e-18"),
+        ([1, 2, 3, -2, -4, -6], deform.Vec6, r"got 1 pairs of parallel columns \(first at index \(1, 2\)\)"),
+        ([np.nan, 0, 0, 1], wp.vec4, r"got 1 NaN or Inf values \(first at index \(1, 2, 0\)\)"),
+        ([0, np.inf, 0], wp.vec3, "got 1 NaN or Inf values"),
+        ([0, 1e19, 0], wp.vec3, "got 1 values out of range"),
+    ],
+)
+def test_parameters_of_no_rotation_are_refused(values, dtype, message, device):
+    parameters = np.random.default_rng(6).normal(size=(2, 3, len(values)))
+    parameters[1, 2] = values
+    with pytest.raises(ValueError, match=f"^parameters: {message}"):
+        deform.rotation_matrices(put(parameters, dtype, device))
+
+
 def test_rotations_of_another_type_are_refused(device):
     with pytest.raises(ValueError, match="parameters: got dtype vec2f?, expected vec4, vec3 or deform.Vec6"):
         deform.rotation_matrices(wp.zeros((1, 1), dtype=wp.vec2, device=device))
@@ -82,14 +149,14 @@ def test_rotations_of_another_type_are_refused(device):
 
 def test_bodies_move_as_one_and_their_gradients_are_those_of_the_twin(device, verified_tape):
     rng = np.random.default_rng(1)
-    rest, radii, bodies = rng.normal(size=(9, 3)), rng.random(9), np.arange(9) % 3
+    rest, radii, bodies = rng.normal(size=(1, 9, 3)), rng.random((1, 9)), np.arange(9) % 3
     rotations = Rotation.random(6, random_state=1).as_matrix().reshape(2, 3, 3, 3)
     translations, scales = rng.normal(size=(2, 3, 3)), rng.uniform(0.5, 2, (2, 3))
     weights, radius_weights = rng.normal(size=(2, 9, 3)), rng.normal(size=(2, 9))
 
     def twin(rest, rotations, translations, scales, radii):
         moved = (
-            np.einsum("bpij,pj->bpi", rotations[:, bodies], rest) * scales[:, bodies, None] + translations[:, bodies]
+            np.einsum("bpij,opj->bpi", rotations[:, bodies], rest) * scales[:, bodies, None] + translations[:, bodies]
         )
         return np.sum(weights * moved) + np.sum(radius_weights * scales[:, bodies] * radii)
 
@@ -170,3 +237,33 @@ def test_gradients_of_a_deformation_are_those_of_the_twin(graph, device, verifie
 def test_too_few_nodes_are_refused():
     with pytest.raises(ValueError, match="count: got 4 for 3 nodes, expected 1 to 2"):
         deform.DeformationGraph.bind(np.zeros((5, 3)), np.eye(3))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize("name", ["rest", "rotations", "translations", "scales"])
+def test_poses_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, device):
+    values = {
+        "rest": np.ones((1, 2, 3)),
+        "rotations": np.ones((1, 1, 3, 3)),
+        "translations": np.ones((1, 1, 3)),
+        "scales": np.ones((1, 1)),
+    }
+    values[name].flat[-1] = value
+    dtypes = wp.vec3, wp.mat33, wp.vec3, wp.float32
+    rest, *similarity = (put(v, dtype, device) for v, dtype in zip(values.values(), dtypes, strict=True))
+    members = wp.zeros(2, dtype=wp.int32, device=device)
+    with pytest.raises(ValueError, match=f"^{name}: got 1 (NaN or Inf values|values out of range)"):
+        deform.Poses(*similarity).points(rest, members)
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e10])
+@pytest.mark.parametrize("name", ["matrices", "translations"])
+def test_deformations_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, graph, device):
+    values = {"matrices": np.ones((1, 12, 3, 3)), "translations": np.ones((1, 12, 3))}
+    values[name].flat[5] = value
+    matrices, translations = put(values["matrices"], wp.mat33, device), put(values["translations"], wp.vec3, device)
+    for call in (graph.points, graph.rigidity):
+        with pytest.raises(ValueError, match=f"^{name}: got 1 "):
+            call(matrices, translations)
+    with pytest.raises(ValueError, match=f"^{name}: got 1 "):
+        graph.shear(matrices) if name == "matrices" else graph.centers(translations)

@@ -6,7 +6,8 @@ import twins
 import warp as wp
 
 from warpshadow import directions as cells
-from warpshadow import sh, shading
+from warpshadow import sh
+from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
 # The golden log-SH has no corners rounded off (see test_log_sh.py: up to 0.6% of one cap near cos θ = 0.916), so
@@ -44,7 +45,7 @@ def log_sh_irradiance(golden, log, device, *, has_normals=False, **options):
     """∫ L V max(n·ω, 0) dω, all in SH of order 8 [receiver]."""
     arguments, normals = geometry(golden, device, has_normals=has_normals)
     visibility = exponential.exponentiate(log_sh.accumulate(*arguments, order=8, log=log), **options)
-    transfer = shading.sh_transfer(visibility, normals, order=8).numpy()[0]
+    transfer = sh_transfer(visibility, normals, order=8).numpy()[0]
     return np.pi * transfer @ golden["light_sh"]
 
 
@@ -52,7 +53,7 @@ def directional_irradiance(golden, count, device):
     arguments, normals = geometry(golden, device, has_normals=True)
     directions = cells.fibonacci(count)
     transmittance = directional.transmittance(*arguments, directions)
-    transfer = shading.directional_transfer(transmittance, normals, directions).numpy()[0]
+    transfer = directional_transfer(transmittance, normals, directions).numpy()[0]
     return np.pi * transfer @ (sh.evaluate(8, directions) @ golden["light_sh"])
 
 
@@ -79,14 +80,14 @@ def test_irradiance_of_log_sh_is_the_golden_one(log, name, golden, device):
 def test_irradiance_of_the_product_of_spheres_is_the_golden_one(golden, device):
     (points, _, centers, radii), normals = geometry(golden, device, has_normals=False)
     visibility = log_sh.multiply_spheres(points, centers, radii, order=8)
-    transfer = shading.sh_transfer(visibility, normals, order=8).numpy()[0]
+    transfer = sh_transfer(visibility, normals, order=8).numpy()[0]
     assert relative(np.pi * transfer @ golden["light_sh"], golden["irradiance_product"]) < IRRADIANCE
 
 
 def test_unshadowed_irradiance_is_the_golden_one(golden, device):
     """Of the full light the golden value is, of which order 8 keeps all but 0.1% here."""
     _, normals = geometry(golden, device, has_normals=True)
-    got = np.pi * shading.sh_transfer(None, normals, order=8).numpy()[0] @ golden["light_sh"]
+    got = np.pi * sh_transfer(None, normals, order=8).numpy()[0] @ golden["light_sh"]
     assert relative(got, golden["irradiance_unshadowed"]) < 0.002
 
 

@@ -6,13 +6,17 @@ import twins
 import warp as wp
 
 from warpshadow import directions as cells
-from warpshadow import sh, shading
+from warpshadow import sh
+from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
 # Relative L2 of a whole gradient: float32 kernels against float64 differences. Measured 3e-6 to 2e-4.
 ADJOINT = 1e-3
 # The table of `eigen` rounds the corners where an eigenvalue meets its floor. Measured 1e-3 to 6e-3.
 EIGEN_CORNERS = 2e-2
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:log-SH visibility")
 
 
 def differences(function, arguments, weights, step=1e-6):
@@ -154,7 +158,7 @@ def test_the_adjoint_of_sh_transfer_is_that_of_the_product(order, device):
     visibility = rng.normal(size=(4, order**2))
     weights = rng.normal(size=(4, order**2))
     expected = differences(twin, [visibility, normals], weights)
-    got = tape_gradients(lambda v, n: shading.sh_transfer(v, n, order=order), [visibility, normals], weights, device)
+    got = tape_gradients(lambda v, n: sh_transfer(v, n, order=order), [visibility, normals], weights, device)
     got[1] = got[1] - np.sum(got[1] * normals, axis=1, keepdims=True) * normals  # the tangential part
     for ours, wanted in zip(got, expected, strict=True):
         assert np.linalg.norm(ours - wanted) < ADJOINT * np.linalg.norm(wanted)
@@ -165,7 +169,7 @@ def test_the_adjoint_of_directional_transfer_is_that_of_its_twin(device):
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(5, 3))
     check(
-        lambda t, n: shading.directional_transfer(t, n, directions),
+        lambda t, n: directional_transfer(t, n, directions),
         lambda t, n: t * np.maximum(n @ directions.T, 0) * 4 / len(directions),
         (rng.random((5, 48)), normals),
         device,
@@ -180,7 +184,7 @@ def test_a_tape_played_back_twice_gives_the_same_gradient(scene, device):
         array.requires_grad = True
     with wp.Tape() as tape:
         log = log_sh.accumulate(points, normals, centers, radii, order=4)
-        result = shading.sh_transfer(exponential.exponentiate(log), normals, order=4)
+        result = sh_transfer(exponential.exponentiate(log), normals, order=4)
     gradients = []
     for _ in range(2):
         result.grad.fill_(1.0)

@@ -10,7 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane, vertex_normals
+from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane, unwrap, vertex_normals
 
 TRIANGLE = np.eye(3, dtype=np.float32)
 ROUNDING = 2e-6  # float32 sums of a few faces, then a normalization
@@ -493,6 +493,103 @@ def test_usd_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(ImportError, match="pip install usd-core"):
         load_mesh(usd_quad(tmp_path))
+
+
+# ------------------------------------------------------------------------------------------------- unwrapping
+
+
+def uv_areas(mesh):
+    """Signed areas of the faces in the texture."""
+    a, b, c = np.moveaxis(mesh.uvs.astype(np.float64)[mesh.uv_faces], 1, 0)
+    return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+
+
+def overlap(mesh, size=512):
+    """Most faces that hold one texel's center of a texture, in floating point; near edges none counts."""
+    rows, columns = np.mgrid[:size, :size]
+    points = np.stack([(columns + 0.5) / size, (rows + 0.5) / size], axis=-1)
+    counts = np.zeros((size, size), int)
+    for corners in mesh.uvs.astype(np.float64)[mesh.uv_faces]:
+        low, high = (corners.min(axis=0) * size).astype(int), (corners.max(axis=0) * size).astype(int) + 1
+        box = np.s_[low[1] : high[1], low[0] : high[0]]
+        edges = np.roll(corners, -1, axis=0) - corners
+        to_points = points[box][:, :, None] - corners
+        sides = edges[:, 0] * to_points[..., 1] - edges[:, 1] * to_points[..., 0]
+        counts[box] += (np.sign(sides.sum(axis=-1, keepdims=True)) * sides > 1e-7).all(axis=-1)
+    return counts.max()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_unwrapping_adds_uvs_without_overlap_and_keeps_all_else(scale):
+    mesh = icosphere(subdivisions=2).transformed(scale=scale, translation=np.full(3, 3 * scale))
+    unwrapped = unwrap(mesh, size=256)
+    np.testing.assert_array_equal(unwrapped.positions, mesh.positions)
+    np.testing.assert_array_equal(unwrapped.faces, mesh.faces)
+    assert unwrapped.name == mesh.name
+    assert unwrapped.uvs.min() >= 0 and unwrapped.uvs.max() <= 1
+    areas = np.abs(uv_areas(unwrapped))
+    assert areas.sum() > 0.3  # of the texture
+    assert areas.max() < 4 * areas.min()  # the faces of the sphere differ by 1.3, charts distort by the rest
+    assert overlap(unwrapped) == 1
+
+
+def test_each_corner_keeps_its_vertex_across_seams():
+    """Two faces that share a uv share the vertex; some vertices have several uvs."""
+    unwrapped = unwrap(icosphere(subdivisions=2))
+    vertex_of_uv = np.full(len(unwrapped.uvs), -1)
+    vertex_of_uv[unwrapped.uv_faces] = unwrapped.faces
+    np.testing.assert_array_equal(vertex_of_uv[unwrapped.uv_faces], unwrapped.faces)
+    assert len(unwrapped.uvs) > unwrapped.vertex_count
+
+
+def test_charts_keep_their_distance():
+    unwrapped = unwrap(icosphere(subdivisions=0), size=128, padding=8)
+    unique = np.unique(np.sort(unwrapped.uv_faces, axis=1), axis=0)
+    chart = np.arange(len(unwrapped.uvs))
+    for _ in range(len(chart)):
+        for face in unique:
+            chart[face] = chart[face].min()
+    separate = chart[:, None] != chart
+    distance = np.linalg.norm(unwrapped.uvs[:, None] - unwrapped.uvs, axis=-1)
+    assert separate.any() and distance[separate].min() > 6 / 160  # the packed size is about that asked for
+
+
+def test_degenerate_and_duplicate_faces_are_unwrapped_with_the_others():
+    mesh = icosphere(subdivisions=1)
+    faces = np.concatenate([[[0, 0, 1], [2, 2, 2]], mesh.faces, mesh.faces[:1]])
+    unwrapped = unwrap(Mesh(mesh.positions, faces))
+    np.testing.assert_array_equal(unwrapped.faces, faces)
+    areas = np.abs(uv_areas(unwrapped))
+    assert (areas[:2] == 0).all() and (areas[2:] > 1e-3).all()
+
+
+def test_a_mesh_without_area_lies_on_a_point():
+    unwrapped = unwrap(Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2], [1, 1, 1]]))
+    assert (uv_areas(unwrapped) == 0).all() and np.isfinite(unwrapped.uvs).all()
+
+
+def test_a_sphere_so_fine_that_it_is_flat_everywhere_is_unwrapped():
+    """Left to itself, xatlas takes it for one chart without an edge, and crashes."""
+    unwrapped = unwrap(icosphere(subdivisions=6))
+    assert (np.abs(uv_areas(unwrapped)) > 0).all()
+
+
+def test_uvs_that_a_mesh_had_are_replaced():
+    mesh = plane(segments=1)
+    stacked = Mesh(mesh.positions, mesh.faces, np.zeros((1, 2)), np.zeros_like(mesh.faces))
+    assert np.abs(uv_areas(unwrap(stacked))).sum() > 0.9
+
+
+@pytest.mark.parametrize("options", [{"size": 0}, {"size": 64.0}, {"padding": -1}, {"size": 4, "padding": 4}])
+def test_bad_sizes_of_an_atlas_are_refused(options):
+    with pytest.raises(MeshError, match="size, padding: got"):
+        unwrap(plane(segments=1), **options)
+
+
+def test_unwrapping_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(ImportError, match=r'pip install "warpshadow\[unwrap\]"'):
+        unwrap(plane(segments=1))
 
 
 # ---------------------------------------------------------------------------------------------------- normals

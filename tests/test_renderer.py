@@ -23,6 +23,7 @@ RAY_NOISE = 0.025
 # dome and under a sky with a sun (measured): directional 1.0% and 0.8%, log-SH 1.0% and 2.5%; no shadows 18%.
 IMAGE_ERROR = {"directional": 0.015, "log-sh": 0.035}
 
+NEIGHBORS = [(0, 1), (0, -1), (1, 0), (-1, 0)]
 UNIT_SPHERE = ws.Spheres([[0, 0, 0]], [1.0])
 CAMERA = ws.Camera.look_at((0, 2.5, 5), (0, 0.6, 0), size=(32, 32))
 FROM_ABOVE = ws.Camera.look_at((0, 5, 0), (0, 0, 0), up=(0, 0, -1), fov_y=40, size=(16, 16))
@@ -91,12 +92,13 @@ def test_the_ground_under_a_ball_gets_what_the_form_factor_leaves(device):
     """A ball of radius r at height h above a point, θ off its normal, blocks cos θ r²/h² of a constant dome."""
     grazing = ws.Camera.look_at((3.5, 0.4, 0), (0, 0, 0), fov_y=10, size=(32, 32))
     renderer = Renderer(scene_of("ray-traced", camera=grazing, samples=8192, supersampling=1), device=device)
-    image, points = renderer.render(), renderer.receivers.points.numpy()[0]
-    on_ground = renderer.body_ids.ravel()[renderer.body_ids.ravel() >= 0] == 1
+    shading, points = (array.numpy()[0] for array in (renderer.scene_shading, renderer.scene_view.receivers.points))
+    body_ids = renderer.body_ids()[0]
+    on_ground = body_ids[body_ids >= 0] == 1
     toward = np.array([0, 1, 0]) - points[on_ground]
     distance = np.linalg.norm(toward, axis=1)
     expected = 1 - toward[:, 1] / distance * 0.64 / distance**2
-    shown = image[renderer.body_ids == 1]
+    shown = shading[on_ground]
     assert len(shown) > 300 and expected.min() < 0.4
     facets = 0.006  # the icosphere is smaller than its sphere, by 1% of what it blocks; with noise 0.3% measured
     assert np.abs(shown[:, 0] - expected).max() < facets
@@ -165,7 +167,7 @@ def test_a_scene_turned_with_its_light_and_camera_gives_the_same_image(device, m
     camera = dataclasses.replace(CAMERA, rotation=CAMERA.rotation @ turn.T)
     turned = scene_of(method, *bodies, light=sh.rotation_matrix(4, turn) @ light, camera=camera)
     image, expected = ws.render(turned, device=device), ws.render(scene, device=device)
-    agrees = image[..., 3] == expected[..., 3]  # at silhouettes a sample may flip
+    agrees = np.abs(image - expected)[..., 3] < FLOAT32  # at silhouettes a sample may flip
     assert agrees.mean() > 0.98
     difference = np.linalg.norm((image - expected)[agrees]) / np.linalg.norm(expected[agrees])
     assert difference < (0.01 if method == "directional" else FLOAT32)
@@ -192,8 +194,11 @@ def test_pixel_and_vertex_receivers_mix_in_one_image(device):
         for receivers in ("pixel", "vertex")
     ]
     mixed, by_vertex = (renderer.render() for renderer in renderers)
-    on_ball, on_ground = (renderers[0].body_ids == number for number in (0, 1))
-    np.testing.assert_array_equal(mixed[on_ground], by_vertex[on_ground])
+    body_ids = renderers[0].body_ids()[0]
+    on_ball = body_ids == 0
+    apart = body_ids == 1  # from the ball and the border, where silhouettes are smoothed
+    apart[1:-1, 1:-1] &= np.all([np.roll(body_ids, shift, (0, 1))[1:-1, 1:-1] == 1 for shift in NEIGHBORS], axis=0)
+    np.testing.assert_array_equal(mixed[apart], by_vertex[apart])
     assert (mixed[on_ball] != by_vertex[on_ball]).any()
     assert relative_error(mixed, by_vertex) < 2e-3  # interpolation again, on a ball of 642 vertices
 
@@ -268,11 +273,12 @@ def test_bodies_with_and_without_uvs_keep_their_own_reflectance(device):
     for order in (1, -1):
         renderer = Renderer(scene_of("none", *bodies[::order]), device=device)
         albedo = renderer.albedo.numpy()[0]
+        body_ids = renderer.body_ids()[0]
         for number, color in enumerate([red, (0.1, 0.2, 0.9), gray][::order]):
-            shown = renderer.body_ids == number
+            shown = body_ids == number
             assert shown.sum() > 20
             assert np.abs(albedo[shown] - color).max() < FLOAT32
-        assert not albedo[renderer.body_ids < 0].any()
+        assert not albedo[body_ids < 0].any()
 
 
 def test_albedo_of_vertices_is_interpolated(device):

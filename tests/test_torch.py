@@ -75,7 +75,7 @@ def inputs_of(renderer: TorchRenderer) -> dict[str, torch.Tensor]:
 def image_of(renderer: TorchRenderer, name: str, values: dict[str, torch.Tensor]) -> torch.Tensor:
     """The image as a function of all inputs; ``color`` and ``vertices`` both stand for the ball's albedo."""
     ball = values["color"] if name == "color" else values["vertices"]
-    return renderer(values["light"], [ball, values["texture"]])
+    return renderer(values["light"], albedo=[ball, None], textures=[None, values["texture"]])
 
 
 # ---------------------------------------------------------------------------------------------- images
@@ -104,9 +104,9 @@ def test_free_light_in_the_methods_own_basis_is_the_scenes_light(method):
 def test_albedo_as_tensors_gives_the_same_image_as_in_the_scene(renderer):
     scene = renderer.renderer.scene
     ball, ground = scene.bodies
-    albedo = [torch.from_numpy(ball.albedo), torch.from_numpy(ground.texture)]
+    color, texture = torch.from_numpy(ball.albedo), torch.from_numpy(ground.texture)
     expected = renderer()
-    assert (renderer(albedo=albedo) - expected).abs().max() < FLOAT32
+    assert (renderer(albedo=[color, None], textures=[None, texture]) - expected).abs().max() < FLOAT32
     assert (renderer(albedo=[None, None]) - expected).abs().max() == 0
     of_vertices = torch.from_numpy(np.tile(ball.albedo, (ball.mesh.vertex_count, 1)))
     assert (renderer(albedo=[of_vertices, None]) - expected).abs().max() < FLOAT32 * 3
@@ -182,18 +182,18 @@ def test_forward_and_backward_are_adjoint(device, name):
 
 def test_all_inputs_can_be_free_at_once(renderer):
     values = inputs_of(renderer)
-    renderer(values["light"], [values["vertices"], values["texture"]]).square().sum().backward()
+    image_of(renderer, "vertices", values).square().sum().backward()
     together = {name: values[name].grad for name in ("light", "vertices", "texture")}
     for name, gradient in together.items():
         alone = {key: value.detach() for key, value in values.items()}
         alone[name].requires_grad_()
-        renderer(alone["light"], [alone["vertices"], alone["texture"]]).square().sum().backward()
+        image_of(renderer, "vertices", alone).square().sum().backward()
         torch.testing.assert_close(alone[name].grad, gradient)
 
 
 def test_backward_twice_gives_the_same(renderer):
     values = inputs_of(renderer)
-    loss = renderer(values["light"], [values["vertices"], values["texture"]]).square().sum()
+    loss = image_of(renderer, "vertices", values).square().sum()
     leaves = [values[name] for name in ("light", "vertices", "texture")]
     first = torch.autograd.grad(loss, leaves, retain_graph=True)
     kept = [gradient.clone() for gradient in first]
@@ -208,7 +208,7 @@ def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
     weights = torch.rand(12, 12, 4, generator=torch.Generator().manual_seed(8))
 
     def loss(factor: float) -> torch.Tensor:
-        return (renderer(factor * light, [None, texture]) * weights).sum()
+        return (renderer(factor * light, textures=[None, texture]) * weights).sum()
 
     (alone,) = torch.autograd.grad(loss(1.0), texture)
     first, second = loss(1.0), loss(3.0)
@@ -229,7 +229,7 @@ def test_a_second_derivative_is_refused_instead_of_being_wrong(renderer):
 def test_without_gradients_nothing_is_recorded(renderer):
     light = random(renderer.renderer.basis.size, 3)
     with torch.no_grad():
-        image = renderer(light, [random(3), random(4, 4, 3)])
+        image = renderer(light, albedo=[random(3), None], textures=[None, random(4, 4, 3)])
     assert not image.requires_grad
     assert renderer(light).requires_grad
     assert not renderer(light.detach()).requires_grad
@@ -242,16 +242,16 @@ def test_tensors_need_not_be_contiguous(renderer):
     vertices = random(3, 162).detach().T.requires_grad_()
     assert not (light.is_contiguous() or texture.is_contiguous() or vertices.is_contiguous())
     weights = torch.rand(12, 4, 12).permute(0, 2, 1)  # so the gradient is not either
-    (renderer(light, [vertices, texture]) * weights).sum().backward()
+    (renderer(light, albedo=[vertices, None], textures=[None, texture]) * weights).sum().backward()
     copies = [tensor.detach().contiguous().requires_grad_() for tensor in (light, vertices, texture)]
-    (renderer(copies[0], copies[1:]) * weights).sum().backward()
+    (renderer(copies[0], albedo=[copies[1], None], textures=[None, copies[2]]) * weights).sum().backward()
     for tensor, copy in zip((light, vertices, texture), copies, strict=True):
         torch.testing.assert_close(tensor.grad, copy.grad)
 
 
 def test_texels_that_no_pixel_sees_have_a_zero_gradient(renderer):
     texture = random(400, 400, 3)
-    renderer(albedo=[None, texture]).sum().backward()
+    renderer(textures=[None, texture]).sum().backward()
     assert texture.grad.isfinite().all()
     seen = (texture.grad != 0).any(dim=-1)
     assert 0 < seen.sum() < 4 * 24 * 24 + 1
@@ -263,12 +263,11 @@ def test_texels_that_no_pixel_sees_have_a_zero_gradient(renderer):
 @pytest.mark.parametrize(
     ("light", "message"),
     [
-        (np.ones((32, 3), np.float32), "light: got ndarray, expected a tensor of torch.float32"),
         (torch.ones(32, 3, dtype=torch.float64), "light: got torch.float64"),
         (torch.ones(32, 3, dtype=torch.int32), "light: got torch.int32"),
         (torch.ones(31, 3), r"light: got shape \(31, 3\), expected \[32, 3\]"),
         (torch.ones(32), r"light: got shape \(32,\)"),
-        (torch.ones(1, 32, 3), r"light: got shape \(1, 32, 3\)"),
+        (torch.ones(1, 31, 3), r"light: got shape \(1, 31, 3\), expected \[batch, 32, 3\]"),
         (torch.full((32, 3), float("nan")), "light: got 96 NaN or Inf"),
         (torch.full((32, 3), float("-inf")), "light: got 96 NaN or Inf"),
         (torch.ones(32, 3, device="meta"), "light: got device meta, expected cpu"),
@@ -285,10 +284,8 @@ def test_light_that_does_not_fit_is_refused(renderer, light, message):
         ([None], "albedo: got 1 items, expected 2"),
         ([torch.ones(4), None], r"albedo\[0\]: got shape \(4,\), expected \[3\]"),
         ([torch.ones(161, 3), None], r"albedo\[0\]: got shape \(161, 3\), expected \[162, 3\]"),
-        ([torch.ones(4, 4, 3), None], r"albedo\[0\]: got shape \(4, 4, 3\)"),
-        ([None, torch.ones(4, 4, 4)], r"albedo\[1\]: got shape \(4, 4, 4\), expected \[height, width, 3\]"),
-        ([None, torch.ones(0, 4, 3)], r"albedo\[1\]: got shape \(0, 4, 3\)"),
-        ([None, torch.ones(4, 4, 3).double()], r"albedo\[1\]: got torch.float64"),
+        ([torch.ones(4, 4, 3), None], r"albedo\[0\]: got shape \(4, 4, 3\), expected \[batch, 162, 3\]"),
+        ([torch.ones(0, 3), None], r"albedo\[0\]: got shape \(0, 3\)"),
         ([None, torch.tensor([0.5, float("nan"), 0.5])], r"albedo\[1\]: got 1 NaN"),
         ([None, [0.5, 0.5, 0.5]], r"albedo\[1\]: got list"),
     ],
@@ -296,6 +293,26 @@ def test_light_that_does_not_fit_is_refused(renderer, light, message):
 def test_albedo_that_does_not_fit_is_refused(renderer, albedo, message):
     with pytest.raises(ValueError, match=message):
         renderer(albedo=albedo)
+
+
+@pytest.mark.parametrize(
+    ("textures", "message"),
+    [
+        ([None], "textures: got 1 items, expected 2"),
+        ([None, torch.ones(4, 4, 4)], r"textures\[1\]: got shape \(4, 4, 4\), expected \[height, width, 3\]"),
+        ([None, torch.ones(0, 4, 3)], r"textures\[1\]: got shape \(0, 4, 3\)"),
+        ([None, torch.ones(4, 4, 3).double()], r"textures\[1\]: got torch.float64"),
+        ([torch.ones(4, 4, 3), None], r"textures\[0\]: got an image, but the mesh has no uvs"),
+    ],
+)
+def test_a_texture_that_does_not_fit_is_refused(renderer, textures, message):
+    with pytest.raises(ValueError, match=message):
+        renderer(textures=textures)
+
+
+def test_a_body_has_an_albedo_or_a_texture(renderer):
+    with pytest.raises(ValueError, match=r"albedo\[1\], textures\[1\]: got both"):
+        renderer(albedo=[None, torch.ones(3)], textures=[None, torch.ones(4, 4, 3)])
 
 
 def test_a_huge_finite_tensor_is_not_mistaken_for_infinity(renderer):
@@ -316,7 +333,7 @@ def test_memory_does_not_grow_over_iterations(renderer):
     def iterate(count: int) -> int:
         """Resident memory afterwards [bytes]."""
         for _ in range(count):
-            renderer(values["light"], [values["vertices"], big]).sum().backward()
+            renderer(values["light"], albedo=[values["vertices"], None], textures=[None, big]).sum().backward()
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
     before = iterate(20)
@@ -355,13 +372,13 @@ def test_a_texture_is_recovered_under_known_shadows():
     renderer = TorchRenderer(small_scene(size=24))
     truth = random(4, 4, 3, seed=9).detach()
     with torch.no_grad():
-        wanted = renderer(albedo=[None, truth])
+        wanted = renderer(textures=[None, truth])
     texture = torch.full((4, 4, 3), 0.5, requires_grad=True)
     optimizer = torch.optim.Adam([texture], lr=0.1)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
     for _ in range(200):
         optimizer.zero_grad()
-        torch.nn.functional.mse_loss(renderer(albedo=[None, texture]), wanted).backward()
+        torch.nn.functional.mse_loss(renderer(textures=[None, texture]), wanted).backward()
         optimizer.step()
         schedule.step()
     assert (texture.detach() - truth).abs().max() < 0.02

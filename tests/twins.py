@@ -3,6 +3,8 @@
 Nothing here imports warpshadow. Arrays of receivers and spheres broadcast: [vertex, 1, 3] against [sphere, 3].
 """
 
+import functools
+
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.special import eval_legendre, roots_legendre, sph_harm_y
@@ -35,6 +37,7 @@ def sphere_quadrature(size):
     return directions.reshape(-1, 3), np.repeat(weight * np.pi / size, 2 * size)
 
 
+@functools.cache
 class Product:
     """The SH product truncated to an order, by evaluating both factors."""
 
@@ -65,7 +68,8 @@ def cones(points, centers, radii):
     """Direction, cos θ and fade weight of spheres: exact from 1.01 r on, a cubic to 90° at r, faded inside of r/4."""
     offset = centers - points
     distance = np.linalg.norm(offset, axis=-1)
-    ratio = distance / radii
+    with np.errstate(invalid="ignore", divide="ignore"):  # spheres of radius 0 are infinitely many radii away
+        ratio = np.nan_to_num(distance / radii, nan=np.inf, posinf=np.inf)
     begin = 1.01
     cosine = np.sqrt(1 - begin**-2)
     blend = CubicHermiteSpline([1.0, begin], [0.0, cosine], [0.0, begin**-3 / cosine])
@@ -118,7 +122,8 @@ def log_sh(points, normals, centers, radii, order, log):
     offset = centers - points[:, None]
     directions, cosine, weight = cones(points[:, None], centers, radii)
     if normals is not None:
-        height = np.einsum("vsx,vx->vs", offset, normals) / radii
+        with np.errstate(invalid="ignore", divide="ignore"):
+            height = np.einsum("vsx,vx->vs", offset, normals) / radii
         weight = weight * smoothstep((height + 1) / 0.5)
     zonal = zonal_log(order, cosine, log) * weight[..., None]
     return turned(zonal, directions).sum(axis=1)
@@ -127,8 +132,9 @@ def log_sh(points, normals, centers, radii, order, log):
 # ------------------------------------------------------------------------------------------ exponentiation
 
 
-def optimal_linear(order, norm):
-    """The factors a, b of a·1 + b·f̂ that suit exp(f̂) of one cap's eigen log whose norm is ``norm``."""
+@functools.cache
+def optimal_knots(order):
+    """The norms of caps' eigen logs f̂, and the a and b of a·1 + b·f̂ that suit their exponentials."""
     theta = np.linspace(1e-3, np.pi / 2, 4000)
     logs = zonal_log(order, np.cos(theta), "eigen")
     logs[:, 0] = 0
@@ -139,30 +145,48 @@ def optimal_linear(order, norm):
     a = exponential[:, 0] / UNIT
     b = (exponential * logs).sum(1) / (logs**2).sum(1)
     rising = norms.argmax()
-    return np.interp(norm, norms[:rising], a[:rising]), np.interp(norm, norms[:rising], b[:rising])
+    return norms[:rising], a[:rising], b[:rising]
 
 
-def exponential(f, base, threshold):
-    """exp*(f) of rows [vertex, order²] by DC isolation, scaling and squaring, each row with its own p."""
+def optimal_linear(order, norm):
+    """The factors a, b of a·1 + b·f̂ that suit exp(f̂) of one cap's eigen log whose norm is ``norm``."""
+    norms, a, b = optimal_knots(order)
+    return np.interp(norm, norms, a), np.interp(norm, norms, b)
+
+
+def exponential(f, base, threshold, *, quiet=6.0, loud=24.0):
+    """exp*(f) of rows [vertex, order²] by DC isolation, scaling and squaring, each row with its own p.
+
+    Squarings are held where |f̂|(⟨v²⟩ − ⟨v⟩) is between quiet and loud, and given up beyond; None holds nothing.
+    """
     order = int(np.sqrt(f.shape[1]))
     product = Product(order)
     residual = f.copy()
     residual[:, 0] = 0
     norm = np.linalg.norm(residual, axis=1)
+    depth = np.hypot(norm, np.maximum(f[:, 0], 0))
     with np.errstate(divide="ignore"):
-        powers = np.maximum(np.ceil(np.log2(norm / threshold)), 0).astype(int)
-    h = residual / 2.0 ** powers[:, None]
+        halvings = np.maximum(np.ceil(np.log2(depth / threshold)), 0).astype(int)
+    powers = np.minimum(halvings, 20)
+    scale = 0.5**halvings
+    h = residual * scale[:, None]
     one = np.eye(1, order**2) * UNIT
     if base == "quadratic":
         result = one + h + product(h, h) / 2
     elif base == "linear":
         result = one + h
     else:
-        a, b = optimal_linear(order, norm / 2.0**powers)
+        a, b = optimal_linear(order, norm * scale)
         result = a[:, None] * one + b[:, None] * h
+    result = np.exp(scale[:, None] * f[:, :1] / UNIT) * result
     for step in range(powers.max(initial=0)):
-        result = np.where((step < powers)[:, None], product(result, result), result)
-    return np.exp(f[:, :1] / UNIT) * result
+        square = product(result, result)
+        share = np.ones(len(f))
+        if quiet is not None:
+            loudness = depth * (square[:, 0] - result[:, 0]) / UNIT
+            share = 1 - smoothstep(np.log(np.maximum(loudness / quiet, 1)) / np.log(loud / quiet))
+        result = np.where((step < powers)[:, None], result + share[:, None] * (square - result), result)
+    return result
 
 
 # ------------------------------------------------------------------------------------------ directional
@@ -183,6 +207,75 @@ def transmittance(points, centers, radii, directions, softness=0.35):
     return result
 
 
+# ------------------------------------------------------------------------------------------ shading
+
+
+def cosine_lobes(order, normals):
+    """Coefficients of max(n·ω, 0)/π around unit normals [..., 3], [..., order²]."""
+    node, weight = roots_legendre(2 * order)
+    z = (node + 1) / 2
+    return turned((weight * z) @ zonal_values(order, z), normals)
+
+
+def sh_transfer(visibility, normals):
+    """Transfer vectors of SH visibility [vertex, order²]: its product with the cosine lobe."""
+    order = int(np.sqrt(visibility.shape[1]))
+    return Product(order)(visibility, cosine_lobes(order, normals))
+
+
+def directional_transfer(visibility, normals, directions):
+    """Transfer vectors of transmittance [vertex, direction]."""
+    return visibility * np.maximum(normals @ directions.T, 0) * 4 / len(directions)
+
+
+# ------------------------------------------------------------------------------------------ triangles
+
+
+def barycentrics(clip, x, y):
+    """Perspective-correct weights, not below 0, of a clip-space triangle [3, 4] at device coordinates [...]."""
+    p = clip[:, :2] - np.stack([x, y], axis=-1)[..., None, :] * clip[:, 3:]
+    a, b, c = np.moveaxis(p, -2, 0)
+    volumes = np.stack([u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0] for u, v in ((b, c), (c, a), (a, b))], axis=-1)
+    inside = np.maximum(np.sign(volumes.sum(axis=-1, keepdims=True)) * volumes, 0)
+    total = inside.sum(axis=-1, keepdims=True)
+    return np.where(total > 0, inside / np.where(total > 0, total, 1), 1 / 3)
+
+
+def hard_triangles():
+    """Triangles at the limits, by name: clip positions [3, 4] for an image of 32 × 32 pixels, float64."""
+
+    def on_screen(pixels, depth=0.5, w=1.0):
+        x, y = 2 * np.transpose(pixels) / 32 - 1
+        x, y, z, w = np.broadcast_arrays(x, y, depth, w)
+        return np.stack([x * w, y * w, z * w, w], axis=-1).astype(float)
+
+    large = np.array([[3.1, 4.2], [29.3, 6.1], [11.2, 27.7]])  # no pixel's center is on an edge
+    center = np.array([16.5, 16.5])
+
+    def sliver(height):
+        return on_screen(center + [[-12.0, -height / 3], [12.0, -height / 3], [0.0, 2 * height / 3]])
+
+    through = on_screen(large)
+    through[2] = [0.3, -2.0, 0.5, -0.4]
+    at_eye = on_screen(large)
+    at_eye[2] = [0.4, 1.0, 0.5, 0.0]
+    return {
+        "ordinary": on_screen(large, w=[1.0, 3.0, 8.0]),
+        "through the near plane": through,
+        "with a vertex at the eye": at_eye,
+        "behind the eye": -on_screen(large),
+        "edge-on": on_screen([[2.5, 2.5], [16.5, 16.5], [30.5, 30.5]], w=[1.0, 2.0, 3.0]),
+        "of two equal vertices": on_screen(large[[0, 1, 1]]),
+        "of three equal vertices": on_screen(large[[0, 0, 0]]),
+        "a sliver of 1e-2 pixels": sliver(1e-2),
+        "a sliver of 1e-6 pixels": sliver(1e-6),
+        "of 1e-3 pixels": on_screen(center + 1e-3 * (large - large.mean(axis=0)) / 26),
+        "of 1e6 pixels": on_screen(center + 1e6 * (large - center)),
+        "at a distance of 1e6": on_screen(large, depth=1e-6, w=1e6),
+        "at a distance of 1e15": on_screen(large, depth=1e-15, w=1e15),
+    }
+
+
 # ------------------------------------------------------------------------------------------ scenes
 
 
@@ -195,6 +288,51 @@ def random_scene(seed, *, vertex_count=40, sphere_count=12):
     normals = rng.normal(size=(vertex_count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return tuple(values.astype(np.float32) for values in (points, normals, centers, radii))
+
+
+def hard_scenes():
+    """Scenes at the limits, by name: 12 points and unit normals, 6 centers, 6 radii, float64 and not yet rounded."""
+    points, normals, centers, radii = (a.astype(float) for a in random_scene(0, vertex_count=12, sphere_count=6))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    own = np.arange(12) % 6
+    toward = np.random.default_rng(1).normal(size=(12, 3))
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+
+    def at(distance):
+        """Each receiver so many radii from the center of a sphere of its own."""
+        return centers[own] + distance * radii[own, None] * toward, normals, centers, radii
+
+    return {
+        "ordinary": (points, normals, centers, radii),
+        "at the centers": at(0),
+        "inside": at(0.6),
+        "where spheres fade": at(0.15),
+        "on the surfaces": at(1),
+        "1e-7 outside": at(1 + 1e-7),
+        "θ → 90°": at(1.0 + np.geomspace(1e-5, 2e-2, 12)[:, None]),
+        "θ → 0°": at(np.geomspace(1e2, 1e5, 12)[:, None]),
+        "1e6 radii away": at(1e6),
+        "radii 0": (points, normals, centers, radii * [0, 1, 0, 1, 0, 1]),
+        "radii 1e-12": (points, normals, centers, np.full(6, 1e-12)),
+        "a radius of 1e6": (points, normals, np.r_[[[0, -1e6 - 0.5, 0]], centers[1:]], np.r_[1e6, radii[1:]]),
+        "scaled by 1e-6": (1e-6 * points, normals, 1e-6 * centers, 1e-6 * radii),
+        "scaled by 1e6": (1e6 * points, normals, 1e6 * centers, 1e6 * radii),
+        "offset by 1e4": (points + 1e4, normals, centers + 1e4, radii),
+        "concentric": (points, normals, 0 * centers, radii),
+        "duplicates": (points, normals, 0 * centers, 0 * radii + 0.5),
+        "enclosed": (0.1 * points, normals, 2 * axes, np.full(6, 1.8)),
+        "along the axes": (0.2 * axes[own], axes[own[::-1]], 2 * axes, np.full(6, 0.5)),
+        "zero normals": (points, normals * (own % 2)[:, None], centers, radii),
+    }
+
+
+def stacked_spheres(count):
+    """Twelve receivers at the origin's height that see ``count`` equal spheres in one direction, at 5° to 80°."""
+    angles = np.radians(np.linspace(5, 80, 12))
+    points = np.array([0.6, -0.48, 0.64]) / -np.sin(angles)[:, None]
+    normals = np.random.default_rng(2).normal(size=(12, 3))
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), np.zeros((count, 3)), np.ones(count)
 
 
 def random_rotation(seed):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpshadow import sh
+from warpshadow.directions import fibonacci
 from warpshadow.light import EnvironmentMap
 
 
@@ -63,3 +64,19 @@ class CellBasis:
 
 
 Basis = HarmonicBasis | CellBasis
+
+
+def conversion(basis: Basis, other: Basis) -> np.ndarray | None:
+    """The matrix M [other coefficient, coefficient] that takes light from a basis to another; None for the same.
+
+    Transfer vectors T to the other basis become T M.
+    """
+    if basis is other or basis == other:
+        return None
+    if isinstance(other, CellBasis) and not isinstance(basis, CellBasis):
+        return basis.functions(other.directions).astype(np.float32)
+    # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
+    fine = fibonacci(64 * max(basis.size, other.size))
+    own, cells = other.functions(fine), basis.functions(fine)
+    weights = 1 / own.sum(axis=0)[:, None] if isinstance(other, CellBasis) else 4 * np.pi / len(fine)
+    return (weights * (own.T @ cells)).astype(np.float32)

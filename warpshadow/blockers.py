@@ -1,53 +1,43 @@
 """Blockers: the spheres that stand in for the bodies of a scene."""
 
-from typing import NamedTuple
-
 import numpy as np
 import warp as wp
 
 from warpshadow.mesh import Mesh
-from warpshadow.scene import Body, Scene
+from warpshadow.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 
 
-class Blockers(NamedTuple):
-    """Spheres in world space."""
-
-    centers: wp.array  # [1, sphere] vec3
-    radii: wp.array  # [1, sphere] float32
-
-
-def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Blockers:
-    """Gather the spheres of all bodies, fitting those that are wanted.
+def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
+    """Find the spheres of each body, in its own space, fitting those that are wanted.
 
     A flat body with (nearly) everything else on its front side is a ground (or a wall): one sphere that touches it from
-    behind stands in for it, since small spheres in a sheet would bulge out of it.
+    behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets none.
     """
+    if scene.visibility.method not in SPHERE_METHODS:
+        return [Spheres.concatenate([])] * len(scene.bodies)
     meshes = [body.world_mesh() for body in scene.bodies]
     spheres = []
     for index, body in enumerate(scene.bodies):
         others = [mesh.positions[np.unique(mesh.faces)] for k, mesh in enumerate(meshes) if k != index]
         spheres.append(_body_spheres(body, meshes[index], others, device, progress))
-    centers = np.concatenate([each.centers for each in spheres])
-    radii = np.concatenate([each.radii for each in spheres])
-    return Blockers(
-        wp.array(centers[None], dtype=wp.vec3, device=device),
-        wp.array(radii[None], dtype=wp.float32, device=device),
-    )
+    return spheres
 
 
 def _body_spheres(
     body: Body, world_mesh: Mesh, others: list[np.ndarray], device: wp.DeviceLike, progress: bool
 ) -> Spheres:
-    spheres = body.blockers
-    if isinstance(spheres, int):
-        if spheres == 0:
-            return Spheres(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
-        ground = _ground_sphere(world_mesh, others)
-        if ground is not None:
-            return ground
-        spheres = fit_spheres(body.mesh, spheres, device=device, progress=progress).spheres
-    return spheres.transformed(rotation=body.rotation_matrix(), translation=body.translation, scale=body.scale)
+    if isinstance(body.blockers, Spheres):
+        return body.blockers
+    if body.blockers == 0:
+        return Spheres.concatenate([])
+    ground = _ground_sphere(world_mesh, others)
+    if ground is not None:
+        inverse = body.rotation_matrix().T
+        return ground.transformed(
+            rotation=inverse, translation=-inverse @ body.translation / body.scale, scale=1 / body.scale
+        )
+    return fit_spheres(body.mesh, body.blockers, device=device, progress=progress).spheres
 
 
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:

@@ -20,6 +20,8 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.batch import common_batch
+from warpshadow.tape import launch
 
 # Rotations read from a file are often rounded to six digits.
 _ROTATION_TOLERANCE = 1e-4
@@ -205,6 +207,69 @@ class Camera:
 
 
 @wp.kernel
+def _compose_clip_matrices(
+    # in
+    intrinsics: wp.array(dtype=wp.mat33),
+    rotations: wp.array(dtype=wp.mat33),
+    translations: wp.array(dtype=wp.vec3),
+    to_ndc: wp.mat33,
+    near: float,
+    # out
+    clip_matrices: wp.array(dtype=wp.mat44),
+):
+    """One thread owns one camera: the rows of [K R | K t] in clip space, the depth row apart."""
+    camera = wp.tid()
+    rotation = rotations[wp.min(camera, rotations.shape[0] - 1)]
+    translation = translations[wp.min(camera, translations.shape[0] - 1)]
+    project = to_ndc * intrinsics[wp.min(camera, intrinsics.shape[0] - 1)]
+    r = project * rotation
+    t = project * translation
+    clip_matrices[camera] = wp.mat44(
+        r[0, 0], r[0, 1], r[0, 2], t[0],
+        r[1, 0], r[1, 1], r[1, 2], t[1],
+        0.0, 0.0, 0.0, near,
+        rotation[2, 0], rotation[2, 1], rotation[2, 2], translation[2],
+    )  # fmt: skip
+
+
+def compose_clip_matrices(
+    intrinsics: wp.array, rotations: wp.array, translations: wp.array, *, size: tuple[int, int], near: float = 0.01
+) -> wp.array:
+    """Compose the maps from world to clip space of cameras whose parameters are free.
+
+    Args:
+        intrinsics: K [pixels], last row (0, 0, 1), mat33 of shape [batch].
+        rotations: R, world to camera, mat33 of shape [batch], from :func:`warpshadow.deform.rotation_matrices`.
+        translations: t [scene units], world to camera, vec3 of shape [batch].
+            Any batch may be 1 and then serves every instance.
+        size: Width and height [pixels] of the image that K is for.
+        near: Distance of the near plane [scene units].
+    Returns:
+        As :meth:`Camera.clip_matrix`, mat44 of shape [batch].
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    Differentiable: intrinsics (so focal lengths and principal point), rotations, translations.
+    """
+    width, height = _size(size)
+    variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
+    to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
+    clip_matrices = wp.empty(
+        common_batch(variables),
+        dtype=wp.mat44,
+        device=intrinsics.device,
+        requires_grad=any(array.requires_grad for array in variables.values()),
+    )
+    launch(
+        _compose_clip_matrices,
+        dim=clip_matrices.shape,
+        inputs=[*variables.values(), to_ndc, _positive("near", near)],
+        outputs=[clip_matrices],
+        device=intrinsics.device,
+    )
+    return clip_matrices
+
+
+@wp.kernel
 def _to_clip(
     # in
     positions: wp.array2d(dtype=wp.vec3),
@@ -232,17 +297,14 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
         ValueError: naming the argument, what it got and what it accepts.
     Differentiable: positions, clip_matrices.
     """
-    batch_count = max(positions.shape[0], clip_matrices.shape[0])
-    for name, array in (("positions", positions), ("clip_matrices", clip_matrices)):
-        if array.shape[0] not in (1, batch_count):
-            raise ValueError(f"{name}: got a batch of {array.shape[0]}, expected 1 or {batch_count}")
+    batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
     clip_positions = wp.empty(
         (batch_count, positions.shape[1]),
         dtype=wp.vec4,
         device=positions.device,
         requires_grad=positions.requires_grad or clip_matrices.requires_grad,
     )
-    wp.launch(
+    launch(
         _to_clip,
         dim=clip_positions.shape,
         inputs=[positions, clip_matrices],

@@ -1,11 +1,15 @@
 """Argument checks: one clear error that names the argument, what it got and what it accepts."""
 
-from __future__ import annotations
-
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
+import warp as wp
+
+LARGEST = 1.0e18
+"""The largest coordinate, radius or coefficient that stages accept: its square, summed up, still fits a float32."""
+
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -35,6 +39,93 @@ def finite(name: str, values: np.ndarray) -> None:
         raise ValueError(
             f"{name}: got {int(bad.sum())} NaN or Inf values (first at index {place}), expected finite numbers"
         )
+
+
+@wp.kernel(enable_backward=False)
+def _count_outside(
+    # in
+    values: wp.array(dtype=wp.float32),
+    least: float,
+    most: float,
+    argument: int,
+    # out
+    faults: wp.array(dtype=wp.int32),
+):
+    """A thread owns a number."""
+    value = values[wp.tid()]
+    if not (value >= least and value <= most):  # so NaN, too
+        wp.atomic_add(faults, argument, 1)
+
+
+def finite_array(name: str, array: wp.array) -> None:
+    """Raise ValueError when one array on a device holds NaN or Inf: :func:`finite_arrays`."""
+    finite_arrays({name: array})
+
+
+def finite_arrays(
+    arrays: Mapping[str, wp.array | None], *, most: float = _FLOAT32_MAX, nonnegative: Collection[str] = ()
+) -> None:
+    """Raise ValueError when float32 arrays on a device, of scalars, vectors or matrices, hold NaN or Inf.
+
+    On a GPU, one count for all of them is read back, which waits for the device. While a CUDA graph is captured that
+    cannot be, and nothing is checked.
+
+    Args:
+        arrays: By the names of their arguments; None is passed over.
+        most: Largest magnitude that is accepted.
+        nonnegative: Names of the arrays that must hold nothing below 0.
+    """
+    present = {name: array for name, array in arrays.items() if array is not None and array.size}
+    if not present or any(array.device.is_capturing for array in present.values()):
+        return
+    ranges = {name: (0.0 if name in nonnegative else -most, most) for name in present}
+    is_on_host = all(array.device.is_cpu for array in present.values())
+    find = _outside_on_host if is_on_host else _outside_on_device
+    for name in find(present, ranges):
+        values, least = present[name].numpy(), ranges[name][0]
+        finite(name, values)
+        outside = (values < least) | (values > most)
+        place = tuple(int(i) for i in np.argwhere(outside)[0])
+        raise ValueError(
+            f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
+            f"expected {least:g} to {most:g}"
+        )
+
+
+def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Names of the arrays that hold a number out of their range, by NumPy."""
+    views = {name: array.numpy() for name, array in arrays.items()}
+    return [
+        name
+        for name, (least, most) in ranges.items()
+        if not least <= views[name].min() <= views[name].max() <= most  # NaN is the least and the largest of any
+    ]
+
+
+def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """The same by a kernel, with one readback."""
+    device = next(iter(arrays.values())).device
+    faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
+    for argument, (name, array) in enumerate(arrays.items()):
+        values = _scalars(array)
+        wp.launch(
+            _count_outside,
+            dim=values.shape,
+            inputs=[values, *ranges[name], argument],
+            outputs=[faults],
+            device=device,
+            record_tape=False,
+        )
+    return [name for name, count in zip(arrays, faults.numpy(), strict=True) if count]
+
+
+def _scalars(array: wp.array) -> wp.array:
+    """View an array of vectors or matrices as one of numbers."""
+    array = array.contiguous()
+    count = array.size * wp.types.type_size(array.dtype)
+    values = wp.array(ptr=array.ptr, dtype=wp.float32, shape=count, device=array.device)
+    values._ref = array  # the memory stays while the view does
+    return values
 
 
 def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...]) -> None:

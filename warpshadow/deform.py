@@ -9,8 +9,19 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.batch import common_batch
+from warpshadow.tape import launch
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+SHORTEST = 1.0e-18
+"""Shorter quaternions and columns have no direction: its gradient would be out of float32's range."""
+
+PARALLEL = 1.0e-6
+"""Columns at a smaller angle [radians] are parallel: what is between them is rounding."""
+
+_LARGEST_POSE = 1.0e12  # a product of scale, rotation and position is a float32
+_LARGEST_NODE = 1.0e9  # so is the fourth power of a matrix, in the energies
 
 # ---------------------------------------------------------------------------------------------- rotations
 
@@ -24,7 +35,7 @@ def _rotate_by_quaternions(
 ):
     """A thread owns a rotation."""
     batch, body = wp.tid()
-    q = wp.normalize(quaternions[batch, body])
+    q = wp.vec4(wp.normalize(wp.vec4d(quaternions[batch, body])))  # whose length squared may not be a float32
     x = q[0]
     y = q[1]
     z = q[2]
@@ -53,8 +64,9 @@ def _rotate_by_axis_angles(
     batch, body = wp.tid()
     v = vectors[batch, body]
     t = wp.dot(v, v)
-    a = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
-    b = 0.5 - t / 24.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0)))
+    s = wp.min(t, 0.25)  # the series' adjoints run for all angles, and must not overflow
+    a = 1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0)))
+    b = 0.5 - s / 24.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0 * (1.0 - s / 90.0)))
     if t > 0.25:
         angle = wp.sqrt(t)
         a = wp.sin(angle) / angle
@@ -70,13 +82,13 @@ def _rotate_by_columns(
     # out
     rotations: wp.array2d(dtype=wp.mat33),
 ):
-    """A thread owns a rotation: Gram–Schmidt of its first two columns."""
+    """A thread owns a rotation: Gram–Schmidt of its first two columns, in float64 as they may be nearly parallel."""
     batch, body = wp.tid()
     c = columns[batch, body]
-    x = wp.normalize(wp.vec3(c[0], c[1], c[2]))
-    y = wp.vec3(c[3], c[4], c[5])
+    x = wp.normalize(wp.vec3d(wp.vec3(c[0], c[1], c[2])))
+    y = wp.vec3d(wp.vec3(c[3], c[4], c[5]))
     y = wp.normalize(y - wp.dot(x, y) * x)
-    rotations[batch, body] = wp.matrix_from_cols(x, y, wp.cross(x, y))
+    rotations[batch, body] = wp.matrix_from_cols(wp.vec3(x), wp.vec3(y), wp.vec3(wp.cross(x, y)))
 
 
 _ROTATION_KERNELS = {
@@ -91,7 +103,7 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
 
     Args:
         parameters: Shape [batch, body]; the dtype says what they are:
-            vec4, quaternions (x, y, z, w) of any length but 0;
+            vec4, quaternions (x, y, z, w) of any length from 1e-18 on;
             vec3, axis-angle vectors [radians], smooth at 0;
             :data:`Vec6`, the first two columns, of which Gram–Schmidt makes a rotation (Zhou et al. 2019).
 
@@ -99,12 +111,15 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
         Rotations, mat33 of shape [batch, body].
 
     Raises:
-        ValueError: for another dtype.
+        ValueError: for another dtype, for NaN, Inf and numbers beyond 1e18, and for what is no rotation: quaternions
+            and columns of length 0, and parallel columns. (Reading them waits for a GPU. While a CUDA graph is captured
+            that cannot be, and nothing is checked.)
 
-    Differentiable: parameters. A quaternion of length 0, or parallel columns, are no rotation and have no gradient.
+    Differentiable: parameters.
     """
     if parameters.dtype not in _ROTATION_KERNELS:
         raise ValueError(f"parameters: got dtype {parameters.dtype.__name__}, expected vec4, vec3 or deform.Vec6")
+    _check_rotations(parameters)
     rotations = wp.empty(
         parameters.shape, dtype=wp.mat33, device=parameters.device, requires_grad=parameters.requires_grad
     )
@@ -118,13 +133,38 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
     return rotations
 
 
+def _check_rotations(parameters: wp.array) -> None:
+    """Raise ValueError for parameters that no rotation has."""
+    if parameters.device.is_capturing:
+        return
+    check.finite_arrays({"parameters": parameters}, most=check.LARGEST)
+    if parameters.dtype is wp.vec3:
+        return
+    values = parameters.numpy().astype(np.float64)
+    if parameters.dtype is wp.vec4:
+        _refuse(np.linalg.norm(values, axis=-1) < SHORTEST, f"quaternions shorter than {SHORTEST:g}")
+        return
+    x, y = values[..., :3], values[..., 3:]
+    lengths = np.linalg.norm(x, axis=-1), np.linalg.norm(y, axis=-1)
+    _refuse(np.minimum(*lengths) < SHORTEST, f"columns shorter than {SHORTEST:g}")
+    areas = np.linalg.norm(np.cross(x, y), axis=-1)
+    _refuse(areas < PARALLEL * lengths[0] * lengths[1], "pairs of parallel columns")
+
+
+def _refuse(faults: np.ndarray, what: str) -> None:
+    """Raise ValueError where there are faults [batch, body]."""
+    if faults.any():
+        place = tuple(int(i) for i in np.argwhere(faults)[0])
+        raise ValueError(f"parameters: got {int(faults.sum())} {what} (first at index {place}), expected rotations")
+
+
 # ---------------------------------------------------------------------------------------------- rigid bodies
 
 
 @wp.kernel
 def _pose_points(
     # in
-    rest: wp.array(dtype=wp.vec3),
+    rest: wp.array2d(dtype=wp.vec3),
     bodies: wp.array(dtype=wp.int32),
     rotations: wp.array2d(dtype=wp.mat33),
     translations: wp.array2d(dtype=wp.vec3),
@@ -135,13 +175,15 @@ def _pose_points(
     """A thread owns a point of an instance."""
     batch, point = wp.tid()
     body = bodies[point]
-    posed[batch, point] = scales[batch, body] * (rotations[batch, body] * rest[point]) + translations[batch, body]
+    pose = wp.min(batch, scales.shape[0] - 1)
+    at_rest = rest[wp.min(batch, rest.shape[0] - 1), point]
+    posed[batch, point] = scales[pose, body] * (rotations[pose, body] * at_rest) + translations[pose, body]
 
 
 @wp.kernel
 def _pose_radii(
     # in
-    rest: wp.array(dtype=wp.float32),
+    rest: wp.array2d(dtype=wp.float32),
     bodies: wp.array(dtype=wp.int32),
     scales: wp.array2d(dtype=wp.float32),
     # out
@@ -149,7 +191,8 @@ def _pose_radii(
 ):
     """A thread owns a sphere of an instance."""
     batch, sphere = wp.tid()
-    posed[batch, sphere] = scales[batch, bodies[sphere]] * rest[sphere]
+    scale = scales[wp.min(batch, scales.shape[0] - 1), bodies[sphere]]
+    posed[batch, sphere] = scale * rest[wp.min(batch, rest.shape[0] - 1), sphere]
 
 
 @dataclass(frozen=True)
@@ -178,7 +221,8 @@ class Poses:
         """Move points with their bodies.
 
         Args:
-            rest: Vertices or centers at rest [scene units], vec3 of shape [point].
+            rest: Vertices or centers at rest [scene units], vec3 of shape [batch, point]; rest or poses may have a
+                batch of 1, which then serves every instance of the other.
             bodies: Body of each point, int32 of shape [point].
 
         Returns:
@@ -186,14 +230,19 @@ class Poses:
 
         Differentiable: rest, rotations, translations, scales.
         """
-        check.shape("bodies", bodies.shape, rest.shape)
         inputs = [rest, bodies, self.rotations, self.translations, self.scales]
-        return _launch(_pose_points, (self.scales.shape[0], rest.shape[0]), wp.vec3, inputs)
+        return _launch(_pose_points, self._shape(rest, bodies), wp.vec3, inputs)
 
     def radii(self, rest: wp.array, bodies: wp.array) -> wp.array:
-        """Scale radii with their bodies: float32 [sphere] to float32 [batch, sphere]. Differentiable: rest, scales."""
-        check.shape("bodies", bodies.shape, rest.shape)
-        return _launch(_pose_radii, (self.scales.shape[0], rest.shape[0]), wp.float32, [rest, bodies, self.scales])
+        """Scale radii, float32 of shape [batch, sphere], with their bodies. Differentiable: rest, scales."""
+        return _launch(_pose_radii, self._shape(rest, bodies), wp.float32, [rest, bodies, self.scales])
+
+    def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
+        """Shape of what moves."""
+        check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
+        arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
+        check.finite_arrays(arrays, most=_LARGEST_POSE)
+        return common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]
 
 
 # ---------------------------------------------------------------------------------------------- embedded deformation
@@ -342,6 +391,7 @@ class DeformationGraph:
     def centers(self, translations: wp.array) -> wp.array:
         """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
+        check.finite_arrays({"translations": translations}, most=_LARGEST_NODE)
         return _launch(_move_nodes, translations.shape, wp.vec3, [self.node_positions, translations])
 
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
@@ -362,11 +412,13 @@ class DeformationGraph:
         Differentiable: matrices.
         """
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
+        check.finite_arrays({"matrices": matrices}, most=_LARGEST_NODE)
         return _launch(_sum_shear, matrices.shape, wp.float32, [matrices], is_sum=True)
 
     def _check(self, matrices: wp.array, translations: wp.array) -> None:
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
         check.shape("translations", translations.shape, matrices.shape)
+        check.finite_arrays({"matrices": matrices, "translations": translations}, most=_LARGEST_NODE)
 
 
 def _launch(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array], is_sum: bool = False):
@@ -379,5 +431,5 @@ def _launch(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[w
         device=device,
         requires_grad=any(array.requires_grad for array in inputs),
     )
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=device)
+    launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=device)
     return result

@@ -1,4 +1,4 @@
-"""Triangle meshes: files, primitives and vertex normals.
+"""Triangle meshes: files, primitives, unwrapping and vertex normals.
 
 Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals.
 Vertices keep the order they have in the file. Texture coordinates have their origin at the lower left of the
@@ -19,6 +19,8 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.silhouette import edge_neighbors
+from warpshadow.tape import launch
 
 
 class MeshError(ValueError):
@@ -465,7 +467,98 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
     return Mesh(positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere")
 
 
+# ------------------------------------------------------------------------------------------------- unwrapping
+
+
+def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
+    """Give a mesh uvs of its own: cut it into charts and lay them out side by side, with xatlas.
+
+    Positions and faces stay as they are: a vertex on the edge of a chart has several uvs. Faces without area lie on a
+    point of the texture.
+
+    Args:
+        mesh: The mesh; uvs that it has are replaced.
+        size: Width and height of the texture that the uvs are meant for [texels].
+        padding: Least distance between charts [texels]: half of it is how far a filter may reach beyond its chart.
+
+    Returns:
+        The mesh with uvs from 0 to 1.
+
+    Raises:
+        ImportError: when xatlas, the extra ``unwrap``, is not installed.
+        MeshError: naming the argument, what it got and what it accepts.
+    """
+    try:
+        import xatlas
+    except ImportError:
+        raise ImportError('unwrapping needs the package xatlas: pip install "warpshadow[unwrap]"') from None
+
+    if not (isinstance(size, int) and isinstance(padding, int) and 0 <= padding < size):
+        raise MeshError(f"size, padding: got {size} and {padding}, expected integers with 0 <= padding < size")
+    positions = _to_unit_edges(mesh)
+    pieces = _pieces(positions[mesh.faces], edge_neighbors(mesh.faces, mesh.positions))
+    atlas = xatlas.Atlas()
+    for piece in pieces:
+        atlas.add_mesh(positions, mesh.faces[piece].astype(np.uint32))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding = size, padding
+    atlas.generate(pack_options=options)
+    if not atlas.atlas_count:  # no face has an area
+        return replace(mesh, uvs=np.zeros((1, 2), np.float32), uv_faces=np.zeros_like(mesh.faces))
+    uvs: list[np.ndarray] = []
+    uv_faces = np.empty_like(mesh.faces)
+    for number, piece in enumerate(pieces):
+        _, uv_faces_of_piece, uvs_of_piece = atlas[number]
+        uv_faces[piece] = uv_faces_of_piece + sum(map(len, uvs))
+        uvs.append(uvs_of_piece)
+    return replace(mesh, uvs=np.concatenate(uvs), uv_faces=uv_faces)
+
+
+def _to_unit_edges(mesh: Mesh) -> np.ndarray:
+    """Vertices of the mesh scaled to edges of length 1: xatlas ignores faces that are small in its units."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    center = np.mean(mesh.bounds, axis=0, dtype=np.float64)
+    return ((mesh.positions - center) / (np.median(lengths) or 1.0)).astype(np.float32)
+
+
+# Cosines: of the angle between faces that may count as flat (2.6°; xatlas takes 0.8°), and of that within a flat part.
+_FLAT = 0.999
+_SAME_SIDE = 0.5
+
+
+def _pieces(corners: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
+    """Faces [face, 3, 3] that xatlas may have at once, given those across their edges: all of them, as a rule.
+
+    It cuts nothing where neighbors are all but coplanar, and crashes where these close around a round, finely
+    tessellated body. Such a mesh comes in six pieces, by the axis that a face looks along.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    face, edge = np.nonzero(neighbors >= 0)
+    other = neighbors[face, edge]
+    is_flat = np.sum(normals[face] * normals[other], axis=1) > _FLAT
+    links = coo_array((is_flat[is_flat], (face[is_flat], other[is_flat])), shape=(len(normals), len(normals)))
+    count, part = connected_components(links, directed=False)
+    means = np.zeros((count, 3))
+    np.add.at(means, part, normals)
+    cosines = np.sum(normals * means[part], axis=1)
+    if (cosines >= _SAME_SIDE * np.linalg.norm(means[part], axis=1)).all():
+        return [np.arange(len(normals))]
+    axis = np.abs(normals).argmax(axis=1)
+    side = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
+    return [np.flatnonzero(side == number) for number in np.unique(side)]
+
+
 # ---------------------------------------------------------------------------------------------------- normals
+
+
+_THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
+_SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
 
 
 @wp.kernel
@@ -474,28 +567,32 @@ def _sum_face_normals(
     positions: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     # out
-    sums: wp.array2d(dtype=wp.vec3),
+    sums: wp.array2d(dtype=wp.vec3d),
 ):
     """A thread adds the normal of one face, as long as twice its area, to its three vertices."""
     batch, face = wp.tid()
     i, j, k = faces[face][0], faces[face][1], faces[face][2]
-    origin = positions[batch, i]
-    normal = wp.cross(positions[batch, j] - origin, positions[batch, k] - origin)
-    wp.atomic_add(sums, batch, i, normal)
-    wp.atomic_add(sums, batch, j, normal)
-    wp.atomic_add(sums, batch, k, normal)
+    origin = wp.vec3d(positions[batch, i])
+    along_j = wp.vec3d(positions[batch, j]) - origin
+    along_k = wp.vec3d(positions[batch, k]) - origin
+    normal = wp.cross(along_j, along_k)
+    longest2 = wp.max(wp.dot(along_j, along_j), wp.dot(along_k, along_k))
+    if wp.length(normal) > wp.float64(_THINNEST) * longest2 and longest2 > wp.float64(_SHORTEST * _SHORTEST):
+        wp.atomic_add(sums, batch, i, normal)
+        wp.atomic_add(sums, batch, j, normal)
+        wp.atomic_add(sums, batch, k, normal)
 
 
 @wp.kernel
 def _normalize(
     # in
-    sums: wp.array2d(dtype=wp.vec3),
+    sums: wp.array2d(dtype=wp.vec3d),
     # out
     normals: wp.array2d(dtype=wp.vec3),
 ):
     """A thread normalizes one vertex; zero stays zero, with a zero gradient."""
     batch, vertex = wp.tid()
-    normals[batch, vertex] = wp.normalize(sums[batch, vertex])
+    normals[batch, vertex] = wp.vec3(wp.normalize(sums[batch, vertex]))
 
 
 def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
@@ -503,7 +600,8 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
 
         n_v = normalize(Σ_{faces at v} (x_j − x_i) × (x_k − x_i))
 
-    On a GPU the order of the sum, so its last bits, may differ between runs; see ``wp.config.deterministic``.
+    Sums are float64, since areas are squares, and lengths of normals those of areas: a mesh may have any scale. On a
+    GPU their order, so their last bits, may differ between runs; see ``wp.config.deterministic``.
 
     Args:
         positions: Vertex positions [scene units], vec3, shape [batch, vertex].
@@ -512,17 +610,21 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     Returns:
         Normals, vec3, shape [batch, vertex]; zero where the faces have no area or the vertex has no face.
 
+    Raises:
+        ValueError: for NaN, Inf and positions beyond 1e18.
+
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
+    check.finite_arrays({"positions": positions}, most=check.LARGEST)
     device, requires_grad = positions.device, positions.requires_grad
-    sums = wp.zeros(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+    sums = wp.zeros(positions.shape, dtype=wp.vec3d, device=device, requires_grad=requires_grad)
     normals = wp.empty(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)
-    wp.launch(
+    launch(
         _sum_face_normals,
         dim=(positions.shape[0], faces.shape[0]),
         inputs=[positions, faces],
         outputs=[sums],
         device=device,
     )
-    wp.launch(_normalize, dim=positions.shape, inputs=[sums], outputs=[normals], device=device)
+    launch(_normalize, dim=positions.shape, inputs=[sums], outputs=[normals], device=device)
     return normals

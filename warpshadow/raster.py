@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
+from warpshadow.tape import launch
 
 MAX_SIZE = 1 << 15
 """Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
@@ -341,6 +342,10 @@ def _instance(pixel: int, pixels_per_instance: int, instance_count: int):
     return instance
 
 
+# Below this the volumes of a face are subnormal numbers, which have no reciprocal in float32.
+TINY_VOLUME = 1.0e-36
+
+
 @wp.func
 def _relative(p: wp.vec4, ray: wp.vec2):
     """A vertex in clip space relative to the ray of a pixel, which passes through it if both are zero."""
@@ -365,8 +370,8 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
     # A pixel's center may lie outside of the face by what the vertices moved when they snapped.
     inside = wp.max(side * volumes, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
-    if total > 0.0:
-        return (1.0 / total) * inside
+    if total > TINY_VOLUME:
+        return inside / total
     return wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)  # edge-on, drawn only because its vertices snapped
 
 
@@ -385,7 +390,7 @@ def _adj_weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_ret: wp.v
     side = wp.sign(volumes[0] + volumes[1] + volumes[2])
     inside = wp.max(side * volumes, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
-    if total > 0.0:
+    if total > TINY_VOLUME:
         scale = side / total
         mean = wp.dot(inside, adj_ret) / total
         adj_a = wp.where(side * volumes[0] < 0.0, 0.0, scale * (adj_ret[0] - mean))
@@ -505,7 +510,7 @@ def barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) 
     device = clip_positions.device
     weights = wp.zeros(face_ids.shape, dtype=wp.vec3, device=device, requires_grad=clip_positions.requires_grad)
     _, height, width = face_ids.shape
-    wp.launch(
+    launch(
         _barycentrics,
         dim=face_ids.size,
         inputs=[face_ids.flatten(), faces, clip_positions, width, height],
@@ -542,7 +547,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         device=face_ids.device,
         requires_grad=attributes.requires_grad or fragments.barycentrics.requires_grad,
     )
-    wp.launch(
+    launch(
         _interpolation(attributes.dtype),
         dim=face_ids.size,
         inputs=[

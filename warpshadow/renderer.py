@@ -1,57 +1,63 @@
-"""The pipeline: from a scene to an image, each stage computed once while what it depends on stands still."""
+"""The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
+
+    geometry, cameras → view → transfer → shading → image
+                                  light ↗     ↖ albedo, textures
+"""
 
 import functools
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from warpshadow import sh, shading
-from warpshadow.basis import Basis, CellBasis, HarmonicBasis
-from warpshadow.blockers import Blockers, scene_blockers
+from warpshadow import check, film, sh
+from warpshadow.assembly import Assembly, Geometry
+from warpshadow.basis import Basis, CellBasis, HarmonicBasis, conversion
+from warpshadow.batch import common_batch, concatenate, expand
 from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.raster import Fragments, interpolate, rasterize
+from warpshadow.receivers import Receivers, find_receivers
 from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
+from warpshadow.shading import shade
+from warpshadow.silhouette import Silhouettes, find_silhouettes, smooth_silhouettes
+from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo
+from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
 COARSE_FACE = 400
 """Pixels of an average face beyond which shading at its corners draws a warning."""
 
-
-class Geometry(NamedTuple):
-    """All bodies in world space as one mesh."""
-
-    positions: wp.array  # [1, vertex] vec3
-    normals: wp.array  # [1, vertex] vec3
-    faces: wp.array  # [face] vec3i
-    uvs: wp.array  # [1, uv] vec2
-    uv_faces: wp.array  # [face] vec3i
-    body_of_face: np.ndarray  # [face]
-    first_vertex: np.ndarray  # [body + 1]
+Light = EnvironmentMap | np.ndarray | wp.array
+"""An environment map, SH coefficients [order², 3], or free coefficients in the renderer's basis [batch, coefficient]."""
 
 
-class Receivers(NamedTuple):
-    """The points at which light is evaluated, and how the pixels get theirs from them."""
+class View(NamedTuple):
+    """What cameras see of a geometry: all that an image takes but light and reflectance."""
 
-    points: wp.array  # [1, receiver] vec3
-    normals: wp.array  # [1, receiver] vec3
-    faces: wp.array  # [face + pixel] vec3i, indices of receivers
-    fragments: Fragments  # pixels of their own see face number face_count + i, whose corners are all receiver i
+    geometry: Geometry
+    receivers: Receivers
+    clip_positions: wp.array  # [batch, vertex] vec4
+    fragments: Fragments  # of the samples
+    silhouettes: Silhouettes
 
 
 class Renderer:
-    """A scene whose geometry and camera stand still, so that an image costs a dot product and a gather.
+    """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
+
+    Geometry and camera of the scene itself stand still, so that their image costs a dot product and a gather. All
+    methods are differentiable under Warp's tape in the arrays they are given, as far as those require gradients.
 
     Args:
         scene: The scene.
         device: Warp device, "cpu" by default.
-        basis: What free light is expressed in (:attr:`transfer`); None for what the method computes in: cells of
-            directions ("directional") or spherical harmonics.
+        basis: What free light is expressed in; None for what the method computes in: cells of directions
+            ("directional") or spherical harmonics.
         progress: Show progress where something takes longer than a second.
     """
 
@@ -66,218 +72,340 @@ class Renderer:
         self.scene = scene
         self.device = wp.get_device(device)
         self.progress = progress
+        self.assembly = Assembly(scene, device=self.device, progress=progress)
         visibility = scene.visibility
         is_cellular = visibility.method == "directional"
         self._own_basis = (
             CellBasis(fibonacci(visibility.directions)) if is_cellular else HarmonicBasis(visibility.order)
         )
         self.basis = self._own_basis if basis is None else basis
+        self._kept_footprints: tuple[Any, Footprints | None] = (None, None)
 
-    # ------------------------------------------------------------------------------------------ what stands still
+    # ------------------------------------------------------------------------------------------ geometry and cameras
 
     @functools.cached_property
     def geometry(self) -> Geometry:
-        """Bodies in world space."""
-        meshes = [body.world_mesh() for body in self.scene.bodies]
-        first_vertex = np.cumsum([0] + [mesh.vertex_count for mesh in meshes])
-        uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
-        uv_faces = [np.zeros_like(mesh.faces) if mesh.uvs is None else mesh.uv_faces for mesh in meshes]
-        first_uv = np.cumsum([0] + [len(uv) for uv in uvs])
-        positions = self._array(np.concatenate([mesh.positions for mesh in meshes])[None], wp.vec3)
-        faces = self._array(
-            np.concatenate([mesh.faces + first for mesh, first in zip(meshes, first_vertex, strict=False)]),
-            wp.vec3i,
-        )
-        return Geometry(
-            positions,
-            vertex_normals(positions, faces),
-            faces,
-            self._array(np.concatenate(uvs)[None], wp.vec2),
-            self._array(np.concatenate([uv + first for uv, first in zip(uv_faces, first_uv, strict=False)]), wp.vec3i),
-            np.repeat(np.arange(len(meshes)), [mesh.face_count for mesh in meshes]),
-            first_vertex,
-        )
+        """Where the scene has its bodies and their spheres; the batch is 1."""
+        return self.assembly.placed()
 
     @functools.cached_property
-    def fragments(self) -> Fragments:
-        """What each sample of the image sees."""
-        camera = self.scene.camera.resized(self.scene.supersampling)
-        clip_matrices = self._array(camera.clip_matrix()[None], wp.mat44)
-        clip_positions = to_clip(self.geometry.positions, clip_matrices)
-        return rasterize(clip_positions, self.geometry.faces, camera.width, camera.height)
+    def clip_matrices(self) -> wp.array:
+        """The scene's camera, mat44 of shape [1]."""
+        return self._array(self.scene.camera.clip_matrix()[None], wp.mat44)
 
-    @functools.cached_property
-    def body_ids(self) -> np.ndarray:
-        """Body that each sample of the image sees, -1 for none, shape [height, width]."""
-        face_ids = self.fragments.face_ids.numpy()[0]
-        return np.where(face_ids >= 0, self.geometry.body_of_face[face_ids], -1)
+    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """See a geometry through cameras.
 
-    @functools.cached_property
-    def receivers(self) -> Receivers:
-        """Vertices, and for bodies that want it (all where rays are traced) the points that the samples see."""
-        geometry, fragments = self.geometry, self.fragments
-        is_traced = self.scene.visibility.method == "ray-traced"
-        wants_pixels = np.array([is_traced or body.receivers == "pixel" for body in self.scene.bodies])
-        self._warn_of_coarse_faces(~wants_pixels)
-        if not wants_pixels.any():
-            return Receivers(geometry.positions, geometry.normals, geometry.faces, fragments)
-        keeps_vertices = np.repeat(~wants_pixels, np.diff(geometry.first_vertex))
-        shows_pixel = (self.body_ids >= 0) & wants_pixels[self.body_ids]
+        Args:
+            geometry: Instances of vertices and spheres, by default the scene's own.
+            clip_matrices: Cameras, mat44 of shape [batch], by default the scene's; see
+                :func:`warpshadow.camera.compose_clip_matrices`.
 
-        def points_of(attribute: wp.array) -> np.ndarray:
-            at_pixels = interpolate(fragments, geometry.faces, attribute).numpy()[0, shows_pixel]
-            return np.concatenate([attribute.numpy()[0, keeps_vertices], at_pixels])
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
 
-        points, normals = points_of(geometry.positions), points_of(geometry.normals)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        receiver_of_vertex = np.maximum(np.cumsum(keeps_vertices) - 1, 0)
-        own = np.arange(keeps_vertices.sum(), len(points))
-        faces = np.concatenate([receiver_of_vertex[geometry.faces.numpy()], np.repeat(own[:, None], 3, axis=1)])
-        face_ids = fragments.face_ids.numpy().copy()
-        face_ids[0, shows_pixel] = len(geometry.body_of_face) + np.arange(len(own))
-        weights = fragments.barycentrics.numpy().copy()
-        weights[0, shows_pixel] = (1, 0, 0)
-        return Receivers(
-            self._array(points[None], wp.vec3),
-            self._array(normals[None], wp.vec3),
-            self._array(faces, wp.vec3i),
-            Fragments(self._array(face_ids, wp.int32), self._array(weights, wp.vec3)),
+        Differentiable: geometry, clip_matrices.
+        """
+        assembly, across = self.assembly, self.scene.supersampling
+        geometry = self.geometry if geometry is None else geometry
+        clip_positions = to_clip(geometry.positions, self.clip_matrices if clip_matrices is None else clip_matrices)
+        camera = self.scene.camera
+        fragments = rasterize(clip_positions, assembly.faces, across * camera.width, across * camera.height)
+        wants_samples = np.array([self._is_traced or body.receivers == "pixel" for body in self.scene.bodies])
+        receivers = find_receivers(
+            geometry.positions,
+            vertex_normals(geometry.positions, assembly.faces),
+            assembly.faces,
+            fragments,
+            np.repeat(~wants_samples, np.diff(assembly.first_vertex)),
+            wants_samples[assembly.body_of_face],
         )
+        silhouettes = find_silhouettes(fragments, assembly.faces, assembly.edges, clip_positions, assembly.surfaces)
+        return View(geometry, receivers, clip_positions, fragments, silhouettes)
 
-    def _warn_of_coarse_faces(self, is_vertex_lit: np.ndarray) -> None:
+    @functools.cached_property
+    def scene_view(self) -> View:
+        """What the scene's camera sees of the scene."""
+        view = self.view()
+        self._warn_of_coarse_faces(view.fragments)
+        return view
+
+    def body_ids(self, view: View | None = None) -> np.ndarray:
+        """Body that each sample sees, -1 for none, shape [batch, height, width]."""
+        view = self.scene_view if view is None else view
+        face_ids = view.fragments.face_ids.numpy()
+        return np.where(face_ids >= 0, self.assembly.body_of_face[face_ids], -1)
+
+    def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
-        face_ids = self.fragments.face_ids.numpy()[0]
-        shown = np.unique(face_ids[face_ids >= 0])
-        face_counts = np.bincount(self.geometry.body_of_face[shown], minlength=len(is_vertex_lit))
-        pixel_counts = np.bincount(self.body_ids[self.body_ids >= 0], minlength=len(is_vertex_lit))
-        pixels_per_face = pixel_counts / np.maximum(face_counts, 1) / self.scene.supersampling**2
-        for number in np.flatnonzero(is_vertex_lit & (pixels_per_face > COARSE_FACE)):
-            warnings.warn(
-                f"body number {number + 1} ({self.scene.bodies[number].mesh.name!r}): a face covers "
-                f"{pixels_per_face[number]:.0f} pixels on average, and light is evaluated at its corners alone; "
-                'receivers = "pixel" evaluates it at every pixel',
-                stacklevel=2,
-            )
+        bodies = self.scene.bodies
+        face_ids = fragments.face_ids.numpy()
+        seen = face_ids[face_ids >= 0]
+        body_of_face = self.assembly.body_of_face
+        face_counts = np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
+        pixel_counts = np.bincount(body_of_face[seen], minlength=len(bodies)) / self.scene.supersampling**2
+        pixels_per_face = pixel_counts / np.maximum(face_counts, 1)
+        for number, body in enumerate(bodies):
+            if body.receivers == "vertex" and not self._is_traced and pixels_per_face[number] > COARSE_FACE:
+                warnings.warn(
+                    f"body number {number + 1} ({body.mesh.name!r}): a face covers {pixels_per_face[number]:.0f} "
+                    "pixels on average, and light is evaluated at its corners alone; "
+                    'receivers = "pixel" evaluates it at every pixel',
+                    stacklevel=2,
+                )
 
-    @functools.cached_property
-    def blockers(self) -> Blockers:
-        """The spheres of all bodies."""
-        return scene_blockers(self.scene, device=self.device, progress=self.progress)
+    # ------------------------------------------------------------------------------------------ light
 
     @functools.cached_property
     def transfer(self) -> wp.array:
-        """Transfer vectors of the receivers to :attr:`basis`, float32 of shape [1, receiver, coefficient]."""
-        if self.scene.visibility.method == "ray-traced":
-            points, normals, *_ = self.receivers
+        """Transfer vectors of the scene's receivers to :attr:`basis`, float32 of shape [1, receiver, coefficient]."""
+        view = self.scene_view
+        if self._is_traced:
+            points, normals, *_ = view.receivers
             count = self.scene.visibility.samples
+            mesh = self._ray_mesh(view, 0)
             traced = trace_transfer(
-                self._ray_mesh, points.flatten(), normals.flatten(), self.basis, count, progress=self.progress
+                mesh, points.flatten(), normals.flatten(), self.basis, count, progress=self.progress
             )
             return traced.reshape((1, *traced.shape))
-        return self._to_basis(self._own_transfer())
+        own = self._own_transfer(view)
+        matrix = self._own_from_basis
+        return own if matrix is None else self._array(own.numpy() @ matrix, wp.float32)
 
-    def _own_transfer(self) -> wp.array:
-        """Transfer vectors to what the method computes in."""
-        if isinstance(self._own_basis, CellBasis):
-            return self._cell_transfer(self._own_basis.directions)
-        return self._harmonic_transfer()
+    @functools.cached_property
+    def _own_from_basis(self) -> np.ndarray | None:
+        return conversion(self.basis, self._own_basis)
 
-    def _cell_transfer(self, directions: np.ndarray) -> wp.array:
-        points, normals, *_ = self.receivers
-        if not self.blockers.radii.size:
-            seen = wp.full((*points.shape, len(directions)), 1.0, dtype=wp.float32, device=self.device)
-            return shading.directional_transfer(seen, normals, directions)
-        softness = self.scene.visibility.softness
-        seen = directional.transmittance(points, normals, *self.blockers, directions, softness=softness)
-        return shading.directional_transfer(seen, normals, directions)
-
-    def _harmonic_transfer(self) -> wp.array:
-        points, normals, *_ = self.receivers
+    def _own_transfer(self, view: View, directions: np.ndarray | None = None) -> wp.array:
+        """Transfer vectors of a view's receivers to what the method computes in, or to other cells of directions."""
+        points, normals, *_ = view.receivers
         visibility = self.scene.visibility
+        spheres = view.geometry.centers, view.geometry.radii
+        has_spheres = spheres[0].shape[1] > 0
+        count = common_batch({"points": points, "centers": spheres[0], "radii": spheres[1]}) if has_spheres else 1
+        points, normals, *spheres = (expand(array, count) for array in (points, normals, *spheres))
+        if isinstance(self._own_basis, CellBasis):
+            directions = self._own_basis.directions if directions is None else directions
+            if has_spheres:
+                softness = visibility.softness
+                seen = directional.transmittance(points, normals, *spheres, directions, softness=softness)
+            else:
+                seen = wp.full((*points.shape, len(directions)), 1.0, dtype=wp.float32, device=self.device)
+            return directional_transfer(seen, normals, directions)
         seen = None
-        if visibility.method == "log-sh" and self.blockers.radii.size:
-            log = log_sh.accumulate(points, normals, *self.blockers, order=visibility.order, log=visibility.log)
+        if has_spheres:
+            log = log_sh.accumulate(points, normals, *spheres, order=visibility.order, log=visibility.log)
             seen = exponential.exponentiate(log, base=visibility.base)
-        return shading.sh_transfer(seen, normals, order=visibility.order)
-
-    def _to_basis(self, transfer: wp.array) -> wp.array:
-        """Take transfer vectors from what the method computes in to what the light is expressed in."""
-        if self.basis == self._own_basis:
-            return transfer
-        if isinstance(self._own_basis, CellBasis) and not isinstance(self.basis, CellBasis):
-            matrix = self.basis.functions(self._own_basis.directions)
-        else:  # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
-            fine = fibonacci(64 * max(self.basis.size, self._own_basis.size))
-            own, cells = self._own_basis.functions(fine), self.basis.functions(fine)
-            is_cellular = isinstance(self._own_basis, CellBasis)
-            weights = 1 / own.sum(axis=0)[:, None] if is_cellular else 4 * np.pi / len(fine)
-            matrix = weights * (own.T @ cells)
-        return self._array(transfer.numpy() @ matrix.astype(np.float32), wp.float32)
-
-    @functools.cached_property
-    def _ray_mesh(self) -> wp.Mesh:
-        geometry = self.geometry
-        return wp.Mesh(points=geometry.positions[0].contiguous(), indices=geometry.faces.view(wp.int32).flatten())
-
-    def pixels_of(self, number: int) -> wp.array:
-        """Flat indices of the samples that show a body, int32."""
-        return self._array(np.flatnonzero(self.body_ids.ravel() == number).astype(np.int32), wp.int32)
-
-    @functools.cached_property
-    def uvs(self) -> wp.array:
-        """Texture coordinates of the samples, vec2 of shape [1, height, width]."""
-        return interpolate(self.fragments, self.geometry.uv_faces, self.geometry.uvs)
+        return sh_transfer(seen, normals, order=visibility.order)
 
     @functools.cached_property
     def scene_shading(self) -> wp.array:
-        """The receivers in the scene's light, each as a white surface: vec3 of shape [1, receiver]."""
-        return self.shade(self.scene.light)
+        """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [1, receiver]."""
+        return self._shade_known(self.scene_view, self.scene.light)
 
-    def shade(self, light: EnvironmentMap | np.ndarray) -> wp.array:
-        """Light the receivers, each as a white surface, as accurately as the method can for known light.
+    def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
+        """Light receivers, each as a white surface.
 
         Args:
-            light: Environment map or SH coefficients [order², 3].
+            light: By default the scene's. Known light is shaded as accurately as the method can; free light, an array
+                of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient], is differentiable.
+            view: By default the scene's own.
 
         Returns:
-            Shading, vec3 of shape [1, receiver].
+            Shading, vec3 of shape [batch, receiver].
+
+        Raises:
+            ValueError: naming the argument; so where rays are asked for a gradient to geometry.
+
+        Differentiable: light, view.
         """
-        method = self.scene.visibility.method
-        if method == "ray-traced":
-            return self._trace(light)
+        is_static = view is None or view is self.scene_view
+        view = self.scene_view if view is None else view
+        if not isinstance(light, wp.array):
+            if light is None and is_static:
+                return self.scene_shading
+            return self._shade_known(view, self.scene.light if light is None else light)
+        if is_static:
+            return shade(self.transfer, light)
+        if self._is_traced:
+            raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
+        if self._own_from_basis is not None:
+            matrix = self._array(self._own_from_basis[None], wp.float32)
+            light = shade(matrix, light)
+        return shade(self._own_transfer(view), light)
+
+    def _shade_known(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
+        if self._is_traced:
+            return self._trace(view, light)
         if isinstance(self._own_basis, CellBasis) and isinstance(light, EnvironmentMap):
             # a cell looks to where its light comes from: a sun is rarely in the middle
             coefficients, aims, _ = light.cells(self._own_basis.directions)
-            transfer = self._cell_transfer(aims)
+            transfer = self._own_transfer(view, aims)
         else:
             coefficients = self._own_basis.coefficients(light)
-            transfer = self._own_transfer()
-        return shading.shade(transfer, self._array(coefficients[None], wp.vec3))
+            transfer = self._own_transfer(view)
+        return shade(transfer, self._array(coefficients[None], wp.vec3))
 
-    def _trace(self, light: EnvironmentMap | np.ndarray) -> wp.array:
+    def _trace(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
+        points, normals, *_ = view.receivers
+        if points.requires_grad:
+            raise ValueError(
+                "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
+            )
         radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
         count = max(1, self.scene.visibility.samples // self.scene.supersampling**2)
-        points, normals, *_ = self.receivers
         samples = sample_map(radiance, count)
-        traced = trace_shading(self._ray_mesh, points.flatten(), normals.flatten(), samples, progress=self.progress)
-        return traced.reshape(points.shape)
+        traced = wp.empty(points.shape, dtype=wp.vec3, device=self.device)
+        for instance in range(points.shape[0] if points.size else 0):
+            mesh = self._ray_mesh(view, instance)
+            lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
+            wp.copy(traced[instance], lit)
+        return traced
+
+    def _ray_mesh(self, view: View, instance: int) -> wp.Mesh:
+        positions = view.geometry.positions
+        points = wp.clone(positions[min(instance, positions.shape[0] - 1)], requires_grad=False)
+        return wp.Mesh(points=points, indices=self.assembly.faces.view(wp.int32).flatten())
+
+    @property
+    def _is_traced(self) -> bool:
+        return self.scene.visibility.method == "ray-traced"
+
+    # ------------------------------------------------------------------------------------------ reflectance
 
     @functools.cached_property
     def albedo(self) -> wp.array:
-        """Reflectance that the samples see, vec3 of shape [1, height, width]."""
-        counts = np.diff(self.geometry.first_vertex)
-        of_vertices = np.concatenate(
-            [np.broadcast_to(body.albedo, (count, 3)) for body, count in zip(self.scene.bodies, counts, strict=True)]
+        """Reflectance that the scene's samples see, vec3 of shape [1, height, width]."""
+        return self._reflect(self.scene_view, self._body_albedo, self._body_textures)
+
+    @functools.cached_property
+    def _body_albedo(self) -> list[wp.array]:
+        """Reflectance of each body in the scene, vec3 of shape [1, 1] or [1, vertex]."""
+        return [self._array(np.atleast_2d(body.albedo)[None], wp.vec3) for body in self.scene.bodies]
+
+    @functools.cached_property
+    def _body_textures(self) -> list[wp.array | None]:
+        """Texture of each body in the scene, vec3 of shape [1, height, width]."""
+        images = (body.texture for body in self.scene.bodies)
+        return [None if image is None else self._array(image[None], wp.vec3) for image in images]
+
+    @functools.cached_property
+    def _scene_pyramids(self) -> Textures:
+        return mip_pyramids([image for image in self._body_textures if image is not None])
+
+    def reflect(
+        self,
+        albedo: Sequence[wp.array | None] | None = None,
+        textures: Sequence[wp.array | None] | None = None,
+        view: View | None = None,
+    ) -> wp.array:
+        """Find the reflectance that samples see.
+
+        Args:
+            albedo: For each body, vec3 of shape [batch, 1] or [batch, vertex]; None for what the scene has.
+            textures: For each body, vec3 of shape [batch, height, width], which needs uvs; None for what the scene has.
+            view: By default the scene's own.
+
+        Returns:
+            vec3 of shape [batch, height, width].
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: albedo, textures, view.
+        """
+        is_scenes = not any(given is not None for given in (*(albedo or ()), *(textures or ())))
+        if is_scenes and (view is None or view is self.scene_view):
+            return self.albedo
+        bodies = self.scene.bodies
+        colors, images = list(self._body_albedo), list(self._body_textures)
+        for name, given in (("albedo", albedo), ("textures", textures)):
+            if given is not None and len(given) != len(bodies):
+                raise ValueError(f"{name}: got {len(given)} items, expected {len(bodies)}, one for each body")
+        for number, color in enumerate(albedo or ()):
+            if color is not None:
+                vertex_count = bodies[number].mesh.vertex_count
+                check.shape(f"albedo[{number}]", color.shape, ("batch", 1 if color.shape[1:] == (1,) else vertex_count))
+                check.finite_arrays({f"albedo[{number}]": color}, most=check.LARGEST)
+                colors[number], images[number] = color, None
+        for number, image in enumerate(textures or ()):
+            if image is not None:
+                check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
+                if bodies[number].mesh.uvs is None:
+                    raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None, or uvs")
+                if albedo is not None and albedo[number] is not None:
+                    raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
+                check.finite_arrays({f"textures[{number}]": image}, most=check.LARGEST)
+                images[number] = image
+        return self._reflect(self.scene_view if view is None else view, colors, images)
+
+    def _reflect(self, view: View, colors: list[wp.array], images: list[wp.array | None]) -> wp.array:
+        faces = self.assembly.faces
+        vertex_albedo = concatenate(colors, np.diff(self.assembly.first_vertex).tolist())
+        present = [image for image in images if image is not None]
+        if not present:
+            return interpolate(view.fragments, faces, vertex_albedo)
+        is_kept = all(image is kept for image, kept in zip(images, self._body_textures, strict=True))
+        pyramids = self._scene_pyramids if is_kept else mip_pyramids(present)
+        footprints = self._footprints(view, pyramids, tuple(image is not None for image in images))
+        return sample_albedo(view.fragments, faces, vertex_albedo, pyramids, footprints)
+
+    def _footprints(self, view: View, pyramids: Textures, has_texture: tuple[bool, ...]) -> Footprints:
+        """What each sample covers of its texture, kept for the scene's own view while sizes stay as they are."""
+        key = pyramids.sizes, has_texture
+        if view is self.scene_view and key == self._kept_footprints[0]:
+            return self._kept_footprints[1]
+        assembly = self.assembly
+        texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
+        footprints = find_footprints(
+            view.fragments,
+            assembly.faces,
+            view.clip_positions,
+            assembly.uvs,
+            assembly.uv_faces,
+            self._array(texture_of_body[assembly.body_of_face], wp.int32),
+            pyramids,
         )
-        albedo = interpolate(self.fragments, self.geometry.faces, self._array(of_vertices[None], wp.vec3))
-        for number, body in enumerate(self.scene.bodies):
-            if body.texture is not None:
-                texture = self._array(body.texture, wp.vec3)
-                shading.sample_texture(texture, self.pixels_of(number), self.uvs.flatten(), albedo.flatten())
-        return albedo
+        if view is self.scene_view:
+            self._kept_footprints = key, footprints
+        return footprints
+
+    # ------------------------------------------------------------------------------------------ image
+
+    def draw(
+        self,
+        light: Light | None = None,
+        *,
+        albedo: Sequence[wp.array | None] | None = None,
+        textures: Sequence[wp.array | None] | None = None,
+        view: View | None = None,
+    ) -> wp.array:
+        """Draw images.
+
+        Args:
+            light: As for :meth:`shade`.
+            albedo: As for :meth:`reflect`.
+            textures: As for :meth:`reflect`.
+            view: From :meth:`view`, by default the scene's own.
+                Batches of 1 serve every instance of the others.
+
+        Returns:
+            Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: light, albedo, textures, view.
+        """
+        lit = self.shade(light, view)
+        reflected = self.reflect(albedo, textures, view)
+        view = self.scene_view if view is None else view
+        samples = film.expose(view.receivers.fragments, view.receivers.faces, lit, reflected)
+        smoothed = smooth_silhouettes(samples, view.silhouettes, view.clip_positions)
+        return film.average(smoothed, self.scene.supersampling)
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
-        """Render the image.
+        """Render the image of the scene.
 
         Args:
             light: Environment map or SH coefficients [order², 3] in place of the scene's.
@@ -285,39 +413,21 @@ class Renderer:
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
         """
-        receivers = self.receivers
-        lit = self.scene_shading if light is None else self.shade(light)
-        color = interpolate(receivers.fragments, receivers.faces, lit).numpy()[0] * self.albedo.numpy()[0]
-        coverage = (self.body_ids >= 0).astype(np.float32)
-        samples = np.concatenate([color, coverage[..., None]], axis=-1)
-        return average_samples(samples, self.scene.supersampling)
+        return self.draw(light).numpy()[0].copy()
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
 
 
-def average_samples(samples: Any, factor: int) -> Any:
-    """Average the samples of each pixel: [height·factor, width·factor, channel] to [height, width, channel].
-
-    Args:
-        samples: A NumPy array or a torch tensor.
-        factor: Samples of a pixel across and down.
-    """
-    height, width, channels = samples.shape
-    return samples.reshape(height // factor, factor, width // factor, factor, channels).mean(axis=(1, 3))
-
-
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
-    """Render a scene.
+    """Render a scene once; for several images of it, keep a :class:`Renderer`.
 
     Args:
-        scene: The scene; its ``visibility`` says how shadows are computed.
+        scene: The scene.
         device: Warp device.
         progress: Show progress where something takes longer than a second.
 
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
-
-    Differentiable: no; see :mod:`warpshadow.torch`.
     """
     return Renderer(scene, device=device, progress=progress).render()

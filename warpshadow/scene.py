@@ -14,7 +14,8 @@ from warpshadow.visibility.directional import SOFTNESS
 from warpshadow.visibility.exponential import THRESHOLDS
 from warpshadow.visibility.zonal_logs import LOGS
 
-METHODS = ("directional", "log-sh", "none", "ray-traced")
+SPHERE_METHODS = ("directional", "log-sh")
+METHODS = (*SPHERE_METHODS, "none", "ray-traced")
 RECEIVERS = ("vertex", "pixel")
 
 

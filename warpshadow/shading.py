@@ -1,306 +1,147 @@
-"""Shading: visibility times light times cosine.
+"""Shading: the light that receivers send back as white surfaces, T · L of their transfer vectors and the light."""
 
-    B(x) = a(x)/π ∫ L(ω) V(ω, x) max(n·ω, 0) dω
-
-is linear in the light, so a receiver that stands still has a *transfer vector* T with B = a · (T · L): its
-coefficients belong to the light's, either spherical harmonics or cells of directions. The 1/π is in T: white under
-L = 1, unoccluded, gives 1. *Shading* below is T · L, the radiance of a white surface.
-"""
-
-import functools
-
-import numpy as np
 import warp as wp
 
-from warpshadow import check, sh
-from warpshadow.directions import CHUNK, check_count
-from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
-from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
+from warpshadow import check
+from warpshadow.batch import common_batch
 from warpshadow.tape import record_adjoint
 
-# ---------------------------------------------------------------------------------------------- transfer vectors
+_WIDTH = 16
+_SLAB = 256
+"""Receivers whose gradients to light a thread sums before it adds them to the others'."""
 
-
-@functools.cache
-def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
-    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    fn = lane_functions(lanes)
-    load, load_rows, store_rows = fn.load, fn.load_rows, fn.store_rows
-    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
-    COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
-
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
-    def transfer_sh(
-        # in
-        visibility: wp.array3d(dtype=wp.float32),
-        normals: wp.array2d(dtype=wp.vec3),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
-        # scratch
-        scratch: wp.array4d(dtype=Lane),
-        # out
-        transfer: wp.array3d(dtype=wp.float32),
-    ):
-        """A thread owns a group of receivers: the SH product of their visibility and clamped cosine."""
-        batch, group = wp.tid()
-        cosine = scratch[batch, group, 0]
-        for i in range(wp.static(order**2)):
-            cosine[i] = Lane(0.0)
-        zonal = Zonal()
-        for band in range(order):
-            zonal[band] = Lane(COSINE[band])
-        x, y, z = load(normals[batch], group)
-        add_rotated_zonal_(x, y, z, zonal, cosine)
-        if wp.static(is_shadowed):
-            factor = scratch[batch, group, 1]
-            product = scratch[batch, group, 2]
-            load_rows(visibility[batch], group, factor)
-            multiply_(factor, cosine, first, pairs, values, product)
-            store_rows(product, group, transfer[batch])
-        else:
-            store_rows(cosine, group, transfer[batch])
-
-    return transfer_sh
-
-
-@functools.cache
-def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
-    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    fn = lane_functions(lanes)
-    load, load_rows, add_rows, add_vectors = fn.load, fn.load_rows, fn.add_rows, fn.add_vectors
-    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
-    rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
-    COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
-
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
-    def transfer_sh_adjoint(
-        # in
-        visibility: wp.array3d(dtype=wp.float32),
-        normals: wp.array2d(dtype=wp.vec3),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
-        adj_transfer: wp.array3d(dtype=wp.float32),
-        # scratch
-        scratch: wp.array4d(dtype=Lane),
-        # out
-        adj_visibility: wp.array3d(dtype=wp.float32),
-        adj_normals: wp.array2d(dtype=wp.vec3),
-    ):
-        """A thread owns a group of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
-        batch, group = wp.tid()
-        adj_row = scratch[batch, group, 0]
-        factor = scratch[batch, group, 1]
-        product = scratch[batch, group, 2]
-        x, y, z = load(normals[batch], group)
-        zonal = Zonal()
-        for band in range(order):
-            zonal[band] = Lane(COSINE[band])
-        load_rows(adj_transfer[batch], group, adj_row)
-        if wp.static(is_shadowed):
-            if adj_visibility:
-                for i in range(wp.static(order**2)):
-                    factor[i] = Lane(0.0)
-                add_rotated_zonal_(x, y, z, zonal, factor)
-                multiply_(adj_row, factor, first, pairs, values, product)
-                add_rows(product, group, adj_visibility[batch])
-            load_rows(visibility[batch], group, factor)
-            multiply_(factor, adj_row, first, pairs, values, product)
-            for i in range(wp.static(order**2)):
-                adj_row[i] = product[i]
-        if adj_normals:
-            adj_x, adj_y, adj_z, _adj_zonal = rotated_zonal_adjoint_(x, y, z, zonal, adj_row)
-            add_vectors(adj_x, adj_y, adj_z, group, adj_normals[batch])
-
-    return transfer_sh_adjoint
-
-
-def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int) -> wp.array:
-    """Transfer vectors to light in spherical harmonics: (V * H_n)_k / π, H_n the clamped cosine around the normal.
-
-    Args:
-        visibility: SH visibility, float32 of shape [batch, vertex, order²]; None where nothing blocks.
-        normals: Unit normals, vec3 of shape [batch, vertex].
-        order: Number of SH bands, 2 to 8.
-
-    Returns:
-        Transfer vectors, float32 of shape [batch, vertex, order²].
-
-    Differentiable: visibility, normals.
-    """
-    sh.check_order(order)
-    device = normals.device
-    lanes = lane_count(device)
-    batch_count, vertex_count = normals.shape
-    if visibility is not None:
-        check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
-    groups = group_count(vertex_count, lanes)
-    variables = [visibility, normals]
-    transfer = wp.empty(
-        (batch_count, vertex_count, order**2),
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
-    )
-    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)
-    scratch = wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device)
-    wp.launch(
-        _sh_transfer_kernel(order, visibility is not None, lanes),
-        dim=(batch_count, groups),
-        inputs=[*variables, *product_table(order, str(device), bands_of_j=lit_bands), scratch],
-        outputs=[transfer],
-        device=device,
-        record_tape=False,
-    )
-
-    def adjoint() -> None:
-        table = product_table(order, str(device))
-        wp.launch(
-            _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
-            dim=(batch_count, groups),
-            inputs=[*variables, *table, transfer.grad, scratch],
-            outputs=[None if variable is None else variable.grad for variable in variables],
-            device=device,
-            record_tape=False,
-        )
-
-    record_adjoint(adjoint, [*variables, transfer])
-    return transfer
-
-
-_Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
+_Chunk = wp.types.vector(length=_WIDTH, dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)
-def _transfer_directions(
+def _split_channels(
     # in
-    transmittance: wp.array3d(dtype=_Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=_Chunk),
-    weight: float,
+    light: wp.array2d(dtype=wp.vec3),
     # out
-    transfer: wp.array3d(dtype=_Chunk),
+    channels: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a receiver."""
-    batch, vertex = wp.tid()
-    n = normals[batch, vertex]
-    for chunk in range(directions.shape[1]):
-        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
-        cosine = weight * wp.max(cosine, _Chunk(0.0))
-        transfer[batch, vertex, chunk] = wp.cw_mul(cosine, transmittance[batch, vertex, chunk])
+    """A thread owns a coefficient of a channel."""
+    batch, channel, k = wp.tid()
+    channels[batch, channel, k] = light[batch, k][channel]
 
 
 @wp.kernel(enable_backward=False)
-def _transfer_directions_adjoint(
+def _join_channels(
     # in
-    transmittance: wp.array3d(dtype=_Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=_Chunk),
-    weight: float,
-    adj_transfer: wp.array3d(dtype=_Chunk),
+    channels: wp.array3d(dtype=wp.float32),
     # out
-    adj_transmittance: wp.array3d(dtype=_Chunk),
-    adj_normals: wp.array2d(dtype=wp.vec3),
+    light: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
-    batch, vertex = wp.tid()
-    n = normals[batch, vertex]
-    total = wp.vec3()
-    for chunk in range(directions.shape[1]):
-        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
-        adj = weight * adj_transfer[batch, vertex, chunk]
-        if adj_transmittance:
-            adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
-                adj, wp.max(cosine, _Chunk(0.0))
-            )
-        is_up = wp.min(wp.max(cosine * 1.0e30, _Chunk(0.0)), _Chunk(1.0))
-        adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), is_up)
-        total += wp.vec3(
-            wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
-        )
-    if adj_normals:
-        adj_normals[batch, vertex] = adj_normals[batch, vertex] + total
+    """A thread owns a coefficient, to which it adds."""
+    batch, k = wp.tid()
+    light[batch, k] = light[batch, k] + wp.vec3(channels[batch, 0, k], channels[batch, 1, k], channels[batch, 2, k])
 
 
-def directional_transfer(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> wp.array:
-    """Transfer vectors to light in cells of directions: T_q max(n·ω_q, 0) · (4π/Q) / π.
-
-    Args:
-        transmittance: Float32 of shape [batch, vertex, direction].
-        normals: Unit normals, vec3 of shape [batch, vertex].
-        directions: Unit vectors ω, NumPy of shape [direction, 3].
-
-    Returns:
-        Transfer vectors, float32 of shape [batch, vertex, direction].
-
-    Differentiable: transmittance, normals.
-    """
-    count = len(directions)
-    check_count("directions", count)
-    check.shape("transmittance", transmittance.shape, (*normals.shape, count))
-    device = normals.device
-    shape = (*normals.shape, count // CHUNK)
-    if transmittance.requires_grad and not transmittance.is_contiguous:
-        raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
-    seen = _as_chunks(transmittance.contiguous(), shape)
-    variables = [transmittance, normals]
-    towards = wp.array(directions.T.reshape(3, -1, CHUNK), dtype=_Chunk, device=device)
-    transfer = wp.empty(
-        transmittance.shape,
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable.requires_grad for variable in variables),
-    )
-    wp.launch(
-        _transfer_directions,
-        dim=normals.shape,
-        inputs=[seen, normals, towards, 4.0 / count],
-        outputs=[_as_chunks(transfer, shape)],
-        device=device,
-        record_tape=False,
-    )
-
-    def adjoint() -> None:
-        wp.launch(
-            _transfer_directions_adjoint,
-            dim=normals.shape,
-            inputs=[seen, normals, towards, 4.0 / count, _as_chunks(transfer.grad, shape)],
-            outputs=[_as_chunks(transmittance.grad, shape), normals.grad],
-            device=device,
-            record_tape=False,
-        )
-
-    record_adjoint(adjoint, [*variables, transfer])
-    return transfer
+@wp.func
+def _sum(values: _Chunk):
+    total = float(0.0)
+    for i in range(_WIDTH):
+        total += values[i]
+    return total
 
 
-def _as_chunks(values: wp.array | None, shape: tuple[int, ...]) -> wp.array | None:
-    """View rows of float32 as rows of chunks."""
-    if values is None:
-        return None
-    chunks = wp.array(ptr=values.ptr, dtype=_Chunk, shape=shape, device=values.device)
-    chunks._ref = values  # the memory stays while the view does
-    return chunks
-
-
-# ---------------------------------------------------------------------------------------------- light
-
-
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _shade(
     # in
     transfer: wp.array3d(dtype=wp.float32),
-    light: wp.array2d(dtype=wp.vec3),
+    transfer_chunks: wp.array3d(dtype=_Chunk),
+    light: wp.array3d(dtype=wp.float32),
+    light_chunks: wp.array3d(dtype=_Chunk),
     # out
     shading: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver."""
+    """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
     batch, vertex = wp.tid()
-    total = wp.vec3()
-    for k in range(transfer.shape[2]):
-        total += transfer[batch, vertex, k] * light[batch, k]
+    seen = wp.min(batch, transfer.shape[0] - 1)
+    lit = wp.min(batch, light.shape[0] - 1)
+    red = _Chunk(0.0)
+    green = _Chunk(0.0)
+    blue = _Chunk(0.0)
+    for chunk in range(transfer_chunks.shape[2]):
+        t = transfer_chunks[seen, vertex, chunk]
+        red += wp.cw_mul(t, light_chunks[lit, 0, chunk])
+        green += wp.cw_mul(t, light_chunks[lit, 1, chunk])
+        blue += wp.cw_mul(t, light_chunks[lit, 2, chunk])
+    total = wp.vec3(_sum(red), _sum(green), _sum(blue))
+    for k in range(_WIDTH * transfer_chunks.shape[2], transfer.shape[2]):
+        total += transfer[seen, vertex, k] * wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
     shading[batch, vertex] = total
+
+
+@wp.kernel(enable_backward=False)
+def _shade_adjoint_transfer(
+    # in
+    light: wp.array3d(dtype=wp.float32),
+    light_chunks: wp.array3d(dtype=_Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transfer: wp.array3d(dtype=wp.float32),
+    adj_transfer_chunks: wp.array3d(dtype=_Chunk),
+):
+    """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
+    seen, vertex = wp.tid()
+    begin = seen
+    end = seen + 1
+    if adj_transfer.shape[0] == 1:
+        end = adj_shading.shape[0]
+    for batch in range(begin, end):
+        lit = wp.min(batch, light.shape[0] - 1)
+        adj = adj_shading[batch, vertex]
+        for chunk in range(light_chunks.shape[2]):
+            adj_transfer_chunks[seen, vertex, chunk] = (
+                adj_transfer_chunks[seen, vertex, chunk]
+                + adj[0] * light_chunks[lit, 0, chunk]
+                + adj[1] * light_chunks[lit, 1, chunk]
+                + adj[2] * light_chunks[lit, 2, chunk]
+            )
+        for k in range(_WIDTH * light_chunks.shape[2], light.shape[2]):
+            adj_transfer[seen, vertex, k] = adj_transfer[seen, vertex, k] + wp.dot(
+                adj, wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
+            )
+
+
+@wp.kernel(enable_backward=False)
+def _shade_adjoint_light(
+    # in
+    transfer: wp.array3d(dtype=wp.float32),
+    transfer_chunks: wp.array3d(dtype=_Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_light: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a slab of receivers and a chunk of coefficients, the last one those left over:  L̄ = Σ T s̄."""
+    batch, slab, chunk = wp.tid()
+    seen = wp.min(batch, transfer.shape[0] - 1)
+    lit = wp.min(batch, adj_light.shape[0] - 1)
+    begin = slab * _SLAB
+    end = wp.min(begin + _SLAB, transfer.shape[1])
+    first = chunk * _WIDTH
+    if chunk < transfer_chunks.shape[2]:
+        red = _Chunk(0.0)
+        green = _Chunk(0.0)
+        blue = _Chunk(0.0)
+        for vertex in range(begin, end):
+            adj = adj_shading[batch, vertex]
+            t = transfer_chunks[seen, vertex, chunk]
+            red += adj[0] * t
+            green += adj[1] * t
+            blue += adj[2] * t
+        for i in range(_WIDTH):
+            wp.atomic_add(adj_light, lit, 0, first + i, red[i])
+            wp.atomic_add(adj_light, lit, 1, first + i, green[i])
+            wp.atomic_add(adj_light, lit, 2, first + i, blue[i])
+    else:
+        for k in range(first, transfer.shape[2]):
+            total = wp.vec3()
+            for vertex in range(begin, end):
+                total += transfer[seen, vertex, k] * adj_shading[batch, vertex]
+            for channel in range(3):
+                wp.atomic_add(adj_light, lit, channel, k, total[channel])
 
 
 def shade(transfer: wp.array, light: wp.array) -> wp.array:
@@ -309,71 +150,78 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
     Args:
         transfer: Transfer vectors, float32 of shape [batch, vertex, coefficient].
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
+            Either batch may be 1 and then serves every instance of the other.
 
     Returns:
         Shading, vec3 of shape [batch, vertex].
 
-    Differentiable: transfer, light.
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: transfer, light. Exact, both being linear.
     """
-    check.shape("light", light.shape, (transfer.shape[0], transfer.shape[2]))
+    check.shape("light", light.shape, ("batch", transfer.shape[2]))
+    check.finite_arrays({"light": light}, most=check.LARGEST)
+    for name, array in (("transfer", transfer), ("light", light)):
+        if not array.is_contiguous:
+            raise ValueError(f"{name}: got a strided array, expected a contiguous one")
+    device = transfer.device
+    light_count, count = light.shape
+    instances = common_batch({"transfer": transfer, "light": light})
     shading = wp.empty(
-        transfer.shape[:2],
+        (instances, transfer.shape[1]),
         dtype=wp.vec3,
-        device=transfer.device,
+        device=device,
         requires_grad=transfer.requires_grad or light.requires_grad,
     )
-    wp.launch(_shade, dim=shading.shape, inputs=[transfer, light], outputs=[shading], device=transfer.device)
+    channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
+    wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
+    factors = [transfer, _as_chunks(transfer), channels, _as_chunks(channels)]
+    wp.launch(_shade, dim=shading.shape, inputs=factors, outputs=[shading], device=device, record_tape=False)
+
+    def adjoint() -> None:
+        if transfer.requires_grad:
+            wp.launch(
+                _shade_adjoint_transfer,
+                dim=transfer.shape[:2],
+                inputs=[*factors[2:], shading.grad],
+                outputs=[transfer.grad, _as_chunks(transfer.grad)],
+                device=device,
+                record_tape=False,
+            )
+        if light.requires_grad:
+            adj_channels = wp.zeros_like(channels)
+            slab_count = -(-transfer.shape[1] // _SLAB)
+            wp.launch(
+                _shade_adjoint_light,
+                dim=(instances, slab_count, -(-count // _WIDTH)),
+                inputs=[*factors[:2], shading.grad],
+                outputs=[adj_channels],
+                device=device,
+                record_tape=False,
+            )
+            wp.launch(
+                _join_channels,
+                dim=light.shape,
+                inputs=[adj_channels],
+                outputs=[light.grad],
+                device=device,
+                record_tape=False,
+            )
+
+    record_adjoint(adjoint, [transfer, light, shading])
     return shading
 
 
-# ---------------------------------------------------------------------------------------------- textures
-
-
-@wp.kernel
-def _sample_texture(
-    # in
-    texture: wp.array2d(dtype=wp.vec3),
-    pixels: wp.array(dtype=wp.int32),
-    uvs: wp.array(dtype=wp.vec2),
-    # out
-    albedo: wp.array(dtype=wp.vec3),
-):
-    """A thread owns a textured pixel: the four texels around its uv, which repeats outside of [0, 1]."""
-    thread = wp.tid()
-    height = texture.shape[0]
-    width = texture.shape[1]
-    pixel = pixels[thread]
-    uv = uvs[pixel]
-    x = (uv[0] - wp.floor(uv[0])) * float(width) - 0.5
-    y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(height) - 0.5
-    left = int(wp.floor(x))
-    top = int(wp.floor(y))
-    s = x - float(left)
-    t = y - float(top)
-    left = (left + width) % width
-    top = (top + height) % height
-    right = (left + 1) % width
-    bottom = (top + 1) % height
-    above = (1.0 - s) * texture[top, left] + s * texture[top, right]
-    below = (1.0 - s) * texture[bottom, left] + s * texture[bottom, right]
-    albedo[pixel] = (1.0 - t) * above + t * below
-
-
-def sample_texture(texture: wp.array, pixels: wp.array, uvs: wp.array, albedo: wp.array) -> None:
-    """Fill the pixels of a textured body with its texture, bilinearly; it repeats outside of [0, 1].
-
-    Args:
-        texture: Linear RGB, row 0 at v = 1, vec3 of shape [height, width].
-        pixels: Flat indices of the pixels that show the body, int32 of shape [textured pixel].
-        uvs: Texture coordinates of all pixels, vec2 of shape [pixel].
-        albedo: Filled at ``pixels``, vec3 of shape [pixel].
-
-    Differentiable: texture.
-    """
-    wp.launch(
-        _sample_texture,
-        dim=pixels.shape,
-        inputs=[texture, pixels, uvs],
-        outputs=[albedo],
-        device=texture.device,
+def _as_chunks(rows: wp.array) -> wp.array:
+    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; what is left over is not in it."""
+    instances, row_count, count = rows.shape
+    chunks = wp.array(
+        ptr=rows.ptr,
+        dtype=_Chunk,
+        shape=(instances, row_count, count // _WIDTH),
+        strides=(*rows.strides[:2], 4 * _WIDTH),
+        device=rows.device,
     )
+    chunks._ref = rows  # the memory stays while the view does
+    return chunks

@@ -1,24 +1,80 @@
 """Silhouettes: edges that a rasterized image has between pixels, smoothed so that their gradient moves vertices.
 
-Where two neighboring pixels see different faces and a silhouette edge of the nearer one runs between their centers, the
-pixel whose half the edge cuts takes that share of the other's color (Laine et al. 2020, section 3.5):
+Where the surface that the nearer of two neighboring pixels sees ends before the other's center, at a silhouette edge,
+each of the two takes of the other's color what of itself lies beyond the edge (after Laine et al. 2020, section 3.5,
+who take edges as upright). With the edge at distance t from a pixel's own center towards the other's, leaning by m
+pixels a pixel (at most 1), that is the area beyond a straight edge,
 
-    t = where the edge crosses the line from the nearer pixel's center (0) to the other's (1)
-    t > ½: the other pixel takes t − ½ of the nearer's color;   t < ½: the nearer takes ½ − t of the other's
+    e = ½ − t                     t ≤ (1 − m)/2
+        ((1 + m)/2 − t)² / 2m     between
+        0                         t ≥ (1 + m)/2
+
+An edge cuts rows and columns of pixels. It counts ω = 1 / (1 + m⁴) where it does the one, and the rest where it does
+the other. A pixel of color c, with neighbors of colors c_k, so becomes
+
+    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          sides l across side k
+
+which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common, nothing
+if they lie beyond one edge, their product if they lie beyond two upright ones. Lines where two surfaces intersect are
+smoothed alike.
+
+On screen an edge with ends a, b is the line ℓ = a × b, and the intersection of two faces the line ℓ = n − n′ on which
+their planes n·(x, y, w) = 1 have the same depth. In a row, where ℓ·(x, y, 1) = 0, lines move by
+
+    dx = (α ℓ·da + β ℓ·db) / ℓ_x                            α, β: the point on the edge is α a + β b, with w = 1
+    dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of what the pixels see, u: its 1/w
+
+How m changes is left out: it hardly matters to what two pixels take of each other on balance (1e-4 of the gradient by
+a rigid motion), and at edges far below a pixel it would outweigh the rest, pulling their ends opposite ways.
 """
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.raster import Fragments
+from warpshadow.tape import record_adjoint
+
+wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 s, and runs as fast
 
 MOST_STEPS = 32
 """Faces that are walked over between the centers of two pixels before the search for an edge is given up."""
 
+LEAST_OPENING = 1e-4
+"""Relative change of two surfaces' distance over a pixel, below which rounding hides where they intersect."""
+
 _NOT_MANIFOLD = -2
+
+# Rasterization moves vertices by up to 1/8192 pixel, so an edge may be this far on the wrong side of a center [pixels].
+_SNAP = 1.0 / 2048.0
+
+# In place of an edge's vertices.
+_NOTHING = -1
+_INTERSECTION = -2
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouettes:
+    """Where an image has silhouettes: an entry for every pixel beside one.
+
+    Args:
+        pixels: Index of the pixel in the flat images [batch, height, width], −1 in an entry that is not used, int32 of
+            shape [entry].
+        edges: Vertices of the edge between it and its neighbor to the right, left, below and above; (−1, −1) where
+            there is none, (−2, −2) where their faces intersect; vec2i of shape [entry, 4].
+        shares: The area e of the pixel that lies beyond each, and how much it counts, ω; vec2 of shape [entry, 4].
+        fragments: What each pixel sees.
+        faces: The rasterized faces, vec3i of shape [face].
+    """
+
+    pixels: wp.array
+    edges: wp.array
+    shares: wp.array
+    fragments: Fragments
+    faces: wp.array
 
 
 def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
@@ -31,43 +87,103 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
 
     Returns:
         Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
-        than two faces meet. Both are silhouettes from everywhere.
+        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
+        and has no neighbors itself.
     """
     check.shape("faces", faces.shape, ("face", 3))
     if positions is not None:
         *_, place = np.unique(positions, axis=0, return_inverse=True)
         faces = place.reshape(-1)[faces]
-    count = len(faces)
-    ends = np.sort(np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-    _, edge, sharing = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    across = np.full(faces.shape, -1, np.int32)
+    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
+    _, edge, sharing = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True)
     edge = edge.reshape(-1)
-    owner = np.repeat(np.arange(count), 3)
+    owner = np.repeat(proper, 3)
     total = np.zeros(len(sharing), np.int64)
     np.add.at(total, edge, owner)
-    across = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
-    return across.reshape(-1, 3).astype(np.int32)
+    found = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
+    across[proper] = found.reshape(-1, 3)
+    return across
+
+
+# --------------------------------------------------------------------------------------------------- lines on screen
 
 
 @wp.func
-def _side(a: wp.vec4, b: wp.vec4, x: float, y: float):
-    """Volume that the ray through screen point (x, y) spans with two vertices; its sign is the side of the line ab."""
-    ax = a[0] - x * a[3]
-    ay = a[1] - y * a[3]
-    bx = b[0] - x * b[3]
-    by = b[1] - y * b[3]
-    return ax * by - ay * bx
+def _center(pixel: int, width: int, height: int):
+    """Center of a pixel of the flat images, in normalized device coordinates."""
+    row = pixel / width
+    x = float(2 * (pixel - row * width) + 1 - width) / float(width)
+    y = float(2 * (row % height) + 1 - height) / float(height)
+    return wp.vec2(x, y)
 
 
 @wp.func
-def _facing(clip_positions: wp.array(dtype=wp.vec4), face: wp.vec3i):
-    """Sign of the orientation of a face on screen."""
-    a = clip_positions[face[0]]
-    b = clip_positions[face[1]]
-    c = clip_positions[face[2]]
-    volume = (
-        a[0] * (b[1] * c[3] - c[1] * b[3]) - a[1] * (b[0] * c[3] - c[0] * b[3]) + a[3] * (b[0] * c[1] - c[0] * b[1])
-    )
-    return wp.sign(volume)
+def _neighbor(pixel: int, side: int, width: int):
+    """Pixel to the right (side 0), left, below or above."""
+    step = wp.where(side < 2, 1, width)
+    return pixel + wp.where(side % 2 == 0, step, -step)
+
+
+@wp.func
+def _relative(p: wp.vec4, center: wp.vec2):
+    """The x, y and w of a vertex relative to the ray through a point of the screen, so that nothing cancels there."""
+    return wp.vec3(p[0] - center[0] * p[3], p[1] - center[1] * p[3], p[3])
+
+
+@wp.func
+def _plane(face: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
+    """Plane n·(x, y, w) = 1 of a face relative to the ray through a point of the screen; n_w is 1/w there."""
+    a = _relative(clip_positions[face[0]], center)
+    b = _relative(clip_positions[face[1]], center)
+    c = _relative(clip_positions[face[2]], center)
+    normal = wp.cross(b - a, c - a)
+    return normal / wp.dot(normal, a)
+
+
+@wp.func
+def _line(
+    pixel: int,
+    side: int,
+    edge: wp.vec2i,
+    width: int,
+    height: int,
+    face_ids: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """The line ℓ between a pixel and its neighbor to a side, relative to the pixel's center."""
+    center = _center(pixel, width, height)
+    if edge[0] >= 0:
+        return wp.cross(_relative(clip_positions[edge[0]], center), _relative(clip_positions[edge[1]], center))
+    here = faces[face_ids[pixel]]
+    there = faces[face_ids[_neighbor(pixel, side, width)]]
+    return _plane(here, center, clip_positions) - _plane(there, center, clip_positions)
+
+
+@wp.func
+def _distance(line: wp.vec3, side: int, half_size: wp.vec2):
+    """Where a line crosses the way from a pixel's center to its neighbor's, t [pixels]."""
+    axis = side / 2
+    return float(2 * (side % 2) - 1) * half_size[axis] * line[2] / line[axis]
+
+
+@wp.func
+def _lean(line: wp.vec3, side: int, half_size: wp.vec2):
+    """How far along that way a line moves from one row (or column) of pixels to the next, m [pixels]."""
+    axis = side / 2
+    return wp.abs(line[1 - axis] / line[axis]) * half_size[axis] / half_size[1 - axis]
+
+
+# ---------------------------------------------------------------------------------------------------- where they are
+
+
+@wp.func
+def _volume(a: wp.vec4, b: wp.vec4, c: wp.vec4):
+    """Volume that the eye spans with a face: its sign is the face's orientation on screen."""
+    origin = wp.vec3(a[0], a[1], a[3])
+    return wp.dot(wp.cross(wp.vec3(b[0], b[1], b[3]) - origin, wp.vec3(c[0], c[1], c[3]) - origin), origin)
 
 
 @wp.func
@@ -85,196 +201,674 @@ def _depth(face: int, weights: wp.vec3, faces: wp.array(dtype=wp.vec3i), clip_po
 
 
 @wp.func
-def _crosses(a: wp.vec4, b: wp.vec4, x0: float, y0: float, x1: float, y1: float):
-    """Whether an edge before the eye runs between two screen points: they on two sides of it, its ends of theirs."""
-    result = False
-    if a[3] > 0.0 and b[3] > 0.0 and _side(a, b, x0, y0) * _side(a, b, x1, y1) < 0.0:
-        # the line through the points is a row or a column
-        start = wp.where(y0 == y1, a[1] - y0 * a[3], a[0] - x0 * a[3])
-        end = wp.where(y0 == y1, b[1] - y0 * b[3], b[0] - x0 * b[3])
-        result = wp.min(start, end) <= 0.0 and wp.max(start, end) > 0.0
-    return result
+def _is_silhouette(
+    face: int,
+    across: int,
+    a: wp.vec4,
+    b: wp.vec4,
+    volume: float,
+    faces: wp.array(dtype=wp.vec3i),
+    neighbors: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """Whether the faces on both sides of edge ab lie on one side of it on screen, however they wind."""
+    if across < 0:
+        return True
+    back = neighbors[across]
+    corner = wp.where(back[0] == face, 0, wp.where(back[1] == face, 1, 2))
+    return volume * _volume(a, b, clip_positions[faces[across][corner]]) >= 0.0
+
+
+@wp.func
+def _end_of_surface(
+    start: int,
+    goal: int,
+    end: wp.vec2,
+    axis: int,
+    faces: wp.array(dtype=wp.vec3i),
+    neighbors: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """Walk over a surface, from face to face along a row or column, until below a point of the screen.
+
+    Returns 3 face + corner of the silhouette edge at which the surface ends before, −1 if it does not.
+    """
+    found = int(-1)
+    face = start
+    step = int(0)
+    while face >= 0 and face != goal and step < MOST_STEPS:
+        corners = faces[face]
+        around = neighbors[face]
+        volume = _volume(clip_positions[corners[0]], clip_positions[corners[1]], clip_positions[corners[2]])
+        onward = int(-1)
+        for k in range(3):
+            p = clip_positions[corners[(k + 1) % 3]]
+            q = clip_positions[corners[(k + 2) % 3]]
+            a = _relative(p, end)
+            b = _relative(q, end)
+            across_a = a[1 - axis]
+            across_b = b[1 - axis]
+            if wp.min(across_a, across_b) <= 0.0 and wp.max(across_a, across_b) > 0.0:
+                line = wp.cross(a, b)
+                is_before_eye = wp.where(axis == 0, -line[0], line[1]) * (across_b - across_a) > 0.0
+                if line[2] * volume < 0.0 and is_before_eye:
+                    if _is_silhouette(face, around[k], p, q, volume, faces, neighbors, clip_positions):
+                        found = 3 * face + k
+                    else:
+                        onward = around[k]
+        face = wp.where(found >= 0, -1, onward)
+        step += 1
+    return found
+
+
+@wp.func
+def _silhouette_between(
+    pixel: int,
+    side: int,
+    width: int,
+    height: int,
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    neighbors: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """The one silhouette edge between a pixel and its neighbor to a side, as 3 face + corner, or −1.
+
+    It is where the nearer one's surface ends; only if that goes on, below the other's, is it where the other's ends.
+    """
+    other = _neighbor(pixel, side, width)
+    here = face_ids[pixel]
+    there = face_ids[other]
+    depth_here = _depth(here, barycentrics[pixel], faces, clip_positions)
+    depth_there = _depth(there, barycentrics[other], faces, clip_positions)
+    axis = side / 2
+    first = _center(pixel, width, height)
+    last = _center(other, width, height)
+    margin = _SNAP * (last - first)
+    found = int(-1)
+    for attempt in range(2):
+        if found < 0:
+            from_here = (depth_here <= depth_there) == (attempt == 0)
+            start = wp.where(from_here, here, there)
+            goal = wp.where(from_here, there, here)
+            end = wp.where(from_here, last + margin, first - margin)
+            found = _end_of_surface(start, goal, end, axis, faces, neighbors, clip_positions)
+    return found
+
+
+@wp.func
+def _add_crossing(
+    pixel: int,
+    side: int,
+    edge: wp.vec2i,
+    width: int,
+    crossing_count: wp.array(dtype=wp.int32),
+    crossings: wp.array(dtype=wp.vec4i),
+    claims: wp.array(dtype=wp.int32),
+):
+    """Add what lies between two pixels to the list. Of the crossings beside a pixel one claims it, no matter which."""
+    crossing = wp.atomic_add(crossing_count, 0, 1)
+    crossings[crossing] = wp.vec4i(pixel, side, edge[0], edge[1])
+    claims[pixel] = 2 * crossing
+    claims[_neighbor(pixel, side, width)] = 2 * crossing + 1
+
+
+@wp.func
+def _add_edge_if_seen(
+    pixel: int,
+    side: int,
+    edge: wp.vec2i,
+    half_edge: int,
+    width: int,
+    height: int,
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    neighbors: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+    crossing_count: wp.array(dtype=wp.int32),
+    crossings: wp.array(dtype=wp.vec4i),
+    claims: wp.array(dtype=wp.int32),
+):
+    """Add an edge that passes between a pixel and its neighbor if it is what they see."""
+    if face_ids[pixel] != face_ids[_neighbor(pixel, side, width)]:
+        found = _silhouette_between(
+            pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip_positions
+        )
+        if found == half_edge:
+            _add_crossing(pixel, side, edge, width, crossing_count, crossings, claims)
+
+
+@wp.func
+def _end_on_screen(p: wp.vec4, q: wp.vec4, half_size: wp.vec2):
+    """The end p of an edge pq, or where the edge meets the near plane if p lies behind it [pixels]."""
+    behind = p[2] - p[3]
+    end = p
+    if behind > 0.0:
+        end = p + (behind / (behind - (q[2] - q[3]))) * (q - p)
+    return wp.vec2((end[0] / end[3] + 1.0) * half_size[0], (end[1] / end[3] + 1.0) * half_size[1])
+
+
+@wp.func
+def _centers_before(coordinate: float, count: int):
+    """How many of ``count`` pixels have their centers before a coordinate [pixels]."""
+    return int(wp.clamp(wp.ceil(coordinate - 0.5), 0.0, float(count)))
 
 
 @wp.kernel(enable_backward=False)
-def _find_crossings(
+def _find_edges(
     # in
-    face_ids: wp.array3d(dtype=wp.int32),
-    barycentrics: wp.array3d(dtype=wp.vec3),
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     neighbors: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    strip_count: int,
     # out
-    crossings: wp.array4d(dtype=wp.vec2i),
+    crossing_count: wp.array(dtype=wp.int32),
+    crossings: wp.array(dtype=wp.vec4i),
+    claims: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a pixel and its right (axis 0) or lower (axis 1) neighbor: the silhouette edge between them.
+    """A thread owns every ``strip_count``-th row and column that the silhouette edges of a face of an instance cut.
 
-    It walks over the surface from the nearer pixel towards the other, from face to face, until it leaves it. A crossing
-    is the edge's two vertices, −1 for none.
+    Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings.
     """
-    batch, row, column = wp.tid()
-    height = face_ids.shape[1]
-    width = face_ids.shape[2]
-    here = face_ids[batch, row, column]
+    batch, face, strip = wp.tid()
     clip = clip_positions[batch]
-    for axis in range(2):
-        crossing = wp.vec2i(-1, -1)
-        other_row = row + axis
-        other_column = column + 1 - axis
-        there = here
-        if other_row < height and other_column < width:
-            there = face_ids[batch, other_row, other_column]
-        if here != there:
-            x0 = float(2 * column + 1 - width) / float(width)
-            y0 = float(2 * row + 1 - height) / float(height)
-            x1 = float(2 * other_column + 1 - width) / float(width)
-            y1 = float(2 * other_row + 1 - height) / float(height)
-            face = here
-            depth = _depth(here, barycentrics[batch, row, column], faces, clip)
-            if _depth(there, barycentrics[batch, other_row, other_column], faces, clip) < depth:
-                face = there
-            came_from = int(-1)
-            step = int(0)
-            while face >= 0 and step < MOST_STEPS:
-                corners = faces[face]
-                facing = _facing(clip, corners)
-                onward = int(-1)
-                for k in range(3):
-                    across = neighbors[face][k]
-                    i = corners[(k + 1) % 3]
-                    j = corners[(k + 2) % 3]
-                    if (across < 0 or across != came_from) and _crosses(clip[i], clip[j], x0, y0, x1, y1):
-                        is_silhouette = across < 0
-                        if across >= 0:
-                            is_silhouette = _facing(clip, faces[across]) * facing <= 0.0
-                        if is_silhouette:
-                            # steep edges cut rows, flat ones columns, so that no share is counted twice
-                            a = clip[i]
-                            b = clip[j]
-                            across_x = wp.abs(b[0] * a[3] - a[0] * b[3]) * float(width)
-                            across_y = wp.abs(b[1] * a[3] - a[1] * b[3]) * float(height)
-                            if (across_y >= across_x) == (axis == 0):
-                                crossing = wp.vec2i(i, j)
-                            onward = -1
-                        elif crossing[0] < 0:
-                            onward = across
-                came_from = face
-                face = onward
-                if crossing[0] >= 0:
-                    face = -1
-                step += 1
-        crossings[batch, axis, row, column] = crossing
+    corners = faces[face]
+    around = neighbors[face]
+    half_size = 0.5 * wp.vec2(float(width), float(height))
+    volume = _volume(clip[corners[0]], clip[corners[1]], clip[corners[2]])
+    for k in range(3):
+        edge = wp.vec2i(corners[(k + 1) % 3], corners[(k + 2) % 3])
+        a = clip[edge[0]]
+        b = clip[edge[1]]
+        is_before_near_plane = a[3] > a[2] or b[3] > b[2]
+        if is_before_near_plane and _is_silhouette(face, around[k], a, b, volume, faces, neighbors, clip):
+            p = _end_on_screen(a, b, half_size)
+            q = _end_on_screen(b, a, half_size)
+            for axis in range(2):
+                # Said for axis 0: along rows, from the lower to the higher row. Axis 1 goes along columns.
+                low = wp.where(p[1 - axis] < q[1 - axis], p, q)
+                high = wp.where(p[1 - axis] < q[1 - axis], q, p)
+                extent = high[1 - axis] - low[1 - axis]
+                slope = (high[axis] - low[axis]) / wp.max(extent, 1.0e-30)
+                row_count = wp.where(axis == 0, height, width)
+                column_count = wp.where(axis == 0, width, height)
+                row = _centers_before(low[1 - axis] - _SNAP, row_count) + strip
+                row_end = _centers_before(high[1 - axis] + _SNAP, row_count)
+                while row < row_end:
+                    x = low[axis] + slope * wp.clamp(float(row) + 0.5 - low[1 - axis], 0.0, extent)
+                    column = wp.max(_centers_before(x - _SNAP, column_count) - 1, 0)
+                    column_end = wp.min(_centers_before(x + _SNAP, column_count), column_count - 1)
+                    while column < column_end:
+                        _add_edge_if_seen(
+                            batch * width * height + wp.where(axis == 0, row * width + column, column * width + row),
+                            2 * axis,
+                            edge,
+                            3 * face + k,
+                            width,
+                            height,
+                            face_ids,
+                            barycentrics,
+                            faces,
+                            neighbors,
+                            clip,
+                            crossing_count,
+                            crossings,
+                            claims,
+                        )
+                        column += 1
+                    row += strip_count
 
 
-@functools.cache
-def _blend_kernel(dtype: type) -> wp.Kernel:
-    @wp.func
-    def share(
-        crossings: wp.array4d(dtype=wp.vec2i),
-        clip_positions: wp.array2d(dtype=wp.vec4),
-        batch: int,
-        axis: int,
-        row: int,
-        column: int,
-        place: int,
-        height: int,
-        width: int,
-    ):
-        """What a pixel takes of its neighbor's color; place says whether it is the first or the second of the pair."""
-        taken = float(0.0)
-        crossing = crossings[batch, axis, row, column]
-        if crossing[0] >= 0:
-            a = clip_positions[batch, crossing[0]]
-            b = clip_positions[batch, crossing[1]]
-            x = float(2 * column + 1 - width) / float(width)
-            y = float(2 * row + 1 - height) / float(height)
-            first = _side(a, b, x, y)
-            second = _side(a, b, x + 2.0 * float(1 - axis) / float(width), y + 2.0 * float(axis) / float(height))
-            t = first / (first - second)  # from the first pixel's center
-            if place == 0:
-                t = 1.0 - t
-            # t is now from the neighbor's center: where the edge lies beyond the middle, its color reaches here, be
-            # the neighbor in front (its face juts out) or behind (this pixel's face ends short)
-            taken = wp.max(t - 0.5, 0.0)
-        return taken
-
-    @wp.kernel(module="unique")
-    def blend(
-        # in
-        image: wp.array3d(dtype=dtype),
-        crossings: wp.array4d(dtype=wp.vec2i),
-        clip_positions: wp.array2d(dtype=wp.vec4),
-        # out
-        smoothed: wp.array3d(dtype=dtype),
-    ):
-        """A thread owns a pixel and takes what its four neighbors' edges give it."""
-        batch, row, column = wp.tid()
-        height = image.shape[1]
-        width = image.shape[2]
-        here = image[batch, row, column]
-        total = here
-        if column + 1 < width:
-            taken = share(crossings, clip_positions, batch, 0, row, column, 0, height, width)
-            total += taken * (image[batch, row, column + 1] - here)
-        if column > 0:
-            taken = share(crossings, clip_positions, batch, 0, row, column - 1, 1, height, width)
-            total += taken * (image[batch, row, column - 1] - here)
-        if row + 1 < height:
-            taken = share(crossings, clip_positions, batch, 1, row, column, 0, height, width)
-            total += taken * (image[batch, row + 1, column] - here)
-        if row > 0:
-            taken = share(crossings, clip_positions, batch, 1, row - 1, column, 1, height, width)
-            total += taken * (image[batch, row - 1, column] - here)
-        smoothed[batch, row, column] = total
-
-    return blend
+@wp.func
+def _approach(
+    pixel: int,
+    side: int,
+    width: int,
+    height: int,
+    face_ids: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """Whether the face of a pixel's neighbor gets clearly nearer than the pixel's from one to the other."""
+    axis = side / 2
+    line = _line(pixel, side, wp.vec2i(_INTERSECTION, _INTERSECTION), width, height, face_ids, faces, clip_positions)
+    inverse_depth = _plane(faces[face_ids[pixel]], _center(pixel, width, height), clip_positions)[2]
+    half_size = wp.where(axis == 0, 0.5 * float(width), 0.5 * float(height))
+    opening = float(2 * (side % 2) - 1) * line[axis] / half_size
+    return opening > LEAST_OPENING * inverse_depth
 
 
-def smooth_silhouettes(
-    image: wp.array, fragments: Fragments, faces: wp.array, neighbors: wp.array, clip_positions: wp.array
-) -> wp.array:
-    """Smooth a rasterized image along silhouettes, by how much of a pixel the edge's face covers.
+@wp.kernel(enable_backward=False)
+def _find_intersections(
+    # in
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    neighbors: wp.array(dtype=wp.vec3i),
+    surfaces: wp.array(dtype=wp.int32),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    run: int,
+    # out
+    crossing_count: wp.array(dtype=wp.int32),
+    crossings: wp.array(dtype=wp.vec4i),
+    claims: wp.array(dtype=wp.int32),
+):
+    """A thread owns ``run`` pixels after one another: what is between each and its right and its lower neighbor."""
+    first = wp.tid() * run
+    for pixel in range(first, wp.min(first + run, face_ids.shape[0])):
+        here = face_ids[pixel]
+        if here >= 0:
+            # Nearly all pixels end here, so this comes first, and without branches.
+            last = face_ids.shape[0] - 1
+            surface = surfaces[here]
+            right = surfaces[wp.max(face_ids[wp.min(pixel + 1, last)], 0)]
+            below = surfaces[wp.max(face_ids[wp.min(pixel + width, last)], 0)]
+            if right != surface or below != surface:
+                row = pixel / width
+                batch = row / height
+                clip = clip_positions[batch]
+                for axis in range(2):
+                    side = 2 * axis
+                    other = _neighbor(pixel, side, width)
+                    is_last = wp.where(axis == 0, other == (row + 1) * width, other >= (batch + 1) * height * width)
+                    differs = not is_last and wp.where(axis == 0, right, below) != surface and face_ids[other] >= 0
+                    if differs and _approach(pixel, side, width, height, face_ids, faces, clip):
+                        found = _silhouette_between(
+                            pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip
+                        )
+                        if found < 0:
+                            edge = wp.vec2i(_INTERSECTION, _INTERSECTION)
+                            _add_crossing(pixel, side, edge, width, crossing_count, crossings, claims)
+
+
+@wp.kernel(enable_backward=False)
+def _gather(
+    # in
+    crossing_count: wp.array(dtype=wp.int32),
+    crossings: wp.array(dtype=wp.vec4i),
+    claims: wp.array(dtype=wp.int32),
+    width: int,
+    # out
+    pixels: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+):
+    """A thread owns a crossing: it goes to the entries of its two pixels; pixels and edges are −1 before."""
+    thread = wp.tid()
+    if thread < crossing_count[0]:
+        crossing = crossings[thread]
+        side = crossing[1]
+        edge = wp.vec2i(crossing[2], crossing[3])
+        pixel = crossing[0]
+        other = _neighbor(pixel, side, width)
+        pixels[claims[pixel]] = pixel
+        pixels[claims[other]] = other
+        edges[claims[pixel], side] = edge
+        edges[claims[other], side + 1] = edge
+
+
+@wp.kernel(enable_backward=False)
+def _measure(
+    # in
+    pixels: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    face_ids: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    # out
+    shares: wp.array2d(dtype=wp.vec2),
+):
+    """A thread owns a side of an entry's pixel: the area e beyond the line there, and how much it counts, ω."""
+    entry, side = wp.tid()
+    edge = edges[entry, side]
+    share = wp.vec2()
+    if edge[0] != _NOTHING:
+        pixel = pixels[entry]
+        half_size = 0.5 * wp.vec2(float(width), float(height))
+        clip = clip_positions[pixel / (width * height)]
+        line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
+        t = wp.clamp(_distance(line, side, half_size), 0.0, 1.0)
+        lean = _lean(line, side, half_size)
+        m = wp.min(lean, 1.0)
+        area = float(0.0)
+        if t <= 0.5 * (1.0 - m):
+            area = 0.5 - t
+        elif t < 0.5 * (1.0 + m):
+            rest = 0.5 * (1.0 + m) - t
+            area = 0.5 * rest * rest / m
+        if wp.isfinite(line / line[side / 2]):  # else vertices are so far away that products overflow
+            share = wp.vec2(area, 1.0 / (1.0 + lean * lean * lean * lean))
+    shares[entry, side] = share
+
+
+def find_silhouettes(
+    fragments: Fragments,
+    faces: wp.array,
+    neighbors: wp.array,
+    clip_positions: wp.array,
+    surfaces: wp.array | None = None,
+) -> Silhouettes:
+    """Find the edges at which the surfaces in an image end, and the lines where they intersect.
 
     Args:
-        image: float32 or a vector of them, shape [batch, height, width]; of ones and zeros it becomes the coverage.
         fragments: What each pixel sees.
         faces: The rasterized faces, vec3i of shape [face].
         neighbors: :func:`edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
+        surfaces: A number for each face, the same all over a body, int32 of shape [face]. Intersections are looked for
+            between different ones; without it there are none, and where bodies intersect they have no gradient.
 
     Returns:
-        Smoothed image, like ``image``.
+        Silhouettes, for :func:`smooth_silhouettes`. They have as many entries as need be: the count is read back, which
+        waits for the device. While a CUDA graph is captured they have four a pixel instead, and nothing is read.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
 
-    Differentiable: image, clip_positions. Which edges cross where is not, as it changes at isolated poses only. An edge
-    with a vertex behind the eye, and lines where surfaces intersect, are not smoothed.
+    Not differentiable: which lines lie between which pixels changes at isolated poses only.
     """
-    check.shape("image", image.shape, fragments.face_ids.shape)
+    batch_count, height, width = fragments.face_ids.shape
     check.shape("neighbors", neighbors.shape, faces.shape)
-    batch_count, height, width = image.shape
-    device = image.device
-    crossings = wp.empty((batch_count, 2, height, width), dtype=wp.vec2i, device=device)
+    check.shape("clip_positions", clip_positions.shape, (batch_count, "vertex"))
+    face_ids, barycentrics = fragments.face_ids.flatten(), fragments.barycentrics.flatten()
+    device = face_ids.device
+    crossing_count = wp.zeros(1, dtype=wp.int32, device=device)
+    crossings = wp.empty(2 * face_ids.size, dtype=wp.vec4i, device=device)
+    claims = wp.empty(face_ids.size, dtype=wp.int32, device=device)
+    strip_count = _strip_count(device)
     wp.launch(
-        _find_crossings,
-        dim=image.shape,
-        inputs=[fragments.face_ids, fragments.barycentrics, faces, neighbors, clip_positions],
-        outputs=[crossings],
+        _find_edges,
+        dim=(batch_count, faces.shape[0], strip_count),
+        inputs=[face_ids, barycentrics, faces, neighbors, clip_positions, width, height, strip_count],
+        outputs=[crossing_count, crossings, claims],
         device=device,
         record_tape=False,
     )
-    smoothed = wp.empty(
-        image.shape,
-        dtype=image.dtype,
+    if surfaces is not None:
+        check.shape("surfaces", surfaces.shape, faces.shape)
+        run = 1 if device.is_cuda else width
+        wp.launch(
+            _find_intersections,
+            dim=-(-face_ids.size // run),
+            inputs=[face_ids, barycentrics, faces, neighbors, surfaces, clip_positions, width, height, run],
+            outputs=[crossing_count, crossings, claims],
+            device=device,
+            record_tape=False,
+        )
+    most = crossings.size if device.is_capturing else int(crossing_count.numpy()[0])
+    pixels = wp.full(2 * most, -1, dtype=wp.int32, device=device)
+    edges = wp.full((2 * most, 4), wp.vec2i(_NOTHING, _NOTHING), dtype=wp.vec2i, device=device)
+    wp.launch(
+        _gather,
+        dim=most,
+        inputs=[crossing_count, crossings, claims, width],
+        outputs=[pixels, edges],
         device=device,
-        requires_grad=image.requires_grad or clip_positions.requires_grad,
+        record_tape=False,
     )
+    shares = wp.empty(edges.shape, dtype=wp.vec2, device=device)
+    wp.launch(
+        _measure,
+        dim=shares.shape,
+        inputs=[pixels, edges, face_ids, faces, clip_positions, width, height],
+        outputs=[shares],
+        device=device,
+        record_tape=False,
+    )
+    return Silhouettes(pixels, edges, shares, fragments, faces)
+
+
+def _strip_count(device: wp.Device) -> int:
+    """Threads that follow an edge: on CUDA several, so that none follows a long one alone."""
+    return 16 if device.is_cuda else 1
+
+
+# ------------------------------------------------------------------------------------------------ what they change
+
+
+@wp.func
+def _pull(line: wp.vec3, center: wp.vec2):
+    """A line or plane relative to a point of the screen, as a gradient in clip space."""
+    return wp.vec4(line[0], line[1], 0.0, line[2] - center[0] * line[0] - center[1] * line[1])
+
+
+@wp.kernel(enable_backward=False)
+def _measure_adjoint(
+    # in
+    pixels: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    height: int,
+    adj_areas: wp.array2d(dtype=wp.float32),
+    # out
+    adj_clip_positions: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a side of an entry's pixel: it pulls at the vertices of the line there."""
+    entry, side = wp.tid()
+    edge = edges[entry, side]
+    seed = adj_areas[entry, side]
+    if edge[0] != _NOTHING and seed != 0.0:
+        axis = side / 2
+        pixel = pixels[entry]
+        batch = pixel / (width * height)
+        clip = clip_positions[batch]
+        half_size = 0.5 * wp.vec2(float(width), float(height))
+        center = _center(pixel, width, height)
+        line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
+        t = wp.clamp(_distance(line, side, half_size), 0.0, 1.0)
+        m = wp.min(_lean(line, side, half_size), 1.0)
+        decline = float(0.0)  # of e with t
+        if t <= 0.5 * (1.0 - m):
+            decline = 1.0
+        elif t < 0.5 * (1.0 + m):
+            decline = (0.5 * (1.0 + m) - t) / m
+        onward = seed * decline * half_size[axis] * float(2 * (side % 2) - 1)  # gradient by the line's place
+        if edge[0] >= 0:
+            across_a = _relative(clip[edge[0]], center)[1 - axis]
+            across_b = _relative(clip[edge[1]], center)[1 - axis]
+            spread = wp.where(axis == 0, -line[0], line[1])
+            pull = onward * _pull(line / line[axis], center)
+            wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * pull)
+            wp.atomic_add(adj_clip_positions, batch, edge[1], (-across_a / spread) * pull)
+        else:
+            for end in range(2):
+                at = pixel
+                sign = float(1.0)
+                if end == 1:
+                    at = _neighbor(pixel, side, width)
+                    sign = -1.0
+                corners = faces[face_ids[at]]
+                ray = _center(at, width, height)
+                plane = _plane(corners, ray, clip)
+                pull = sign * onward * (plane[2] / line[axis]) * _pull(plane, ray)
+                for k in range(3):
+                    wp.atomic_add(adj_clip_positions, batch, corners[k], barycentrics[at][k] * pull)
+
+
+@wp.func
+def _in_common(share: wp.vec2, across: wp.vec2):
+    """Half of what an area has in common with one across it, a part of the former."""
+    return 0.5 * wp.max(share[1] + across[1] - 1.0, 0.0) * across[0]
+
+
+@functools.cache
+def _blend_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend(
+        # in
+        image: wp.array2d(dtype=dtype),
+        pixels: wp.array(dtype=wp.int32),
+        shares: wp.array2d(dtype=wp.vec2),
+        width: int,
+        # out
+        smoothed: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns an entry's pixel of an image; the smoothed image is a copy before."""
+        instance, entry = wp.tid()
+        pixel = pixels[entry]
+        if pixel >= 0:
+            here = image[instance, pixel]
+            total = here
+            for side in range(4):
+                share = shares[entry, side]
+                if share[0] > 0.0:
+                    across = wp.where(side < 2, 2, 0)
+                    counts = share[1] - _in_common(share, shares[entry, across])
+                    counts -= _in_common(share, shares[entry, across + 1])
+                    total += share[0] * counts * (image[instance, _neighbor(pixel, side, width)] - here)
+            smoothed[instance, pixel] = total
+
+    return blend
+
+
+@functools.cache
+def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
+    inner = wp.mul if dtype is wp.float32 else wp.dot
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend_adjoint(
+        # in
+        image: wp.array2d(dtype=dtype),
+        pixels: wp.array(dtype=wp.int32),
+        shares: wp.array2d(dtype=wp.vec2),
+        width: int,
+        adj_smoothed: wp.array2d(dtype=dtype),
+        # out
+        adj_image: wp.array2d(dtype=dtype),
+        adj_areas: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns an entry's pixel of an image; what it kept of its own color is in the gradient before."""
+        instance, entry = wp.tid()
+        pixel = pixels[entry]
+        if pixel >= 0:
+            seed = adj_smoothed[instance, pixel]
+            for side in range(4):
+                share = shares[entry, side]
+                if share[0] > 0.0:
+                    other = _neighbor(pixel, side, width)
+                    across = wp.where(side < 2, 2, 0)
+                    counts = share[1] - _in_common(share, shares[entry, across])
+                    counts -= _in_common(share, shares[entry, across + 1])
+                    if adj_image:
+                        wp.atomic_add(adj_image, instance, other, share[0] * counts * seed)
+                        wp.atomic_sub(adj_image, instance, pixel, share[0] * counts * seed)
+                    if adj_areas:
+                        change = inner(seed, image[instance, other] - image[instance, pixel])
+                        wp.atomic_add(adj_areas, entry, side, counts * change)
+                        for k in range(2):
+                            common = _in_common(shares[entry, across + k], share)
+                            wp.atomic_sub(adj_areas, entry, across + k, common * change)
+
+    return blend_adjoint
+
+
+@functools.cache
+def _add_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # in
+        values: wp.array(dtype=dtype),
+        # out
+        totals: wp.array(dtype=dtype),
+    ):
+        """A thread owns a value."""
+        i = wp.tid()
+        totals[i] = totals[i] + values[i]
+
+    return add
+
+
+def smooth_silhouettes(image: wp.array, silhouettes: Silhouettes, clip_positions: wp.array) -> wp.array:
+    """Smooth an image along silhouettes, by how much of a pixel lies beyond them.
+
+    It takes a copy of the image and, beside that, time in proportion to the length of the silhouettes.
+
+    Args:
+        image: float32 or a vector of them, shape [batch, height, width]; of ones where there is a face and zeros
+            elsewhere it becomes the coverage.
+        silhouettes: Of :func:`find_silhouettes`; if their batch is 1 they serve every image.
+        clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
+
+    Returns:
+        Smoothed image, like ``image``; a pixel lies within the range of itself and its four neighbors.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: image, clip_positions. An edge has the color of the pixels beside it, so where shading changes by δ
+    over a pixel there, its gradient is δ/2 off. Without gradient are intersections within one surface, cuts by the near
+    plane, and what leaves the image: there is no neighbor to take from.
+    """
+    fragments = silhouettes.fragments
+    batch_count, height, width = fragments.face_ids.shape
+    check.shape("image", image.shape, ("batch" if batch_count == 1 else batch_count, height, width))
+    check.shape("clip_positions", clip_positions.shape, (batch_count, "vertex"))
+    if getattr(image.dtype, "_wp_scalar_type_", image.dtype) is not wp.float32:
+        raise ValueError(f"image: got dtype {image.dtype.__name__}, expected float32 or a vector of them")
+    device, pixels, shares = image.device, silhouettes.pixels, silhouettes.shares
+    smoothed = wp.clone(image, requires_grad=False)
+    smoothed.requires_grad = image.requires_grad or clip_positions.requires_grad
+    instances = (image.shape[0] // batch_count, batch_count * height * width)
     wp.launch(
         _blend_kernel(image.dtype),
-        dim=image.shape,
-        inputs=[image, crossings, clip_positions],
-        outputs=[smoothed],
+        dim=(instances[0], pixels.size),
+        inputs=[image.reshape(instances), pixels, shares, width],
+        outputs=[smoothed.reshape(instances)],
         device=device,
+        record_tape=False,
     )
+
+    def adjoint() -> None:
+        adj_image = adj_areas = None
+        if image.requires_grad:
+            adj_image = image.grad.reshape(instances)
+            wp.launch(
+                _add_kernel(image.dtype),
+                dim=image.size,
+                inputs=[smoothed.grad.flatten()],
+                outputs=[image.grad.flatten()],
+                device=device,
+            )
+        if clip_positions.requires_grad:
+            adj_areas = wp.zeros(shares.shape, dtype=wp.float32, device=device)
+        wp.launch(
+            _blend_adjoint_kernel(image.dtype),
+            dim=(instances[0], pixels.size),
+            inputs=[image.reshape(instances), pixels, shares, width, smoothed.grad.reshape(instances)],
+            outputs=[adj_image, adj_areas],
+            device=device,
+        )
+        if clip_positions.requires_grad:
+            wp.launch(
+                _measure_adjoint,
+                dim=shares.shape,
+                inputs=[
+                    pixels,
+                    silhouettes.edges,
+                    fragments.face_ids.flatten(),
+                    fragments.barycentrics.flatten(),
+                    silhouettes.faces,
+                    clip_positions,
+                    width,
+                    height,
+                    adj_areas,
+                ],
+                outputs=[clip_positions.grad],
+                device=device,
+            )
+
+    record_adjoint(adjoint, [image, clip_positions, smoothed])
     return smoothed

@@ -1,6 +1,7 @@
-"""Adjoints written by hand, under Warp's tape."""
+"""Warp's tape: adjoints written by hand go under it, and what needs no gradient stays off it."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import warp as wp
 
@@ -16,3 +17,14 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
     wanted = [array for array in arrays if array is not None and array.requires_grad]
     if tape is not None and wanted:
         tape.record_func(adjoint, wanted)
+
+
+def launch(
+    kernel: wp.Kernel, dim: int | Sequence[int], *, inputs: Sequence[Any], outputs: Sequence[wp.array], device: Any
+) -> None:
+    """Launch a kernel, on the tape only if an input requires a gradient.
+
+    Warp records every launch, and playing it back compiles its adjoint and runs it, be a gradient asked for or not.
+    """
+    is_wanted = any(isinstance(value, wp.array) and value.requires_grad for value in inputs)
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=is_wanted)

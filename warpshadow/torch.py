@@ -1,33 +1,42 @@
-"""Rendering with torch tensors: images that are differentiable in light, albedo and textures.
+"""Rendering with torch tensors: images that are differentiable in light, reflectance, geometry and cameras.
 
-Geometry and camera stand still, so visibility and rasterization are computed once, by any method, the ray-traced mesh
-included; an iteration is a matrix product and a gather.
+While geometry and camera stand still, visibility and rasterization are computed once, by any method, the ray-traced
+mesh included; an iteration is then a matrix product and a gather.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 import warp as wp
 
-from warpshadow import check
+from warpshadow import check, deform
+from warpshadow.assembly import Geometry
 from warpshadow.basis import Basis
-from warpshadow.raster import interpolate
-from warpshadow.renderer import Renderer, average_samples
+from warpshadow.camera import compose_clip_matrices
+from warpshadow.deform import Poses, Vec6
+from warpshadow.light import EnvironmentMap
+from warpshadow.renderer import Renderer
 from warpshadow.scene import Scene
-from warpshadow.shading import sample_texture
+
+_ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6}
+_GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
 
 
 class TorchRenderer(torch.nn.Module):
-    """Render a scene whose light and reflectance are tensors.
+    """Render a scene whose light, reflectance, geometry and camera are tensors.
+
+    Tensors are float32 on the renderer's device. What has no batch dimension, or one of 1, serves every instance.
 
     Args:
         scene: The scene; what a call is not given is taken from it.
         device: Device of the tensors and the kernels.
-        basis: What the light is expressed in: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for what the
+        basis: What free light is expressed in: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for what the
             scene's method computes in.
         progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        renderer: The :class:`warpshadow.renderer.Renderer` whose methods it calls.
     """
 
     def __init__(
@@ -42,129 +51,323 @@ class TorchRenderer(torch.nn.Module):
         self.renderer = Renderer(scene, device=str(device), basis=basis, progress=progress)
         self.device = torch.device(wp.device_to_torch(self.renderer.device))
 
-    @functools.cached_property
-    def transfer(self) -> torch.Tensor:
-        """Transfer vectors to free light, shape [receiver, coefficient]."""
-        return wp.to_torch(self.renderer.transfer)[0]
-
-    @functools.cached_property
-    def coverage(self) -> torch.Tensor:
-        """1 where a sample sees a body, shape [height, width, 1]."""
-        return torch.from_numpy(self.renderer.body_ids >= 0).to(self.device, torch.float32)[..., None]
-
     def forward(
-        self, light: torch.Tensor | None = None, albedo: Sequence[torch.Tensor | None] | None = None
+        self,
+        light: torch.Tensor | EnvironmentMap | None = None,
+        *,
+        albedo: Sequence[torch.Tensor | None] | None = None,
+        textures: Sequence[torch.Tensor | None] | None = None,
+        geometry: Geometry | None = None,
+        clip_matrices: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Render the image.
+        """Render images.
 
         Args:
-            light: Coefficients of the light in ``renderer.basis``, linear RGB, float32 of shape [coefficient, 3]. By
-                default the scene's light, which is shaded once, more accurately than free light can be.
-            albedo: For each body, its reflectance in linear RGB, float32: one color [3], one for each vertex
-                [vertex, 3], or a texture [height, width, 3], which needs uvs; None for the scene's.
+            light: Free light, coefficients in ``renderer.basis``, linear RGB, shape [coefficient, 3] or
+                [batch, coefficient, 3]; or known light, which is shaded more accurately than free light can be, by
+                default the scene's.
+            albedo: For each body its reflectance in linear RGB, one color [3], one for each vertex [vertex, 3], or
+                either in a batch, [batch, 1 or vertex, 3]; None for what the scene has.
+            textures: For each body its reflectance as an image, [height, width, 3] or [batch, height, width, 3], which
+                needs uvs; None for what the scene has.
+            geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
+                still.
+            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices`; by default the scene's.
 
         Returns:
-            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
+            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
+            where an argument has a batch dimension; the background is 0.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
 
-        Differentiable: light, albedo. Exact, both being linear in the image.
+        Differentiable: light, albedo, textures, geometry, clip_matrices; the README's table says how exactly.
         """
-        receivers = self.renderer.receivers
-        shading = wp.to_torch(self.renderer.scene_shading) if light is None else self._shade(light)
-        shaded = apply(lambda values: interpolate(receivers.fragments, receivers.faces, values), shading)
-        color = shaded[0] * self._albedo_image(albedo)
-        samples = torch.cat([color, self.coverage], dim=-1)
-        return average_samples(samples, self.renderer.scene.supersampling)
-
-    def _shade(self, light: torch.Tensor) -> torch.Tensor:
-        _check_tensor("light", light, self.device, [(self.renderer.basis.size, 3)])
-        return (self.transfer @ light)[None]
-
-    def _albedo_image(self, albedo: Sequence[torch.Tensor | None] | None) -> torch.Tensor:
-        """Reflectance that the samples see, shape [height, width, 3]."""
         renderer, bodies = self.renderer, self.renderer.scene.bodies
-        kept = wp.to_torch(renderer.albedo)[0]
-        if albedo is None:
-            return kept
-        if len(albedo) != len(bodies):
-            raise ValueError(f"albedo: got {len(albedo)} items, expected {len(bodies)}, one for each body")
-        image = kept
-        for number, (values, body) in enumerate(zip(albedo, bodies, strict=True)):
-            if values is None:
-                continue
-            shapes = [(3,), (body.mesh.vertex_count, 3)] + [("height", "width", 3)] * (body.mesh.uvs is not None)
-            _check_tensor(f"albedo[{number}]", values, self.device, shapes)
-            shows = torch.from_numpy(renderer.body_ids == number).to(self.device)[..., None]
-            image = torch.where(shows, self._body_albedo(number, values), image)
-        return image
+        arguments = _Arguments(self.device)
+        if isinstance(light, torch.Tensor):
+            arguments.add("light", light, wp.vec3, (renderer.basis.size,))
+        for name, tensor, dtype in zip(Geometry._fields, geometry or (), _GEOMETRY_DTYPES, strict=False):
+            arguments.add(f"geometry.{name}", tensor, dtype, getattr(renderer.assembly.rest, name).shape[1:])
+        if clip_matrices is not None:
+            arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
+        for name, tensors in (("albedo", albedo), ("textures", textures)):
+            if tensors is not None and len(tensors) != len(bodies):
+                raise ValueError(f"{name}: got {len(tensors)} items, expected {len(bodies)}, one for each body")
+        for number, tensor in enumerate(albedo or ()):
+            if tensor is not None:
+                counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
+                shape = counts if counts in ((), (1,)) else (bodies[number].mesh.vertex_count,)
+                arguments.add(f"albedo[{number}]", tensor, wp.vec3, shape)
+        for number, tensor in enumerate(textures or ()):
+            if tensor is not None:
+                arguments.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"))
 
-    def _body_albedo(self, number: int, values: torch.Tensor) -> torch.Tensor:
-        renderer = self.renderer
-        if values.ndim == 1:
-            return values
-        if values.ndim == 3:
-            pixels = renderer.pixels_of(number)
+        def draw(*arrays: wp.array) -> wp.array:
+            given = dict(zip(arguments.names, arrays, strict=True))
 
-            def sample(texture: wp.array) -> wp.array:
-                image = wp.zeros(renderer.uvs.shape, dtype=wp.vec3, device=renderer.device, requires_grad=True)
-                sample_texture(texture, pixels, renderer.uvs.flatten(), image.flatten())
-                return image
+            colors = [given.get(f"albedo[{number}]") for number in range(len(bodies))]
+            colors = [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors]
+            images = [given.get(f"textures[{number}]") for number in range(len(bodies))]
+            view = None
+            if geometry is not None or clip_matrices is not None:
+                moved = (
+                    None if geometry is None else Geometry(*(given[f"geometry.{name}"] for name in Geometry._fields))
+                )
+                view = renderer.view(moved, given.get("clip_matrices"))
+            return renderer.draw(given.get("light", light), albedo=colors, textures=images, view=view)
 
-            return apply(sample, values)[0]
-        first, last = renderer.geometry.first_vertex[number : number + 2]
-        before = torch.nn.functional.pad(values, (0, 0, int(first), int(renderer.geometry.first_vertex[-1] - last)))
-        faces = renderer.geometry.faces
-        return apply(lambda values: interpolate(renderer.fragments, faces, values), before[None])[0]
+        image = apply(draw, *arguments.tensors, dtypes=arguments.dtypes, device=self.device)
+        return image if arguments.has_batch else image[0]
+
+    def placed(
+        self,
+        rotations: torch.Tensor,
+        translations: torch.Tensor,
+        scales: torch.Tensor | None = None,
+        *,
+        rest: Geometry | None = None,
+    ) -> Geometry:
+        """Place the bodies in the world: x → s R x + t.
+
+        Args:
+            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`.
+            translations: Of each body [scene units], [body, 3] or [batch, body, 3].
+            scales: Of each body, [body] or [batch, body]; by default the scene's.
+            rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
+
+        Returns:
+            Vertices and spheres for :meth:`forward`.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: all.
+        """
+        assembly, count = self.renderer.assembly, len(self.renderer.scene.bodies)
+        scales = wp.to_torch(assembly.poses.scales) if scales is None else scales
+        arguments = _Arguments(self.device)
+        arguments.add("rotations", rotations, wp.mat33, (count,))
+        arguments.add("translations", translations, wp.vec3, (count,))
+        arguments.add("scales", scales, wp.float32, (count,))
+        arguments.tensors = list(_same_batch(arguments.tensors))
+        for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
+            arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
+
+        def place(rotations: wp.array, translations: wp.array, scales: wp.array, *parts: wp.array) -> Geometry:
+            return assembly.placed(Poses(rotations, translations, scales), Geometry(*parts) if parts else None)
+
+        return Geometry(*apply(place, *arguments.tensors, dtypes=arguments.dtypes, device=self.device))
+
+    def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rotations [body, 3, 3], translations [body, 3] and scales [body] of the scene's bodies, as copies."""
+        poses = self.renderer.assembly.poses
+        return tuple(wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales))
+
+    def deformed(
+        self,
+        number: int,
+        positions: torch.Tensor | None = None,
+        centers: torch.Tensor | None = None,
+        radii: torch.Tensor | None = None,
+        *,
+        rest: Geometry | None = None,
+    ) -> Geometry:
+        """Exchange the shape of one body at rest, as :meth:`warpshadow.assembly.Assembly.deformed` does.
+
+        Args:
+            number: The body, from 0.
+            positions: Its vertices in its own space, [vertex, 3] or [batch, vertex, 3].
+            centers: Its spheres' centers, [sphere, 3] or [batch, sphere, 3].
+            radii: Its spheres' radii, [sphere] or [batch, sphere].
+                What is None stays as it is in ``rest``.
+            rest: All bodies at rest, by default as their meshes are.
+
+        Returns:
+            All bodies at rest, for :meth:`placed`.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: all.
+        """
+        assembly = self.renderer.assembly
+        parts = {"positions": positions, "centers": centers, "radii": radii}
+        arguments = _Arguments(self.device)
+        for (name, tensor), dtype in zip(parts.items(), _GEOMETRY_DTYPES, strict=True):
+            if tensor is not None:
+                arguments.add(name, tensor, dtype, ("item",))
+        for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
+            arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
+
+        def exchange(*arrays: wp.array) -> Geometry:
+            given = dict(zip(arguments.names, arrays, strict=True))
+            whole = Geometry(*(given[f"rest.{name}"] for name in Geometry._fields)) if rest else None
+            return assembly.deformed(number, *(given.get(name) for name in parts), rest=whole)
+
+        return Geometry(*apply(exchange, *arguments.tensors, dtypes=arguments.dtypes, device=self.device))
+
+    def clip_matrices(
+        self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
+    ) -> torch.Tensor:
+        """Compose cameras for :meth:`forward`, which have the size and the near plane of the scene's.
+
+        Args:
+            rotations: R, world to camera, [3, 3] or [batch, 3, 3].
+            translations: t, world to camera [scene units], [3] or [batch, 3].
+            intrinsics: K [pixels], last row (0, 0, 1), [3, 3] or [batch, 3, 3].
+
+        Returns:
+            Maps from world to clip space, [batch, 4, 4].
+
+        Differentiable: all, so focal lengths and the principal point, too.
+        """
+        camera = self.renderer.scene.camera
+        arguments = _Arguments(self.device)
+        arguments.add("intrinsics", intrinsics, wp.mat33, ())
+        arguments.add("rotations", rotations, wp.mat33, ())
+        arguments.add("translations", translations, wp.vec3, ())
+
+        def compose(*arrays: wp.array) -> wp.array:
+            return compose_clip_matrices(*arrays, size=(camera.width, camera.height), near=camera.near)
+
+        return apply(compose, *arguments.tensors, dtypes=arguments.dtypes, device=self.device)
 
 
-def apply(function: Callable[[wp.array], wp.array], values: torch.Tensor) -> torch.Tensor:
-    """Apply a differentiable function of Warp arrays of vec3 to a float32 tensor of shape [..., 3]."""
-    return _WarpFunction.apply(function, values)
+def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
+    """Make rotation matrices of free parameters, as :func:`warpshadow.deform.rotation_matrices` does.
+
+    Args:
+        parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
+            axis-angle vectors [radians], smooth at 0; 6, the first two columns.
+
+    Returns:
+        Rotations, shape [..., 3, 3].
+
+    Raises:
+        ValueError: for another n.
+
+    Differentiable: parameters.
+    """
+    check.choice("parameters: last dimension", parameters.shape[-1], _ROTATION_PARAMETERS)
+    dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
+    rows = parameters.reshape(1, -1, parameters.shape[-1])
+    matrices = apply(deform.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
+    return matrices.reshape(*parameters.shape[:-1], 3, 3)
+
+
+class _Arguments:
+    """Tensors that become arguments of a function of Warp arrays, checked and with a leading batch dimension."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self.names: list[str] = []
+        self.tensors: list[torch.Tensor] = []
+        self.dtypes: list[type] = []
+        self.has_batch = False
+
+    def add(self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...]) -> None:
+        """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
+        shape = (*shape, *getattr(dtype, "_shape_", ()))
+        _check_tensor(name, tensor, self.device, shape)
+        has_batch = tensor.ndim > len(shape)
+        self.has_batch |= has_batch
+        self.names.append(name)
+        self.tensors.append(tensor if has_batch else tensor[None])
+        self.dtypes.append(dtype)
+
+
+def _same_batch(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
+    count = max(tensor.shape[0] for tensor in tensors)
+    return [tensor.expand(count, *tensor.shape[1:]) if tensor.shape[0] == 1 else tensor for tensor in tensors]
+
+
+def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...]) -> None:
+    """Raise ValueError unless a tensor is of float32, finite, on the device, and of the shape or a batch of it."""
+    if not isinstance(tensor, torch.Tensor) or tensor.dtype != torch.float32:
+        got = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
+        raise ValueError(f"{name}: got {got}, expected a tensor of torch.float32")
+    if tensor.device != device:
+        raise ValueError(f"{name}: got device {tensor.device}, expected {device}")
+    check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape)
+    if tensor.numel() == 0 and 0 not in shape:
+        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
+    if not np.isfinite(float(tensor.detach().sum())):
+        check.finite(name, tensor.detach().cpu().numpy())
+
+
+# ---------------------------------------------------------------------------------------------- autograd
+
+
+def apply(
+    function: Callable, *tensors: torch.Tensor, dtypes: Sequence[type], device: torch.device | None = None
+) -> torch.Tensor | tuple[torch.Tensor, ...]:
+    """Apply a differentiable function of Warp arrays to tensors.
+
+    Args:
+        function: Takes an array for each tensor and returns an array, or a tuple of them; what it launches is recorded
+            on a tape if a tensor requires a gradient.
+        tensors: Float32; contiguous or not. Items of a dtype lie in the last dimensions: a [batch, vertex, 3] tensor
+            is an array of vec3 of shape [batch, vertex].
+        dtypes: Warp's dtype of each.
+        device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
+
+    Returns:
+        A tensor for each array.
+
+    Differentiable: as the function is, once.
+    """
+    wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
+    results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)
+    return results if len(results) > 1 else results[0]
 
 
 class _WarpFunction(torch.autograd.Function):
     """Records Warp launches on a tape in forward and plays it back in backward, as often as asked."""
 
     @staticmethod
-    def forward(ctx, function: Callable[[wp.array], wp.array], values: torch.Tensor) -> torch.Tensor:
-        argument = wp.from_torch(values.detach().contiguous(), dtype=wp.vec3, requires_grad=values.requires_grad)
-        with _current_stream(values):
-            if not values.requires_grad:
-                return wp.to_torch(function(argument), requires_grad=False)
-            with wp.Tape() as tape:
-                result = function(argument)
-        ctx.tape, ctx.argument, ctx.result = tape, argument, result
-        return wp.to_torch(result, requires_grad=False)
+    def forward(
+        ctx,
+        function: Callable,
+        dtypes: tuple[type, ...],
+        wants: tuple[bool, ...],
+        device: torch.device,
+        *tensors: torch.Tensor,
+    ):
+        arguments = [
+            wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=is_wanted)
+            for tensor, dtype, is_wanted in zip(tensors, dtypes, wants, strict=True)
+        ]
+        with _current_stream(device), wp.Tape() as tape:
+            results = function(*arguments)
+        results = results if isinstance(results, tuple) else (results,)
+        outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
+        if any(wants):
+            ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
+            ctx.tape, ctx.arguments, ctx.results = tape, arguments, results
+            pairs = zip(outputs, results, strict=True)
+            ctx.mark_non_differentiable(*(output for output, result in pairs if not result.requires_grad))
+        return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
-        with _current_stream(gradient):
+    def backward(ctx, *gradients: torch.Tensor):
+        ctx.saved_tensors  # noqa: B018
+        with _current_stream(gradients[0].device):
             # copies, since memory shared with torch is reused behind the tape's back
-            wp.copy(ctx.result.grad, wp.from_torch(gradient.detach().contiguous(), dtype=wp.vec3))
+            for result, gradient in zip(ctx.results, gradients, strict=True):
+                if result.requires_grad:
+                    wp.copy(result.grad, wp.from_torch(gradient.detach().contiguous(), dtype=result.dtype))
             ctx.tape.backward()
-            result = wp.to_torch(ctx.argument.grad, requires_grad=False).clone()
+            found = [
+                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
+                for argument in ctx.arguments
+            ]
             ctx.tape.zero()
-        return None, result
+        return None, None, None, None, *found
 
 
-def _current_stream(tensor: torch.Tensor) -> wp.ScopedStream:
+def _current_stream(device: torch.device) -> wp.ScopedStream:
     """Launch on torch's current stream."""
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)) if tensor.is_cuda else None)
-
-
-def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shapes: list[tuple]) -> None:
-    """Raise ValueError unless a tensor has the type, the device and one of the shapes."""
-    if not isinstance(tensor, torch.Tensor) or tensor.dtype != torch.float32:
-        got = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
-        raise ValueError(f"{name}: got {got}, expected a tensor of torch.float32")
-    if tensor.device != device:
-        raise ValueError(f"{name}: got device {tensor.device}, expected {device}")
-    fitting = [shape for shape in shapes if len(shape) == tensor.ndim] or shapes[:1]
-    check.shape(name, tuple(tensor.shape), fitting[0])
-    if tensor.numel() == 0:
-        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
-    if not np.isfinite(float(tensor.detach().sum())):
-        check.finite(name, tensor.detach().cpu().numpy())
+    is_cuda = device.type == "cuda"
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None)

@@ -19,7 +19,7 @@ from warpshadow import check
 from warpshadow.directions import CHUNK, check_count, chunk_cones, edge_width
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.tape import record_adjoint
-from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, cone_function
+from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
@@ -121,7 +121,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load, store_columns, sqrt = fn.load, fn.store_columns, fn.sqrt
-    cone, edge, reaches = cone_function(lanes), _edge_function(lanes), _reach_function(lanes)
+    cone, edge, reaches = relative_cone_function(lanes), _edge_function(lanes), _reach_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
@@ -159,8 +159,11 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
             if radius > TINY_RADIUS:
+                curvature = 1.0 / radius
                 ux, uy, uz, cosine, sine2, weight = cone(
-                    Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
+                    curvature * (Lane(center[0]) - x),
+                    curvature * (Lane(center[1]) - y),
+                    curvature * (Lane(center[2]) - z),
                 )
                 sine = sqrt(sine2)
                 if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
@@ -188,7 +191,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
     fn = lane_functions(lanes)
     load, load_products, sqrt = fn.load, fn.load_products, fn.sqrt
     add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
-    cone, cone_adjoint_ = cone_function(lanes), cone_adjoint(lanes)
+    cone, cone_adjoint_ = relative_cone_function(lanes), cone_adjoint(lanes)
     edge, edge_adjoint, reaches = _edge_function(lanes), _edge_adjoint(lanes), _reach_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
@@ -231,10 +234,11 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
             radius = radii[batch, sphere]
             center = centers[batch, sphere]
             if radius > TINY_RADIUS:
-                dx = Lane(center[0]) - x
-                dy = Lane(center[1]) - y
-                dz = Lane(center[2]) - z
-                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
+                curvature = 1.0 / radius
+                dx = curvature * (Lane(center[0]) - x)
+                dy = curvature * (Lane(center[1]) - y)
+                dz = curvature * (Lane(center[2]) - z)
+                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz)
                 sine = sqrt(sine2)
                 if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
                     low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
@@ -267,7 +271,7 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
                         dx,
                         dy,
                         dz,
-                        radius,
+                        curvature,
                         wp.cw_mul(slope, sum_x),
                         wp.cw_mul(slope, sum_y),
                         wp.cw_mul(slope, sum_z),
@@ -309,12 +313,16 @@ def transmittance(
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts.
+        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf, numbers beyond 1e18 and
+            negative radii. (On a GPU that reads a count back, and is left out while a CUDA graph is captured.)
 
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness.
     """
     check.shape("directions", directions.shape, ("direction", 3))
     check_count("directions", len(directions))
+    check.finite("directions", directions)
+    if not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+        raise ValueError("directions: got vectors of other lengths, expected unit vectors")
     width = edge_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     device = points.device

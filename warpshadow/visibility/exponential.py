@@ -1,6 +1,18 @@
 """The exponential of log-visibility under the truncated SH product, by scaling and squaring.
 
 exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
+
+Where many spheres overlap, the truncated sum of their logs has lobes above 0, and their exponential grows without
+bound: with 10 000 spheres in one direction, beyond float64. So squarings are *held* where they are no longer those of
+a visibility. Squares of numbers from 0 to 1 are, in the mean, no more than the numbers; so with d = ⟨v²⟩ − ⟨v⟩, means
+over directions,
+
+    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
+
+is plain squaring while |f̂| d ≤ QUIET, and no squaring from LOUD on: the result is then the visibility of a part of
+f, 2^−k of it. The factor |f̂|, which is as large as spheres are deep, holds deep logs earlier: they are dark long
+before all their squarings. QUIET to LOUD are two octaves, since by that or more one squaring raises d: so v moves
+smoothly with f. The mean is the product's first coefficient, and the rule costs nothing.
 """
 
 import functools
@@ -29,7 +41,7 @@ THRESHOLDS = {
     "linear": Threshold(0.06, 1.0),
     "optimal_linear": Threshold(0.06, 2.0),
 }
-"""Base approximations of the exponential. Beyond the limits, repeated squaring explodes: for `quadratic` the error is
+"""Base approximations of the exponential. Beyond the limits, plain squaring explodes: for `quadratic` the error is
 12-fold at twice its limit and 48 000-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.6%
 (`linear`) and 3% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
@@ -37,10 +49,13 @@ LEAST_THRESHOLD = 0.01
 """Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
 
 MOST_SQUARINGS = 20
-"""Limit of p."""
+"""Limit of the squarings; a log that asks for more is cut down to what they can do."""
 
-LOUD = 1.5
-"""A coefficient this many times √4π draws a warning: no visibility from 0 to 1 has one above √4π."""
+QUIET = 6.0
+"""|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
+
+LOUD = 24.0
+"""|f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared."""
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
@@ -65,7 +80,11 @@ def _optimal_table(order: int, device: str) -> wp.array:
 
 @functools.cache
 def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
-    """Make the kernel function that measures f: → p, 2^−p, |f̂|, most p; of the base e^{…}, a, b, da/d|h|, db/d|h|."""
+    """Make the kernel function that measures f.
+
+    It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; and of
+    the base e^{…}, a, b, da/d|h|, db/d|h|.
+    """
     Lane = lane_type(lanes)
     sqrt = lane_functions(lanes).sqrt
     STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
@@ -77,6 +96,8 @@ def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
         for i in range(1, wp.static(order**2)):
             norm2 += wp.cw_mul(log[i], log[i])
         norm = sqrt(norm2)
+        above = wp.max(log[0], Lane(0.0))
+        depth = sqrt(norm2 + wp.cw_mul(above, above))
         count = Lane(0.0)
         scale = Lane(1.0)
         most = int(0)
@@ -89,9 +110,10 @@ def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
             # the least p with |f̂| / 2^p ≤ threshold, of each receiver by itself
             p = int(0)
             s = float(1.0)
-            while s * norm[lane] > threshold and p < MOST_SQUARINGS:
+            while s * depth[lane] > threshold:
                 s = 0.5 * s
                 p = p + 1
+            p = wp.min(p, MOST_SQUARINGS)
             count[lane] = float(p)
             scale[lane] = s
             most = wp.max(most, p)
@@ -106,9 +128,30 @@ def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
                 slope[lane] = ab[1]
                 constant_change[lane] = change[0]
                 slope_change[lane] = change[1]
-        return count, scale, norm, most, factor, constant, slope, constant_change, slope_change
+        return count, scale, norm, depth, most, factor, constant, slope, constant_change, slope_change
 
     return scale_
+
+
+@functools.cache
+def _hold_function(lanes: int) -> wp.Function:
+    """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
+    Lane = lane_type(lanes)
+    PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
+
+    @wp.func
+    def hold(loudness: Lane):
+        share = Lane(1.0)
+        slope = Lane(0.0)
+        if wp.max(loudness) > QUIET:
+            for lane in range(lanes):
+                if loudness[lane] > QUIET:
+                    t = wp.min(wp.log(loudness[lane] / QUIET) * PER_OCTAVES, 1.0)
+                    share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
+                    slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
+        return share, slope
+
+    return hold
 
 
 @functools.cache
@@ -116,7 +159,7 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load_rows, store_rows = fn.load_rows, fn.store_rows
-    scale_, multiply_ = _scale_function(order, base, lanes), multiply(order, lanes)
+    scale_, hold, multiply_ = _scale_function(order, base, lanes), _hold_function(lanes), multiply(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def exponentiate_log_sh(
@@ -136,13 +179,14 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
     ):
         """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
 
-        Faults count the receivers whose visibility is loud, and those whose is not finite.
+        Faults count the receivers whose squarings are held, and those whose log is too large or not finite.
         """
         batch, group = wp.tid()
         row = scratch[batch, group, 0]
         square = scratch[batch, group, 1]
         load_rows(log_sh[batch], group, row)
-        count, scale, _norm, most, factor, constant, slope, _c, _s = scale_(row, threshold, optimal)
+        count, scale, _norm, depth, most, factor, constant, slope, _c, _s = scale_(row, threshold, optimal)
+        mean = row[0]
         row[0] = Lane(0.0)
         linear = wp.cw_mul(wp.cw_mul(factor, scale), slope)
         if wp.static(base == "quadratic"):
@@ -154,23 +198,22 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(linear, row[i])
         row[0] = row[0] + _UNIT * wp.cw_mul(factor, constant)
+        held = Lane(0.0)
         for step in range(most):
             if wp.static(keeps_powers):
                 for i in range(wp.static(order**2)):
                     powers[batch, group, step, i] = row[i]
             multiply_(row, row, first, pairs, values, square)
+            share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
+            held += wp.cw_mul(is_due, Lane(1.0) - share)
+            share = wp.cw_mul(is_due, share)
             for i in range(wp.static(order**2)):
-                row[i] = row[i] + wp.cw_mul(is_due, square[i] - row[i])
-        sum_ = Lane(0.0)
-        largest = Lane(0.0)
-        for i in range(wp.static(order**2)):
-            sum_ += row[i]
-            largest = wp.max(largest, wp.abs(row[i]))
+                row[i] = row[i] + wp.cw_mul(share, square[i] - row[i])
         for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
-            if not wp.isfinite(sum_[lane]):
+            if not wp.isfinite(depth[lane] + mean[lane]):
                 wp.atomic_add(faults, 1, 1)
-            elif largest[lane] > LOUD * _UNIT:
+            elif held[lane] > 0.0:
                 wp.atomic_add(faults, 0, 1)
         store_rows(row, group, visibility[batch])
 
@@ -182,7 +225,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load_rows, add_rows = fn.load_rows, fn.add_rows
-    scale_, multiply_ = _scale_function(order, base, lanes), multiply(order, lanes)
+    scale_, hold, multiply_ = _scale_function(order, base, lanes), _hold_function(lanes), multiply(order, lanes)
     is_optimal = base == "optimal_linear"
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
@@ -203,9 +246,11 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
     ):
         """A thread owns a group of receivers and goes back through the squarings, then the base.
 
-        Γ is symmetric, so v' = v * v has v̄ = 2 v * v̄'. The base is v = F (a 1 + b h + q h * h), h = f̂ / 2^p and
-        F = exp(2^−p f0/√4π):  f̄0 = 2^−p/√4π Σ v̄ v,  h̄ = F (b v̄ + 2q h * v̄), and for a(|h|), b(|h|) also
-        F (√4π v̄0 a' + b' Σ v̄ h) h/|h|
+        Γ is symmetric, so v' = v + w (v * v − v) has v̄ = v̄' + w (2 v * v̄' − v̄'), w̄ = Σ v (v * v̄' − v̄') and, as
+        (v * v)_0 = |v|²/√4π, with the loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also
+        v̄ += λ̄ |f̂| (2v/4π − e0/√4π) and |f̂|¯ += λ̄ λ/|f̂|.
+        The base is v = F (a 1 + b h + q h * h), h = f̂ / 2^p and F = exp(2^−p f0/√4π):  f̄0 = 2^−p/√4π Σ v̄ v,
+        h̄ = F (b v̄ + 2q h * v̄), and for a(|h|), b(|h|) also F (√4π v̄0 a' + b' Σ v̄ h) h/|h|
         """
         batch, group = wp.tid()
         log = scratch[batch, group, 0]
@@ -213,16 +258,38 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         product = scratch[batch, group, 2]
         load_rows(log_sh[batch], group, log)
         load_rows(adj_visibility[batch], group, adj_row)
-        count, scale, norm, most, factor, constant, slope, constant_change, slope_change = scale_(
+        count, scale, norm, depth, most, factor, constant, slope, constant_change, slope_change = scale_(
             log, threshold, optimal
         )
+        adj_depth = Lane(0.0)
         for back in range(most):
             step = most - 1 - back
-            multiply_(powers[batch, group, step], adj_row, first, pairs, values, product)
-            is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
+            power = powers[batch, group, step]
+            multiply_(power, adj_row, first, pairs, values, product)
+            mean_square = Lane(0.0)
             for i in range(wp.static(order**2)):
-                adj_row[i] = adj_row[i] + wp.cw_mul(is_due, 2.0 * product[i] - adj_row[i])
+                mean_square += wp.cw_mul(power[i], power[i])
+            growth = (mean_square / _UNIT - power[0]) / _UNIT
+            share, share_slope = hold(wp.cw_mul(depth, growth))
+            is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
+            adj_growth = Lane(0.0)
+            if wp.min(share_slope) < 0.0:
+                adj_share = Lane(0.0)
+                for i in range(wp.static(order**2)):
+                    adj_share += wp.cw_mul(power[i], product[i] - adj_row[i])
+                adj_loudness = wp.cw_mul(wp.cw_mul(is_due, adj_share), share_slope)
+                adj_growth = wp.cw_mul(adj_loudness, depth)
+                adj_depth += wp.cw_mul(adj_loudness, growth)
+            share = wp.cw_mul(is_due, share)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + wp.cw_mul(share, 2.0 * product[i] - adj_row[i])
+            if wp.min(share_slope) < 0.0:
+                for i in range(wp.static(order**2)):
+                    adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, power[i])
+                adj_row[0] = adj_row[0] - adj_growth / _UNIT
 
+        adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
+        above = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
         log[0] = Lane(0.0)
         linear = wp.cw_mul(factor, slope)
         along = Lane(0.0)  # Σ v̄ h
@@ -243,8 +310,8 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
             adj_h = wp.cw_mul(linear, adj_row[i]) + wp.cw_mul(radial, log[i])
             if wp.static(base == "quadratic"):
                 adj_h += wp.cw_mul(factor, product[i])
-            adj_row[i] = wp.cw_mul(scale, adj_h)
-        adj_row[0] = wp.cw_mul(scale, dc) / _UNIT
+            adj_row[i] = wp.cw_mul(scale, adj_h) + wp.cw_mul(adj_depth, log[i])
+        adj_row[0] = wp.cw_mul(scale, dc) / _UNIT + wp.cw_mul(adj_depth, above)
         add_rows(adj_row, group, adj_log_sh[batch])
 
     return exponentiate_log_sh_adjoint
@@ -255,6 +322,9 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
 
         exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p},  p the least with |f̂| / 2^p ≤ threshold
                                                      [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
+
+    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap (see the module): it is
+    then bounded, and draws a warning.
 
     Args:
         log_sh: Log-visibility f, float32 of shape [batch, vertex, order²], f̂ being f without its constant part.
@@ -267,9 +337,9 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         SH visibility, float32 of shape [batch, vertex, order²].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so for log-visibility whose exponential is not
-            finite. One that is far above 1, as where hundreds of spheres overlap, draws a warning. (Reading the counts
-            waits for the device. While a CUDA graph is captured that cannot be, and nothing is checked.)
+        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf and numbers beyond 1e18.
+            (Reading the counts waits for the device. While a CUDA graph is captured that cannot be, and nothing is
+            checked.)
 
     Differentiable: log_sh, for the p that it has.
     """
@@ -306,16 +376,13 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         record_tape=False,
     )
     if not device.is_capturing:
-        loud, broken = faults.numpy().tolist()
+        held, broken = faults.numpy().tolist()
         if broken:
-            raise ValueError(
-                f"log_sh: the exponential of {broken} of {batch_count * vertex_count} receivers is not finite; "
-                "expected log-visibility of fewer overlapping spheres (directional transmittance has no such limit)"
-            )
-        if loud:
+            check.finite_arrays({"log_sh": log_sh}, most=check.LARGEST)
+        if held:
             warnings.warn(
-                f"log-SH visibility of {loud} of {batch_count * vertex_count} receivers is far above 1, since many "
-                "spheres overlap; fewer spheres, or directional transmittance, are accurate",
+                f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
+                "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate",
                 stacklevel=2,
             )
 

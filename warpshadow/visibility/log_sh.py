@@ -12,7 +12,7 @@ from warpshadow import check, sh
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
-from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, cone_function
+from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 from warpshadow.visibility.zonal_logs import LOGS, band_type, look_up, look_up_slope, zonal_table
 
 HORIZON_FADE = 0.5
@@ -21,13 +21,13 @@ HORIZON_FADE = 0.5
 
 @functools.cache
 def _horizon_function(lanes: int) -> wp.Function:
-    """Make the kernel function of the fade at the horizon: n·d and radius → weight and its derivative by n·d."""
+    """Make the kernel function of the fade at the horizon: n·d/r → weight and its derivative."""
     Lane = lane_type(lanes)
 
     @wp.func
-    def horizon(height: Lane, radius: float):
-        t = wp.min(wp.max((height / radius + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
-        slope = 6.0 / (HORIZON_FADE * radius) * wp.cw_mul(t, Lane(1.0) - t)
+    def horizon(height: Lane):
+        t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
+        slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
         return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), slope
 
     return horizon
@@ -38,7 +38,7 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = lane_functions(lanes)
     load, store_rows = fn.load, fn.store_rows
-    cone, horizon, look_up_ = cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
+    cone, horizon, look_up_ = relative_cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
     add_rotated_zonal_ = add_rotated_zonal(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
@@ -72,9 +72,11 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
                 dx = Lane(center[0]) - x
                 dy = Lane(center[1]) - y
                 dz = Lane(center[2]) - z
-                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
+                curvature = 1.0 / radius
+                ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
                 if wp.static(has_horizon):
-                    fade, _slope = horizon(wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz), radius)
+                    height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
+                    fade, _slope = horizon(curvature * height)
                     weight = wp.cw_mul(weight, fade)
                 if wp.max(weight) > 0.0:
                     amount = wp.cw_mul(sine2, weight)
@@ -92,7 +94,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
     Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
     fn = lane_functions(lanes)
     load, load_rows, add_vectors, add_to_sphere = fn.load, fn.load_rows, fn.add_vectors, fn.add_to_sphere
-    cone, cone_adjoint_, horizon = cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
+    cone, cone_adjoint_, horizon = relative_cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
     look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
 
@@ -116,7 +118,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         """A thread owns a group of receivers.
 
         With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā s²,
-        and with w = w_cone w_horizon(n·d, r):  n̄ = d w̄_h w_h',  d̄ += n w̄_h w_h',  r̄ −= (n·d) w̄_h w_h' / r
+        and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
         """
         batch, group = wp.tid()
         row = scratch[batch, group]
@@ -140,13 +142,15 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
                 dx = Lane(center[0]) - x
                 dy = Lane(center[1]) - y
                 dz = Lane(center[2]) - z
-                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz, radius)
+                curvature = 1.0 / radius
+                ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
                 height = Lane(0.0)
                 fade = Lane(1.0)
                 fade_slope = Lane(0.0)
                 if wp.static(has_horizon):
-                    height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
-                    fade, fade_slope = horizon(height, radius)
+                    height = curvature * (wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz))
+                    height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
+                    fade, fade_slope = horizon(height)
                 faded = wp.cw_mul(weight, fade)
                 if wp.max(faded) > 0.0:
                     amount = wp.cw_mul(sine2, faded)
@@ -162,12 +166,12 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
                         adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
                         adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
                     adj_faded = wp.cw_mul(adj_amount, sine2)
-                    adj_height = wp.cw_mul(wp.cw_mul(adj_faded, weight), fade_slope)
+                    adj_height = curvature * wp.cw_mul(wp.cw_mul(adj_faded, weight), fade_slope)
                     adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
-                        dx,
-                        dy,
-                        dz,
-                        radius,
+                        curvature * dx,
+                        curvature * dy,
+                        curvature * dz,
+                        curvature,
                         adj_ux,
                         adj_uy,
                         adj_uz,
@@ -178,7 +182,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
                     adj_dx += wp.cw_mul(adj_height, nx)
                     adj_dy += wp.cw_mul(adj_height, ny)
                     adj_dz += wp.cw_mul(adj_height, nz)
-                    adj_radius -= wp.cw_mul(adj_height, height) / radius
+                    adj_radius -= wp.cw_mul(adj_height, height)
                     adj_nx += wp.cw_mul(adj_height, dx)
                     adj_ny += wp.cw_mul(adj_height, dy)
                     adj_nz += wp.cw_mul(adj_height, dz)
@@ -220,7 +224,8 @@ def accumulate(
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts.
+        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf, numbers beyond 1e18 and
+            negative radii. (On a GPU that reads a count back, and is left out while a CUDA graph is captured.)
 
     Differentiable: points, normals, centers, radii.
     """
@@ -271,7 +276,7 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = lane_functions(lanes)
     load, store_rows = fn.load, fn.store_rows
-    cone, look_up_ = cone_function(lanes), look_up(order, lanes)
+    cone, look_up_ = relative_cone_function(lanes), look_up(order, lanes)
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     UNIT = wp.constant(float(np.sqrt(4 * np.pi)))  # the coefficient of the constant function 1
 
@@ -303,8 +308,11 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
             radius = radii[batch, sphere]
             if radius > TINY_RADIUS:
                 center = centers[batch, sphere]
+                curvature = 1.0 / radius
                 ux, uy, uz, cosine, sine2, weight = cone(
-                    Lane(center[0]) - x, Lane(center[1]) - y, Lane(center[2]) - z, radius
+                    curvature * (Lane(center[0]) - x),
+                    curvature * (Lane(center[1]) - y),
+                    curvature * (Lane(center[2]) - z),
                 )
                 zonal = look_up_(cosine, table)
                 for band in range(order):
@@ -335,6 +343,10 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
     Returns:
         SH visibility, float32 of shape [batch, vertex, order²].
 
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts; so for hundreds of spheres in one direction,
+            whose product, truncated again and again, overflows.
+
     Differentiable: no.
     """
     sh.check_order(order)
@@ -359,4 +371,7 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
         device=device,
         record_tape=False,
     )
+    if not (device.is_capturing or np.isfinite(visibility.numpy()).all()):
+        count = radii.shape[1]
+        raise ValueError(f"centers: the SH product of {count} spheres is not finite, expected fewer that overlap")
     return visibility

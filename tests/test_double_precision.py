@@ -1,0 +1,362 @@
+"""Every differentiable stage, built in float64, against central differences: what float32 would round away."""
+
+import importlib
+
+import double_precision
+import numpy as np
+import pytest
+import torch
+import twins
+import warp as wp
+
+import warpshadow.raster
+
+# Of every entry of a Jacobian. What differs is due to the differences, rounding of 1e-16/1e-6 and third derivatives:
+# measured is a relative L2 of 5e-11 (shading) to 7e-9 (held squarings).
+EXACT = {"eps": 1e-6, "rtol": 1e-7, "atol": 2e-8}
+CUDA_SUMS = 1e-12  # atomics add up in any order
+
+
+@pytest.fixture(scope="module")
+def double(tmp_path_factory):
+    """Import a module of the float64 build."""
+    package = double_precision.build(tmp_path_factory.mktemp("float64"))
+    return lambda name: importlib.import_module(f"{package.__name__}.{name}")
+
+
+@pytest.fixture
+def check(double, device):
+    """Check the Jacobian of a function of Warp arrays, called with arguments (dtype, values)."""
+    apply = double("torch").apply
+
+    def check(function, *arguments):
+        dtypes = [dtype for dtype, _ in arguments]
+        place = {"dtype": torch.float64, "device": wp.device_to_torch(device), "requires_grad": True}
+        tensors = [torch.tensor(values, **place) for _, values in arguments]
+        assert torch.autograd.gradcheck(
+            lambda *tensors: apply(function, *tensors, dtypes=dtypes), tensors, nondet_tol=CUDA_SUMS, **EXACT
+        )
+
+    return check
+
+
+def random(seed, *shape):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def put(values, dtype, device):
+    return wp.array(values, dtype=dtype, device=device)
+
+
+# A tetrahedron.
+VERTICES = 1.2 * np.array([[1, 0, -0.6], [-1, 0.1, -0.7], [0.1, -0.2, 1.1], [0.2, 0.9, 0.1]])
+FACES = np.int32([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+
+
+def test_the_build_has_the_digits_of_float64(double, device):
+    points, _, centers, radii = (values.astype(np.float64) for values in twins.random_scene(0))
+    directions = double("directions").fibonacci(32)
+    scene = [put(points[None], wp.vec3d, device), None]
+    scene += [put(centers[None], wp.vec3d, device), put(radii[None], wp.float64, device)]
+    got = double("visibility.directional").transmittance(*scene, directions).numpy()[0]
+    np.testing.assert_allclose(got, twins.transmittance(points, centers, radii, directions), rtol=0, atol=1e-12)
+
+
+def test_the_build_rasterizes_what_the_package_rasterizes(double, device):
+    """Depths are sorted by the bits of float32, and so they are here."""
+    clip_positions = random(0, 1, 60, 4).astype(np.float32) + np.float32([0, 0, 1, 2])
+    faces = put(np.arange(60).reshape(20, 3), wp.vec3i, device)
+    expected = warpshadow.raster.rasterize(put(clip_positions, wp.vec4, device), faces, 40, 30).face_ids.numpy()
+    got = double("raster").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
+    assert len(np.unique(expected)) > 10
+    np.testing.assert_array_equal(got, expected)
+
+
+# ---------------------------------------------------------------------------------------------- geometry
+
+
+def test_vertex_normals(double, device, check):
+    faces = put(FACES, wp.vec3i, device)
+    check(lambda p: double("mesh").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
+
+
+@pytest.mark.parametrize("kind", ["quaternion", "axis-angle", "columns"])
+def test_rotation_matrices(kind, double, device, check):
+    deform = double("deform")
+    dtype, size = {"quaternion": (wp.vec4d, 4), "axis-angle": (wp.vec3d, 3), "columns": (deform.Vec6, 6)}[kind]
+    parameters = random(0, 2, 3, size)
+    if kind == "axis-angle":
+        parameters[0] *= [[0], [1e-3], [0.3]]  # where the series is
+    check(deform.rotation_matrices, (dtype, parameters))
+
+
+@pytest.fixture
+def poses():
+    """Rotations, translations and scales of two instances of three bodies, as arguments."""
+    rotations = np.stack([[twins.random_rotation(3 * i + j) for j in range(3)] for i in range(2)])
+    return (wp.mat33d, rotations), (wp.vec3d, random(1, 2, 3, 3)), (wp.float64, 1 + random(2, 2, 3) ** 2)
+
+
+def test_poses_of_points(double, device, check, poses):
+    bodies = put(np.int32([0, 2, 1, 2]), wp.int32, device)
+    check(lambda r, *p: double("deform").Poses(*p).points(r, bodies), (wp.vec3d, random(3, 1, 4, 3)), *poses)
+
+
+def test_poses_of_radii(double, device, check, poses):
+    bodies = put(np.int32([0, 2, 1, 2]), wp.int32, device)
+    rotations, translations, scales = poses
+
+    def radii(rest, scales):
+        fixed = [put(values, dtype, device) for dtype, values in (rotations, translations)]
+        return double("deform").Poses(*fixed, scales).radii(rest, bodies)
+
+    check(radii, (wp.float64, random(3, 1, 4)), scales)
+
+
+@pytest.mark.parametrize("quantity", ["points", "centers", "rigidity", "shear"])
+def test_deformation_graphs(quantity, double, device, check):
+    graph = double("deform").DeformationGraph.bind(random(0, 5, 3), random(1, 4, 3), count=2, device=device)
+    matrices, translations = (wp.mat33d, random(2, 2, 4, 3, 3)), (wp.vec3d, random(3, 2, 4, 3))
+    arguments = {"centers": [translations], "shear": [matrices]}.get(quantity, [matrices, translations])
+    check(getattr(graph, quantity), *arguments)
+
+
+# ---------------------------------------------------------------------------------------------- visibility
+
+
+@pytest.fixture
+def spheres():
+    """Receivers, normals, centers and radii, as arguments.
+
+    Three receivers are at the surface of a sphere, within it, and where it fades out; each sees a sphere fade out below
+    its horizon. All is some ten units wide, so that a step is small against the hundredth of a radius in which a cone's
+    edge bends at the surface.
+    """
+    points, turns, centers, radii = (
+        10 * a.astype(float) for a in twins.random_scene(3, vertex_count=5, sphere_count=4)
+    )
+    for sphere, distance in enumerate([1.004, 0.7, 0.15]):
+        points[sphere] = centers[sphere] + distance * radii[sphere] * np.array([0.6, 0.8, 0])
+    toward = centers[[3, 3, 3, 2, 1]] - points
+    depth = 0.7 * radii[[3, 3, 3, 2, 1], None] / np.sum(toward**2, axis=1, keepdims=True) * toward
+    normals = unit(np.cross(toward, turns)) * np.sqrt(1 - np.sum(depth**2, axis=1, keepdims=True)) - depth
+    dtypes = (wp.vec3d, wp.vec3d, wp.vec3d, wp.float64)
+    return [(dtype, values[None]) for dtype, values in zip(dtypes, (points, normals, centers, radii), strict=True)]
+
+
+@pytest.mark.parametrize("count, softness", [(16, 1.2), (64, 0.35)])
+def test_transmittance(count, softness, double, device, check, spheres):
+    directions = double("directions").fibonacci(count)
+    transmittance = double("visibility.directional").transmittance
+    points, (_, normals), *rest = spheres
+    up = put(normals, wp.vec3d, device)
+    check(lambda p, c, r: transmittance(p, up, c, r, directions, softness=softness), points, *rest)
+
+
+@pytest.mark.parametrize("log", ["cap", "eigen"])
+def test_log_visibility(log, double, device, check, spheres):
+    accumulate = double("visibility.log_sh").accumulate
+    check(lambda *scene: accumulate(*scene, order=3, log=log), *spheres)
+
+
+def test_log_visibility_without_a_horizon(double, device, check, spheres):
+    accumulate = double("visibility.log_sh").accumulate
+    check(lambda p, c, r: accumulate(p, None, c, r, order=3), spheres[0], *spheres[2:])
+
+
+def logs(*sizes):
+    """Log-visibility of one instance, of these norms; powers of 2 would be where the number of squarings changes."""
+    rows = random(0, 1, len(sizes), 9)
+    return rows * np.array(sizes)[:, None] / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
+def test_the_exponential(base, double, check):
+    exponentiate = double("visibility.exponential").exponentiate
+    check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(0.05, 0.3, 1.7)))
+
+
+@pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
+def test_the_exponential_where_squarings_are_held(base, double, check):
+    exponentiate = double("visibility.exponential").exponentiate
+    with pytest.warns(UserWarning, match="held back"):
+        check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(5.3, 9, 6)))
+
+
+# ---------------------------------------------------------------------------------------------- shading
+
+
+def test_harmonic_transfer(double, device, check):
+    visibility, normals = (wp.float64, random(0, 1, 3, 9)), (wp.vec3d, unit(random(1, 1, 3, 3)))
+    sh_transfer = double("transfer").sh_transfer
+    check(lambda v, n: sh_transfer(v, n, order=3), visibility, normals)
+    check(lambda n: sh_transfer(None, n, order=3), normals)
+
+
+def test_directional_transfer(double, device, check):
+    directions = double("directions").fibonacci(16)
+    transmittance, normals = random(0, 1, 3, 16) ** 2, unit(random(1, 1, 3, 3))
+    check(
+        lambda t, n: double("transfer").directional_transfer(t, n, directions),
+        (wp.float64, transmittance),
+        (wp.vec3d, normals),
+    )
+
+
+def test_shading(double, device, check):
+    check(double("shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 2, 4, 3)))
+
+
+def test_shading_under_the_same_light(double, device, check):
+    check(double("shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 1, 4, 3)))
+
+
+# ---------------------------------------------------------------------------------------------- images
+
+SIZE = (8, 6)  # of a picture [pixels]
+
+
+@pytest.fixture
+def view(double):
+    """A tetrahedron before a camera, as arguments: its vertices and the matrix to clip space."""
+    camera = double("camera").Camera.look_at((0.4, 0.9, 3), (0.1, 0, 0), size=SIZE)
+    return (wp.vec3d, VERTICES[None]), (wp.mat44d, camera.clip_matrix()[None])
+
+
+@pytest.fixture
+def clip(view):
+    """The same vertices in clip space."""
+    (_, vertices), (_, matrices) = view
+    return wp.vec4d, np.concatenate([vertices, np.ones((1, 4, 1))], axis=-1) @ matrices[0].T
+
+
+def test_projection(double, check, view):
+    check(double("camera").to_clip, *view)
+
+
+def test_cameras(double, check):
+    rotations = np.stack([twins.random_rotation(0), twins.random_rotation(1)])
+    check(
+        lambda *camera: double("camera").compose_clip_matrices(*camera, size=SIZE),
+        (wp.mat33d, random(0, 1, 3, 3)),
+        (wp.mat33d, rotations),
+        (wp.vec3d, random(1, 2, 3)),
+    )
+
+
+def test_interpolation(double, device, check, clip):
+    raster = double("raster")
+    faces = put(FACES, wp.vec3i, device)
+    face_ids = raster.rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    assert len(np.unique(face_ids.numpy())) == 3  # two sides and the background
+
+    def draw(clip_positions, attributes):
+        weights = raster.barycentrics(face_ids, faces, clip_positions)
+        return raster.interpolate(raster.Fragments(face_ids, weights), faces, attributes)
+
+    check(draw, clip, (wp.vec2d, random(0, 1, 4, 2)))
+
+
+def test_textures(double, device, check, clip):
+    """Two faces have a texture that repeats and is finer than the picture; two have colors at their vertices."""
+    raster, texture = double("raster"), double("texture")
+    faces = put(FACES, wp.vec3i, device)
+    texture_of_face = put([0, -1, -1, 0], wp.int32, device)
+
+    def reflect(clip_positions, uvs, vertex_albedo, image):
+        fragments = raster.rasterize(clip_positions, faces, *SIZE)
+        textures = texture.mip_pyramids([image])
+        footprints = texture.find_footprints(fragments, faces, clip_positions, uvs, faces, texture_of_face, textures)
+        return texture.surface_albedo(fragments, faces, vertex_albedo, textures, footprints)
+
+    uvs, vertex_albedo, image = 2 * random(0, 1, 4, 2), random(1, 1, 4, 3), random(2, 1, 7, 5, 3)
+    check(reflect, clip, (wp.vec2d, uvs), (wp.vec3d, vertex_albedo), (wp.vec3d, image))
+
+
+def test_upright_silhouettes(double, device, check):
+    """Of edges that lean, how the lean changes is left out of the gradient."""
+    raster, silhouette = double("raster"), double("silhouette")
+    corners = np.array([[2.3, 1.2], [5.6, 1.2], [5.6, 4.4], [2.3, 4.4]])  # [pixels]
+    depths = np.array([[1.0], [1.5], [2.0], [1.2]])
+    clip_positions = np.hstack([depths * (2 * corners / SIZE - 1), np.full((4, 1), 0.1), depths])[None]
+    sides = np.int32([[0, 1, 2], [0, 2, 3]])
+    faces = put(sides, wp.vec3i, device)
+    neighbors = put(silhouette.edge_neighbors(sides), wp.vec3i, device)
+
+    def smooth(image, clip_positions):
+        fragments = raster.rasterize(clip_positions, faces, *SIZE)
+        silhouettes = silhouette.find_silhouettes(fragments, faces, neighbors, clip_positions)
+        return silhouette.smooth_silhouettes(image, silhouettes, clip_positions)
+
+    check(smooth, (wp.vec3d, random(0, 1, SIZE[1], SIZE[0], 3)), (wp.vec4d, clip_positions))
+
+
+def test_exposure(double, device, check, clip):
+    film, raster = double("film"), double("raster")
+    faces = put(FACES, wp.vec3i, device)
+    face_ids = raster.rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+
+    def expose(clip_positions, shading, albedo):
+        weights = raster.barycentrics(face_ids, faces, clip_positions)
+        return film.average(film.expose(raster.Fragments(face_ids, weights), faces, shading, albedo), 2)
+
+    albedo = random(1, 1, SIZE[1], SIZE[0], 3)
+    check(expose, clip, (wp.vec3d, random(0, 2, 4, 3)), (wp.vec3d, albedo))
+
+
+# ---------------------------------------------------------------------------------------------- all stages
+
+
+PLACES, SCALES = [(0, 0, 0), (1.8, 0.7, 0.3)], [1, 0.4]  # of a ground and a body
+LIGHT = random(0, 4, 3) + 5 * np.eye(4, 1)
+
+
+@pytest.fixture
+def make_renderer(double, device):
+    """Make what torch sees of a scene: a ground that fills the picture, and beside that a body that shadows it."""
+    mesh, scene = double("mesh"), double("scene")
+    ground = mesh.plane(size=5, segments=2)
+    body = mesh.Mesh(VERTICES, FACES)
+    spheres = double("spheres").Spheres([[0, 0.2, 0], [0.2, 0.5, 0.1]], [0.6, 0.5])
+    camera = double("camera").Camera.look_at((0.3, 3, 0.5), (0.1, 0, 0), fov_y=30, size=SIZE)
+
+    def make(method, receivers):
+        bodies = [
+            scene.Body(ground, blockers=0, receivers=receivers),
+            scene.Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
+        ]
+        visibility = scene.Visibility(method=method, directions=16, order=3)
+        whole = scene.Scene(bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1)
+        place, basis = wp.device_to_torch(device), double("basis").HarmonicBasis(2)
+        return double("torch").TorchRenderer(whole, device=place, basis=basis)
+
+    return make
+
+
+def variables(renderer, *arguments):
+    """Tensors that require a gradient."""
+    options = {"dtype": torch.float64, "device": renderer.device, "requires_grad": True}
+    return [torch.tensor(values, **options) for values in arguments]
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer):
+    """From poses, cameras, light and reflectance to the pixels; no silhouette is in view."""
+    renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
+    camera = renderer.renderer.scene.camera
+    towards, offset, intrinsics = variables(renderer, camera.rotation, camera.translation, camera.intrinsics)
+
+    def draw(turns, translations, scales, camera_turn, light, color):
+        geometry = renderer.placed(rotation_matrices(turns), translations, scales)
+        view = renderer.clip_matrices(rotation_matrices(camera_turn) @ towards, offset, intrinsics)
+        return renderer(light, albedo=[color, None], geometry=geometry, clip_matrices=view)
+
+    turns, camera_turn, color = 0.1 * random(1, 2, 3), 0.02 * random(2, 3), random(3, 3) ** 2
+    tensors = variables(renderer, turns, PLACES, SCALES, camera_turn, LIGHT, color)
+    assert (draw(*tensors)[..., 3] == 1).all()
+    assert torch.autograd.gradcheck(draw, tensors, nondet_tol=CUDA_SUMS, **EXACT)

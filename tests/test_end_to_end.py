@@ -1,0 +1,262 @@
+"""Every path from a parameter to the loss, as a whole: gradients of images against central differences of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.torch import TorchRenderer, apply, rotation_matrices
+
+# Where no silhouette moves the loss is smooth, and what is left is float32 rounding over the step.
+SMOOTH = 1e-2
+# Silhouettes are sampled by pixels, whose colors stand for those at the edge.
+SILHOUETTE = 5e-2
+
+METHODS = ("directional", "log-sh", "none")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
+
+
+def blob() -> ws.Body:
+    """A bumpy ball with spheres that overlap, a little above the ground."""
+    mesh = ws.icosphere(1.0, 3)
+    bumps = 1 + 0.15 * np.sin(4 * mesh.positions[:, :1]) * np.cos(3 * mesh.positions[:, 1:2])
+    mesh = ws.Mesh(mesh.positions * bumps, mesh.faces, name="blob")
+    centers = [(0.3, 0, 0), (-0.3, 0.1, 0), (0, 0.3, 0.3), (0, -0.3, -0.2), (0.1, 0.2, -0.3), (-0.1, -0.2, 0.35)]
+    spheres = ws.Spheres(centers, [0.7, 0.65, 0.6, 0.6, 0.65, 0.6])
+    return ws.Body(mesh, albedo=(0.7, 0.5, 0.3), blockers=spheres, translation=(0, 0.9, 0), scale=0.6)
+
+
+ON_BOTH = ws.Camera.look_at((0.5, 2.2, 3.6), (0, 0.5, 0), size=(64, 64))
+ON_GROUND = ws.Camera.look_at((1.6, 0.6, -0.5), (1.35, 0.0, -0.4), fov_y=50, size=(32, 32))
+"""Sees the ground alone, and on it the shadow of a body that is out of view."""
+
+
+def scene_of(method: str, camera: ws.Camera, **visibility) -> ws.Scene:
+    ground = ws.Body(ws.plane(6.0, 48), albedo=(0.3, 0.5, 0.6), blockers=0)
+    sky = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
+    return ws.Scene((blob(), ground), sky, camera, ws.Visibility(method, **visibility))
+
+
+def smooth_weights(height: int, width: int) -> torch.Tensor:
+    """A few waves, different in each channel."""
+    rng = np.random.default_rng(3)
+    row, column = np.mgrid[0 : 1 : height * 1j, 0 : 1 : width * 1j]
+    waves = [np.sin(6 * (a * row + b * column) + c) for a, b, c in rng.normal(size=(4, 3)) * [1, 1, 3]]
+    return torch.from_numpy(np.stack(waves, axis=-1))
+
+
+class Poses:
+    """The image as a function of (turn [3], shift [3], scale [1]) of the blob."""
+
+    def __init__(self, renderer: TorchRenderer):
+        self.renderer = renderer
+        self.rotations, self.translations, self.scales = renderer.scene_poses()
+        self.start = torch.zeros(7)
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        rest = torch.zeros(1, 3)
+        turns = rotation_matrices(torch.cat([values[None, :3], rest]))
+        shifts = self.translations + torch.cat([values[None, 3:6], rest])
+        scales = self.scales * (1 + torch.cat([values[6:], torch.zeros(1)]))
+        return self.renderer(geometry=self.renderer.placed(turns @ self.rotations, shifts, scales))
+
+
+class Cameras:
+    """The image as a function of (turn [3], shift [3], focal length [1]) of the camera."""
+
+    def __init__(self, renderer: TorchRenderer):
+        self.renderer = renderer
+        self.start = torch.zeros(7)
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        camera = self.renderer.renderer.scene.camera
+        matrix, turn, shift = (
+            torch.tensor(array, dtype=torch.float32)
+            for array in (camera.intrinsics, camera.rotation, camera.translation)
+        )
+        focal = torch.eye(3) + values[6] * torch.diag(torch.tensor([1.0, 1.0, 0.0]))
+        matrices = self.renderer.clip_matrices(
+            rotation_matrices(values[None, :3])[0] @ turn, shift + values[3:6], matrix @ focal
+        )
+        return self.renderer(clip_matrices=matrices)[0]
+
+
+class Deformations:
+    """The image as a function of the rotations [node, 3], translations [node, 3] and radii [node] of a graph."""
+
+    def __init__(self, renderer: TorchRenderer):
+        self.renderer = renderer
+        self.graph = renderer.renderer.assembly.graph(0, count=3)
+        self.radii = torch.tensor(renderer.renderer.scene.bodies[0].blockers.radii)
+        self.start = torch.zeros(7 * len(self.radii))
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        count = len(self.radii)
+        turns, shifts = values[: 6 * count].reshape(2, 1, count, 3)
+        radii = self.radii * (1 + values[6 * count :])
+        matrices = rotation_matrices(turns)
+        points = apply(self.graph.points, matrices, shifts, dtypes=(wp.mat33, wp.vec3))
+        centers = apply(self.graph.centers, shifts, dtypes=(wp.vec3,))
+        rest = self.renderer.deformed(0, points, centers, radii[None])
+        rotations, translations, scales = self.renderer.scene_poses()
+        return self.renderer(geometry=self.renderer.placed(rotations, translations, scales, rest=rest))[0]
+
+
+def gradient_and_differences(image_of, directions: np.ndarray, step: float, channels: slice) -> tuple[np.ndarray, ...]:
+    """Of Σ weights · image at the start, along directions [direction, parameter]: by autograd, by differences."""
+    start = image_of.start.clone().requires_grad_()
+    image = image_of(start)
+    weights = smooth_weights(*image.shape[:2])[..., channels]
+
+    def loss(image: torch.Tensor) -> torch.Tensor:
+        return (image[..., channels].double() * weights).sum()
+
+    (gradient,) = torch.autograd.grad(loss(image), start)
+    assert gradient.isfinite().all()
+    differences = []
+    with torch.no_grad():
+        for direction in torch.tensor(directions, dtype=torch.float32):
+            ends = [loss(image_of(image_of.start + sign * step * direction)).item() for sign in (1, -1)]
+            differences.append((ends[0] - ends[1]) / (2 * step))
+    return directions @ gradient.double().numpy(), np.array(differences)
+
+
+def relative_error(got: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(got - expected) / np.linalg.norm(expected))
+
+
+# ---------------------------------------------------------------------------------------------- smooth paths
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_shadow_alone_moves_the_body_that_casts_it(method):
+    """The camera sees the ground alone; pose and scale of the blob out of view change what it sees by its shadow."""
+    renderer = TorchRenderer(scene_of(method, ON_GROUND))
+    assert set(np.unique(renderer.renderer.body_ids())) == {1}
+    got, expected = gradient_and_differences(Poses(renderer), np.eye(7), 2e-3, slice(3))
+    assert np.abs(expected[[0, 3, 4, 5, 6]]).min() > 0
+    assert relative_error(got, expected) < SMOOTH
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_shadow_alone_moves_the_nodes_of_a_deforming_body(method):
+    renderer = TorchRenderer(scene_of(method, ON_GROUND))
+    image_of = Deformations(renderer)
+    directions = np.random.default_rng(4).normal(size=(6, len(image_of.start)))
+    got, expected = gradient_and_differences(image_of, directions, 2e-3, slice(3))
+    assert relative_error(got, expected) < SMOOTH
+
+
+# ---------------------------------------------------------------------------------------------- with silhouettes
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("parameters", [Poses, Cameras])
+def test_what_moves_the_image_has_the_gradient_of_the_image(method, parameters):
+    renderer = TorchRenderer(scene_of(method, ON_BOTH))
+    got, expected = gradient_and_differences(parameters(renderer), np.eye(7), 4e-3, slice(4))
+    assert relative_error(got, expected) < SILHOUETTE
+
+
+# ---------------------------------------------------------------------------------------------- batches
+
+
+def random_batch(renderer: TorchRenderer, count: int) -> dict[str, torch.Tensor]:
+    """Turns and shifts of both bodies, cameras, lights and colors."""
+    generator = torch.Generator().manual_seed(0)
+    basis_size = renderer.renderer.basis.size
+    camera = torch.tensor(renderer.renderer.scene.camera.clip_matrix(), dtype=torch.float32)
+    return {
+        "turns": 0.3 * torch.randn(count, 2, 3, generator=generator),
+        "shifts": 0.1 * torch.randn(count, 2, 3, generator=generator),
+        "clip_matrices": camera + 0.02 * torch.randn(count, 4, 4, generator=generator) * (camera != 0),
+        "light": torch.rand(count, basis_size, 3, generator=generator),
+        "albedo": torch.rand(count, 1, 3, generator=generator),
+        "textures": torch.rand(count, 5, 4, 3, generator=generator),
+    }
+
+
+def image_of_batch(renderer: TorchRenderer, values: dict[str, torch.Tensor]) -> torch.Tensor:
+    rotations, translations, scales = renderer.scene_poses()
+    geometry = renderer.placed(
+        rotation_matrices(values["turns"]) @ rotations, translations + values["shifts"], scales
+    )
+    return renderer(
+        values["light"],
+        albedo=[values["albedo"], None],
+        textures=[None, values["textures"]],
+        geometry=geometry,
+        clip_matrices=values["clip_matrices"],
+    )
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_batch_is_its_instances_one_by_one(method, receivers):
+    """Images to the bit; gradients, too, but for what all instances share, which is summed in another order."""
+    scene = scene_of(method, ON_BOTH, directions=64, order=4)
+    ground = dataclasses.replace(scene.bodies[1], receivers=receivers)
+    renderer = TorchRenderer(dataclasses.replace(scene, bodies=(scene.bodies[0], ground)))
+    values = random_batch(renderer, 3)
+    together = {name: value.clone().requires_grad_() for name, value in values.items()}
+    images = image_of_batch(renderer, together)
+    weights = torch.randn(images.shape, generator=torch.Generator().manual_seed(1))
+    (images * weights).sum().backward()
+    for instance in range(3):
+        alone = {name: value[instance : instance + 1].clone().requires_grad_() for name, value in values.items()}
+        image = image_of_batch(renderer, alone)
+        assert torch.equal(image[0], images[instance])
+        (image[0] * weights[instance]).sum().backward()
+        for name, value in alone.items():
+            torch.testing.assert_close(value.grad[0], together[name].grad[instance])
+
+
+@pytest.mark.parametrize("name", ["turns", "clip_matrices", "light", "albedo", "textures"])
+def test_one_instance_of_anything_serves_all_of_the_rest(name):
+    """A batch in which one argument is the same for all, given once or repeated."""
+    renderer = TorchRenderer(scene_of("directional", ON_BOTH, directions=32))
+    shared = ["turns", "shifts"] if name == "turns" else [name]
+    values = random_batch(renderer, 2)
+    once = {key: (value[:1].clone() if key in shared else value).requires_grad_() for key, value in values.items()}
+    repeated = {key: value.detach().expand(2, *value.shape[1:]).clone().requires_grad_() for key, value in once.items()}
+    images, expected = (image_of_batch(renderer, given) for given in (once, repeated))
+    assert torch.equal(images, expected)
+    weights = torch.randn(images.shape, generator=torch.Generator().manual_seed(2))
+    for image in (images, expected):
+        (image * weights).sum().backward()
+    for key, value in once.items():
+        gradient = repeated[key].grad
+        expected_gradient = gradient.sum(dim=0, keepdim=True) if key in shared else gradient
+        scale = expected_gradient.abs().max()
+        assert (value.grad - expected_gradient).abs().max() < 1e-5 * scale
+
+
+@pytest.mark.parametrize("name", ["turns", "clip_matrices", "light", "albedo", "textures"])
+def test_only_one_argument_in_a_batch_makes_a_batch_of_images(name):
+    renderer = TorchRenderer(scene_of("directional", ON_BOTH, directions=32))
+    varied = ["turns", "shifts"] if name == "turns" else [name]
+    values = random_batch(renderer, 2)
+    given = {key: value if key in varied else value[:1] for key, value in values.items()}
+    images = image_of_batch(renderer, given)
+    for instance in range(2):
+        one = {key: value[instance : instance + 1] if key in varied else value for key, value in given.items()}
+        assert torch.equal(image_of_batch(renderer, one)[0], images[instance])
+    assert not torch.equal(images[0], images[1])
+
+
+def test_geometry_that_does_not_move_gives_the_scenes_image():
+    for method in METHODS:
+        renderer = TorchRenderer(scene_of(method, ON_BOTH))
+        geometry = renderer.placed(*renderer.scene_poses())
+        assert torch.equal(renderer(geometry=geometry)[0], renderer())

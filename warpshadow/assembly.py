@@ -1,0 +1,210 @@
+"""Assembly: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.batch import common_batch, concatenate
+from warpshadow.blockers import scene_blockers
+from warpshadow.deform import DeformationGraph, Poses
+from warpshadow.scene import Scene
+from warpshadow.silhouette import edge_neighbors
+
+
+class Geometry(NamedTuple):
+    """What can move: the vertices of all bodies, and the spheres that stand in for them."""
+
+    positions: Any  # [batch, vertex] vec3
+    centers: Any  # [batch, sphere] vec3
+    radii: Any  # [batch, sphere] float32
+
+
+class Assembly:
+    """What all poses of a scene share: topology, and the bodies' shapes at rest, each in its own space.
+
+    Args:
+        scene: The scene; its spheres are fitted when first asked for.
+        device: Where the arrays live.
+        progress: Show progress of the fits.
+
+    Attributes:
+        faces: Indices of vertices, vec3i of shape [face].
+        uvs: Texture coordinates, vec2 of shape [1, uv].
+        uv_faces: Indices of uvs, vec3i of shape [face].
+        first_vertex, first_face: Where each body begins, and the end of the last, NumPy of shape [body + 1].
+    """
+
+    def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
+        self.scene = scene
+        self.device = wp.get_device(device)
+        self._progress = progress
+        meshes = [body.mesh for body in scene.bodies]
+        uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
+        uv_faces = [np.zeros_like(mesh.faces) if mesh.uvs is None else mesh.uv_faces for mesh in meshes]
+        self.first_vertex = _starts([mesh.positions for mesh in meshes])
+        self.first_face = _starts([mesh.faces for mesh in meshes])
+        self.faces = self._array(_stacked_faces([mesh.faces for mesh in meshes], self.first_vertex), wp.vec3i)
+        self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
+        self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
+
+    @functools.cached_property
+    def body_of_face(self) -> np.ndarray:
+        """Body that each face belongs to, shape [face]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face))
+
+    @functools.cached_property
+    def surfaces(self) -> wp.array | None:
+        """Body that each face belongs to, int32 of shape [face]; None where there is one."""
+        return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
+
+    @functools.cached_property
+    def edges(self) -> wp.array:
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.silhouette.edge_neighbors`."""
+        parts = [edge_neighbors(body.mesh.faces, body.mesh.positions) for body in self.scene.bodies]
+        moved = [
+            np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)
+        ]
+        return self._array(np.concatenate(moved), wp.vec3i)
+
+    @functools.cached_property
+    def _spheres(self) -> list:
+        """Spheres of each body in its own space; none where the method asks for none."""
+        return scene_blockers(self.scene, device=self.device, progress=self._progress)
+
+    @functools.cached_property
+    def first_sphere(self) -> np.ndarray:
+        """Where each body's spheres begin, and the end of the last, shape [body + 1]."""
+        return _starts([spheres.radii for spheres in self._spheres])
+
+    @functools.cached_property
+    def rest(self) -> Geometry:
+        """The bodies at rest, each in its own space; the batch is 1."""
+        positions = np.concatenate([body.mesh.positions for body in self.scene.bodies])
+        centers = np.concatenate([spheres.centers for spheres in self._spheres])
+        radii = np.concatenate([spheres.radii for spheres in self._spheres])
+        return Geometry(
+            self._array(positions[None], wp.vec3),
+            self._array(centers[None], wp.vec3),
+            self._array(radii[None], wp.float32),
+        )
+
+    @functools.cached_property
+    def poses(self) -> Poses:
+        """Where the scene has its bodies; the batch is 1."""
+        bodies = self.scene.bodies
+        return Poses(
+            self._array(np.stack([body.rotation_matrix() for body in bodies])[None], wp.mat33),
+            self._array(np.stack([body.translation for body in bodies])[None], wp.vec3),
+            self._array(np.array([[body.scale for body in bodies]]), wp.float32),
+        )
+
+    def placed(self, poses: Poses | None = None, rest: Geometry | None = None) -> Geometry:
+        """Place the bodies in the world.
+
+        Args:
+            poses: Of each body, by default the scene's.
+            rest: The bodies in their own spaces, by default as their meshes are.
+                Either batch may be 1 and then serves every instance of the other.
+
+        Differentiable: poses, rest.
+        """
+        poses = self.poses if poses is None else poses
+        rest = self.rest if rest is None else rest
+        check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
+        return Geometry(
+            poses.points(rest.positions, self._vertex_bodies),
+            poses.points(rest.centers, self._sphere_bodies),
+            poses.radii(rest.radii, self._sphere_bodies),
+        )
+
+    def graph(self, number: int, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
+
+        Args:
+            number: The body, from 0.
+            count: Nodes that carry a vertex.
+
+        Raises:
+            ValueError: when the body has too few spheres.
+        """
+        check.choice("number", number, range(len(self.scene.bodies)))
+        body = self.scene.bodies[number]
+        return DeformationGraph.bind(
+            body.mesh.positions, self._spheres[number].centers, count=count, device=self.device
+        )
+
+    def deformed(
+        self,
+        number: int,
+        positions: wp.array | None = None,
+        centers: wp.array | None = None,
+        radii: wp.array | None = None,
+        *,
+        rest: Geometry | None = None,
+    ) -> Geometry:
+        """Exchange the shape of one body at rest.
+
+        Args:
+            number: The body, from 0.
+            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
+            centers: Its spheres' centers, vec3 of shape [batch, sphere].
+            radii: Its spheres' radii, float32 of shape [batch, sphere].
+                What is None stays as it is in ``rest``.
+            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
+
+        Returns:
+            All bodies at rest, for :meth:`placed`.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: positions, centers, radii, rest.
+        """
+        check.choice("number", number, range(len(self.scene.bodies)))
+        rest = self.rest if rest is None else rest
+        first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
+        return Geometry(
+            _spliced("positions", rest.positions, positions, first_vertex),
+            _spliced("centers", rest.centers, centers, first_sphere),
+            _spliced("radii", rest.radii, radii, first_sphere),
+        )
+
+    @functools.cached_property
+    def _vertex_bodies(self) -> wp.array:
+        return self._members(self.first_vertex)
+
+    @functools.cached_property
+    def _sphere_bodies(self) -> wp.array:
+        return self._members(self.first_sphere)
+
+    def _members(self, starts: np.ndarray) -> wp.array:
+        """Body of each item, int32."""
+        return self._array(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), wp.int32)
+
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _starts(parts: list[np.ndarray]) -> np.ndarray:
+    """Where each part begins when they are put after one another, and the end of the last."""
+    return np.cumsum([0, *map(len, parts)])
+
+
+def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
+    return np.concatenate([part + first for part, first in zip(parts, starts[:-1], strict=True)])
+
+
+def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
+    """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
+    if part is None:
+        return whole
+    first, end = place.tolist()
+    check.shape(name, part.shape, ("batch", end - first))
+    common_batch({"rest": whole, name: part})
+    before = [whole[:, :first]] if first else []
+    after = [whole[:, end:]] if end < whole.shape[1] else []
+    pieces = [*before, part, *after]
+    return concatenate(pieces, [piece.shape[1] for piece in pieces])

@@ -1,0 +1,76 @@
+"""Batches: every array of a stage has a leading dimension of instances, and a length of 1 serves them all."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import warp as wp
+
+from warpshadow.tape import launch
+
+
+def common_batch(arrays: Mapping[str, Any]) -> int:
+    """The common length of the leading dimensions of arrays, None passed over; a length of 1 serves any.
+
+    Raises:
+        ValueError: naming the array whose length is another.
+    """
+    counts = {name: array.shape[0] for name, array in arrays.items() if array is not None}
+    count = next((count for count in counts.values() if count != 1), 1)
+    for name, got in counts.items():
+        if got not in (1, count):
+            raise ValueError(f"{name}: got a batch of {got}, expected 1 or {count}")
+    return count
+
+
+@functools.cache
+def _copy_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique")
+    def copy(
+        # in
+        part: wp.array2d(dtype=dtype),
+        first: int,
+        # out
+        whole: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns an item of an instance."""
+        batch, item = wp.tid()
+        whole[batch, first + item] = part[wp.min(batch, part.shape[0] - 1), wp.min(item, part.shape[1] - 1)]
+
+    return copy
+
+
+def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: int | None = None) -> wp.array:
+    """Put arrays of items after one another, for every instance.
+
+    Args:
+        parts: Arrays of one dtype, shape [batch, count], or [batch, 1] where one item serves them all.
+        counts: Items of each part.
+        instances: Length of the batch, by default the parts' own.
+
+    Differentiable: parts.
+    """
+    if instances is None:
+        instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
+    whole = wp.empty(
+        (instances, sum(counts)),
+        dtype=parts[0].dtype,
+        device=parts[0].device,
+        requires_grad=any(part.requires_grad for part in parts),
+    )
+    first = 0
+    for part, count in zip(parts, counts, strict=True):
+        dim = instances, count
+        launch(_copy_kernel(part.dtype), dim=dim, inputs=[part, first], outputs=[whole], device=part.device)
+        first += count
+    return whole
+
+
+def expand(array: wp.array, instances: int) -> wp.array:
+    """Repeat an array of shape [1, item] for every instance; one that has the instances stays as it is.
+
+    Differentiable: array.
+    """
+    if array.shape[0] == instances:
+        return array
+    return concatenate([array], array.shape[1:], instances=instances)

@@ -1,0 +1,859 @@
+"""Textures: mip levels, and the reflectance that each sample of an image sees of them.
+
+A texture is an image of linear RGB reflectance with row 0 at v = 1; it repeats outside of [0, 1], and its texels have
+their centers at +0.5. Each mip level is half as large as the one before, and a texel there is the mean of those that
+it covers.
+
+A sample does not see a point of the texture but its *footprint*: to first order an ellipse, the image of the sample
+under the derivative of uv by its position. The footprint is filtered by *probes* on a line along its major axis. A
+probe is bilinear in two mip levels, blended so that their mean texel is as wide as the minor axis. So a ground seen
+at a grazing angle neither blurs nor aliases, and each texel in view gets its share of the gradient: a texture that is
+fitted has no holes. Where a texel is larger than the footprint, one probe of the finest level is left, which is
+bilinear interpolation.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.batch import common_batch
+from warpshadow.raster import Fragments, _instance, _relative, _volumes, interpolate
+from warpshadow.tape import launch, record_adjoint
+
+MAX_PROBES = 7
+"""Most probes of a footprint, an odd number; where it is longer still, its probes grow wider."""
+
+# A probe reaches beyond its width, so a line of n probes may be this many widths longer than n widths. Of 0 to 1, a
+# quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
+_REACH = 0.25
+
+# Derivatives of uv are cut off here [texels per sample], so that a face seen edge-on gives the coarsest level, not NaN.
+_MAX_DERIVATIVE = 1.0e6
+
+
+@dataclass(frozen=True, eq=False)
+class Textures:
+    """Mip levels of several textures, of any sizes, in one array.
+
+    Args:
+        texels: All levels of all textures, linear RGB, vec3 of shape [batch, texel].
+        levels: First texel, width and height of each level, the finest first, vec3i of shape [texture, level].
+        level_counts: Levels that each texture has, int32 of shape [texture].
+        sizes: Height and width of each texture.
+    """
+
+    texels: wp.array
+    levels: wp.array
+    level_counts: wp.array
+    sizes: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Where each sample lies in its texture, and what it covers there.
+
+    Args:
+        texture_ids: Texture that the sample sees, -1 where none, int32 of shape [batch, height, width].
+        uvs: Texture coordinates, vec2 of shape [batch, height, width].
+        probes: (Δu, Δv, width, count): probes lie Δ apart on a line through uv, each as wide as ``width`` texels of
+            the finest level; ``count`` is the length of the line in widths, at least 1, and need not be whole. Vec4 of
+            shape [batch, height, width].
+    """
+
+    texture_ids: wp.array
+    uvs: wp.array
+    probes: wp.array
+
+
+# ---------------------------------------------------------------------------------------------------- mip levels
+
+
+def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """Height and width of each level, rounded down, to a single texel."""
+    sizes = [(height, width)]
+    while max(sizes[-1]) > 1:
+        height, width = max(height // 2, 1), max(width // 2, 1)
+        sizes.append((height, width))
+    return sizes
+
+
+class _Layout:
+    """Where the levels of textures lie in an array of texels."""
+
+    def __init__(self, sizes: tuple[tuple[int, int], ...], device: str):
+        level_sizes = [_level_sizes(*size) for size in sizes]
+        self.level_counts = [len(part) for part in level_sizes]
+        self.levels = np.zeros((len(sizes), max(self.level_counts), 3), np.int32)
+        self.texel_count = 0
+        for texture, part in enumerate(level_sizes):
+            for level, (height, width) in enumerate(part):
+                self.levels[texture, level] = self.texel_count, width, height
+                self.texel_count += width * height
+        self.device_levels = wp.array(self.levels, dtype=wp.vec3i, device=device)
+        self.device_level_counts = wp.array(self.level_counts, dtype=wp.int32, device=device)
+
+    def steps(self, texture: int) -> list[tuple[wp.vec3i, wp.vec3i]]:
+        """Each level of a texture with the next, coarser one, from the finest."""
+        levels = [wp.vec3i(*level) for level in self.levels[texture, : self.level_counts[texture]].tolist()]
+        return list(zip(levels[:-1], levels[1:], strict=True))
+
+
+@functools.lru_cache(maxsize=64)
+def _layout(sizes: tuple[tuple[int, int], ...], device: str) -> _Layout:
+    return _Layout(sizes, device)
+
+
+@wp.kernel(enable_backward=False)
+def _copy(
+    # in
+    values: wp.array(dtype=wp.vec3),
+    # out
+    copies: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a value."""
+    thread = wp.tid()
+    copies[thread] = values[thread]
+
+
+@wp.kernel(enable_backward=False)
+def _add(
+    # in
+    values: wp.array(dtype=wp.vec3),
+    # out
+    sums: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a sum."""
+    thread = wp.tid()
+    sums[thread] = sums[thread] + values[thread]
+
+
+@wp.func
+def _shares(coarse: int, fine_count: int, coarse_count: int):
+    """What part of a coarse texel each of the three fine ones from number 2 ``coarse`` on is.
+
+    An odd number of fine texels is not twice that of coarse ones, which cover 2 + 1/coarse_count each: the outer two
+    of the three are shared with their neighbors.
+    """
+    if fine_count == 1:
+        return wp.vec3(1.0, 0.0, 0.0)
+    if fine_count == 2 * coarse_count:
+        return wp.vec3(0.5, 0.5, 0.0)
+    return wp.vec3(float(coarse_count - coarse), float(coarse_count), float(coarse + 1)) / float(fine_count)
+
+
+@wp.kernel(enable_backward=False)
+def _halve(
+    # in
+    fine: wp.vec3i,
+    coarse: wp.vec3i,
+    # out
+    texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a texel of the coarse level, in every instance: the mean of what it covers of the fine one."""
+    texel = wp.tid()
+    row = texel // coarse[1]
+    column = texel - row * coarse[1]
+    across = _shares(column, fine[1], coarse[1])
+    down = _shares(row, fine[2], coarse[2])
+    start = fine[0] + 2 * row * fine[1] + 2 * column
+    for batch in range(texels.shape[0]):
+        of_instance = texels[batch]
+        mean = wp.vec3()
+        for i in range(3):
+            if down[i] > 0.0:
+                for j in range(3):
+                    if across[j] > 0.0:
+                        mean += (down[i] * across[j]) * of_instance[start + i * fine[1] + j]
+        of_instance[coarse[0] + texel] = mean
+
+
+@wp.kernel(enable_backward=False)
+def _halve_adjoint(
+    # in
+    fine: wp.vec3i,
+    coarse: wp.vec3i,
+    # out
+    adj_texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a texel of the coarse level, in every instance."""
+    texel = wp.tid()
+    row = texel // coarse[1]
+    column = texel - row * coarse[1]
+    across = _shares(column, fine[1], coarse[1])
+    down = _shares(row, fine[2], coarse[2])
+    start = fine[0] + 2 * row * fine[1] + 2 * column
+    for batch in range(adj_texels.shape[0]):
+        of_instance = adj_texels[batch]
+        adj_mean = of_instance[coarse[0] + texel]
+        for i in range(3):
+            if down[i] > 0.0:
+                for j in range(3):
+                    if across[j] > 0.0:
+                        wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * across[j]) * adj_mean)
+
+
+def mip_pyramids(images: Sequence[wp.array]) -> Textures:
+    """Compute the mip levels of textures, down to a single texel.
+
+    A level has half the width and the height of the one before, rounded down; its texels have the same size and cover
+    the same square, so where a number is odd a texel is shared by its two neighbors. Each level has the image's mean.
+
+    Args:
+        images: Linear RGB, row 0 at v = 1, vec3 of shape [batch, height, width], each of its own size; a batch may be
+            1 and then serves every instance.
+
+    Returns:
+        All levels.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: images.
+    """
+    if not images:
+        raise ValueError("images: got none, expected at least one")
+    for number, image in enumerate(images):
+        check.shape(f"images[{number}]", image.shape, ("batch", "height", "width"))
+        if image.dtype != wp.vec3 or not image.size or not image.is_contiguous:
+            got = f"{'' if image.is_contiguous else 'strided '}{image.dtype.__name__} of shape {image.shape}"
+            raise ValueError(f"images[{number}]: got {got}, expected contiguous vec3 with at least one texel")
+    sizes = tuple(image.shape[1:] for image in images)
+    device = images[0].device
+    layout = _layout(sizes, str(device))
+    texels = wp.empty(
+        (common_batch({f"images[{number}]": image for number, image in enumerate(images)}), layout.texel_count),
+        dtype=wp.vec3,
+        device=device,
+        requires_grad=any(image.requires_grad for image in images),
+    )
+    for number, image in enumerate(images):
+        for from_image, to_texels in _finest(image, texels, layout, number):
+            _launch(_copy, to_texels.size, [from_image], [to_texels])
+        for fine, coarse in layout.steps(number):
+            _launch(_halve, coarse[1] * coarse[2], [fine, coarse], [texels])
+
+    def adjoint() -> None:
+        for number, image in enumerate(images):
+            if image.requires_grad:
+                _add_to_image(image.grad, texels.grad, layout, number)
+
+    record_adjoint(adjoint, [*images, texels])
+    return Textures(texels, layout.device_levels, layout.device_level_counts, sizes)
+
+
+def _add_to_image(adj_image: wp.array, adj_texels: wp.array, layout: _Layout, number: int) -> None:
+    """Gather the gradients of all levels of a texture, the coarsest first, in its image."""
+    for fine, coarse in reversed(layout.steps(number)):
+        _launch(_halve_adjoint, coarse[1] * coarse[2], [fine, coarse], [adj_texels])
+    for to_image, from_texels in _finest(adj_image, adj_texels, layout, number):
+        _launch(_add, to_image.size, [from_texels], [to_image])
+
+
+def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
+    """An image [height · width] and the texels of its finest level, in each instance."""
+    first, width, height = layout.levels[number, 0].tolist()
+    rows = image.reshape((image.shape[0], -1))
+    return [
+        (rows[min(batch, len(rows) - 1)], texels[batch, first : first + width * height])
+        for batch in range(texels.shape[0])
+    ]
+
+
+def _launch(kernel: wp.Kernel, thread_count: int, inputs: list, outputs: list) -> None:
+    """Launch off the tape, on the device of the first array."""
+    device = next(value.device for value in [*inputs, *outputs] if isinstance(value, wp.array))
+    wp.launch(kernel, dim=thread_count, inputs=inputs, outputs=outputs, device=device, record_tape=False)
+
+
+# ---------------------------------------------------------------------------------------------------- footprints
+
+
+@wp.func
+def _uv_derivatives(
+    a: wp.vec4, b: wp.vec4, c: wp.vec4, to_a: wp.vec2, to_b: wp.vec2, to_c: wp.vec2, ray: wp.vec2, pixel: wp.vec2
+):
+    """Derivative of uv by the position of a sample [1/sample], its columns by column and row.
+
+    ``a``, ``b`` and ``c`` are the vertices in clip space, ``to_a``, ``to_b`` and ``to_c`` their uvs relative to that of
+    the sample, and ``pixel`` the steps of the ray from one sample to the next. With volumes v, linear in the ray,
+    uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the face.
+    """
+    at_a = _relative(a, ray)
+    at_b = _relative(b, ray)
+    at_c = _relative(c, ray)
+    volumes = _volumes(at_a, at_b, at_c)
+    total = volumes[0] + volumes[1] + volumes[2]
+    by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
+    by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
+    scale = wp.where(wp.abs(total) > 1.0e-18, total, 1.0e-18)  # edge-on: what follows is cut off
+    x = (pixel[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
+    y = (pixel[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
+    return wp.mat22(x[0], y[0], x[1], y[1])
+
+
+@wp.func
+def _probes(derivatives: wp.mat22, width: float, height: float):
+    """Probes of a footprint (`Footprints`) in a texture of a size [texels].
+
+    The derivative's singular values are the major and the minor axis of the footprint.
+    """
+    limit = wp.static(_MAX_DERIVATIVE)
+    ux = wp.clamp(derivatives[0, 0] * width, -limit, limit)
+    uy = wp.clamp(derivatives[0, 1] * width, -limit, limit)
+    vx = wp.clamp(derivatives[1, 0] * height, -limit, limit)
+    vy = wp.clamp(derivatives[1, 1] * height, -limit, limit)
+    uu = ux * ux + uy * uy
+    vv = vx * vx + vy * vy
+    probes = wp.vec4(0.0, 0.0, 1.0, 1.0)
+    if uu + vv > 1.0:  # else one probe of the finest level is enough
+        uv = ux * vx + uy * vy
+        half = 0.5 * (uu - vv)
+        # the axes of a round footprint have no derivative: 1e-12 keeps it finite
+        root = wp.sqrt(half * half + uv * uv + 1.0e-12 * (uu + vv) * (uu + vv))
+        major = wp.sqrt(0.5 * (uu + vv) + root)
+        minor = wp.abs(ux * vy - uy * vx) / major
+        probe_width = wp.max(wp.max(minor, major / wp.static(MAX_PROBES + _REACH)), 1.0)
+        count = wp.max(major / probe_width - wp.static(_REACH), 1.0)
+        # eigenvector of the major axis, from the row in which nothing cancels
+        along_u = wp.where(half > 0.0, root + half, uv)
+        along_v = wp.where(half > 0.0, uv, root - half)
+        step = probe_width / wp.sqrt(along_u * along_u + along_v * along_v)
+        probes = wp.vec4(along_u * step / width, along_v * step / height, probe_width, count)
+    return probes
+
+
+@wp.kernel
+def _find_footprints(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    uv_faces: wp.array(dtype=wp.vec3i),
+    uvs: wp.array2d(dtype=wp.vec2),
+    texture_of_face: wp.array(dtype=wp.int32),
+    levels: wp.array2d(dtype=wp.vec3i),
+    image_width: int,
+    image_height: int,
+    batch_count: int,
+    # out
+    texture_ids: wp.array(dtype=wp.int32),
+    sample_uvs: wp.array(dtype=wp.vec2),
+    probes: wp.array(dtype=wp.vec4),
+):
+    """A thread owns a sample; uvs and probes are zero before."""
+    thread = wp.tid()
+    instance = _instance(thread, image_width * image_height, batch_count)
+    sample = thread - instance * image_width * image_height
+    fragment = wp.min(instance, face_ids.shape[0] - 1)
+    face = face_ids[fragment, sample]
+    texture = int(-1)
+    if face >= 0:
+        texture = texture_of_face[face]
+    texture_ids[thread] = texture
+    if texture >= 0:
+        projected = wp.min(instance, clip_positions.shape[0] - 1)
+        a = clip_positions[projected, faces[face][0]]
+        b = clip_positions[projected, faces[face][1]]
+        c = clip_positions[projected, faces[face][2]]
+        mapped = wp.min(instance, uvs.shape[0] - 1)
+        uv_a = uvs[mapped, uv_faces[face][0]]
+        uv_b = uvs[mapped, uv_faces[face][1]]
+        uv_c = uvs[mapped, uv_faces[face][2]]
+        weights = barycentrics[fragment, sample]
+        uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
+        row = sample // image_width
+        pixel = wp.vec2(2.0 / float(image_width), 2.0 / float(image_height))
+        ray = wp.vec2((float(sample - row * image_width) + 0.5) * pixel[0] - 1.0, (float(row) + 0.5) * pixel[1] - 1.0)
+        derivatives = _uv_derivatives(a, b, c, uv_a - uv, uv_b - uv, uv_c - uv, ray, pixel)
+        sample_uvs[thread] = uv
+        probes[thread] = _probes(derivatives, float(levels[texture, 0][1]), float(levels[texture, 0][2]))
+
+
+def find_footprints(
+    fragments: Fragments,
+    faces: wp.array,
+    clip_positions: wp.array,
+    uvs: wp.array,
+    uv_faces: wp.array,
+    texture_of_face: wp.array,
+    textures: Textures,
+) -> Footprints:
+    """Find where each sample lies in its texture, and what it covers there.
+
+    Footprints depend on the sizes of the textures, not on what is in them: where geometry and camera stand still,
+    they are found once. A footprint is that of the sample's face, continued beyond its edges, so neither seams of
+    the uvs nor occlusions disturb it.
+
+    Args:
+        fragments: What each sample sees.
+        faces: Vertex indices, vec3i of shape [face].
+        clip_positions: The rasterized vertices in clip space, vec4 of shape [batch, vertex].
+        uvs: Texture coordinates, vec2 of shape [batch, uv].
+        uv_faces: Indices of uvs, vec3i of shape [face]; those of a face without a texture are not read.
+            Any batch may be 1 and then serves every instance.
+        texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
+        textures: The textures.
+
+    Returns:
+        Footprints.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint
+    included, which matter: neglected, they were 1% to 15% of the gradient of a textured plane's pose.
+    """
+    check.shape("uv_faces", uv_faces.shape, faces.shape)
+    check.shape("texture_of_face", texture_of_face.shape, faces.shape)
+    variables = {"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs}
+    batch_count = common_batch(variables)
+    _, height, width = fragments.face_ids.shape
+    shape = batch_count, height, width
+    device = fragments.face_ids.device
+    requires_grad = any(array.requires_grad for array in variables.values())
+    texture_ids = wp.empty(shape, dtype=wp.int32, device=device)
+    sample_uvs = wp.zeros(shape, dtype=wp.vec2, device=device, requires_grad=requires_grad)
+    probes = wp.zeros(shape, dtype=wp.vec4, device=device, requires_grad=requires_grad)
+    launch(
+        _find_footprints,
+        dim=texture_ids.size,
+        inputs=[
+            _rows(fragments.face_ids),
+            _rows(fragments.barycentrics),
+            faces,
+            clip_positions,
+            uv_faces,
+            uvs,
+            texture_of_face,
+            textures.levels,
+            width,
+            height,
+            batch_count,
+        ],
+        outputs=[texture_ids.flatten(), sample_uvs.flatten(), probes.flatten()],
+        device=device,
+    )
+    return Footprints(texture_ids, sample_uvs, probes)
+
+
+def _rows(image: wp.array | None) -> wp.array | None:
+    """View an image [batch, height, width] as [batch, sample]; None stays None."""
+    return None if image is None else image.reshape((image.shape[0], -1))
+
+
+# ---------------------------------------------------------------------------------------------------- reflectance
+
+
+@wp.func
+def _level_of(width: float, level_count: int):
+    """Finer of the two levels that a probe blends, and the part of the coarser one.
+
+    With the part width/2^level - 1 the mean width of their texels is that of the probe.
+    """
+    level = int(0)
+    texel_width = float(1.0)
+    while level < level_count - 1 and width >= 2.0 * texel_width:
+        level += 1
+        texel_width *= 2.0
+    return level, wp.where(level < level_count - 1, width / texel_width - 1.0, 0.0)
+
+
+@wp.func
+def _reach(count: float):
+    """Number of the outermost probe on either side."""
+    return int(wp.ceil(0.5 * (count - 1.0)))
+
+
+@wp.func
+def _weight(probe: int, count: float):
+    """Weight of a probe: the part of the line in its stretch of one width, so outer ones fade in as it grows."""
+    return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0) / count
+
+
+@wp.struct
+class _Cell:
+    """The four texels around a point of a level, and where it lies between them."""
+
+    above_left: int
+    above_right: int
+    below_left: int
+    below_right: int
+    s: float
+    t: float
+
+
+@wp.func
+def _cell(level: wp.vec3i, u: float, v: float):
+    """Find the texels around a uv, which repeats outside of [0, 1]."""
+    width = level[1]
+    height = level[2]
+    x = (u - wp.floor(u)) * float(width) - 0.5
+    y = (1.0 - (v - wp.floor(v))) * float(height) - 0.5
+    left = int(wp.floor(x))
+    top = int(wp.floor(y))
+    cell = _Cell()
+    cell.s = x - float(left)
+    cell.t = y - float(top)
+    right = wp.where(left + 1 < width, left + 1, 0)
+    bottom = wp.where(top + 1 < height, top + 1, 0)
+    left = wp.where(left < 0, width - 1, left)
+    top = wp.where(top < 0, height - 1, top)
+    cell.above_left = level[0] + top * width + left
+    cell.above_right = level[0] + top * width + right
+    cell.below_left = level[0] + bottom * width + left
+    cell.below_right = level[0] + bottom * width + right
+    return cell
+
+
+@wp.func
+def _bilinear(texels: wp.array(dtype=wp.vec3), cell: _Cell):
+    """Interpolate between four texels."""
+    above = (1.0 - cell.s) * texels[cell.above_left] + cell.s * texels[cell.above_right]
+    below = (1.0 - cell.s) * texels[cell.below_left] + cell.s * texels[cell.below_right]
+    return (1.0 - cell.t) * above + cell.t * below
+
+
+@wp.kernel(enable_backward=False)
+def _sample(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    vertex_albedo: wp.array2d(dtype=wp.vec3),
+    texels: wp.array2d(dtype=wp.vec3),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array2d(dtype=wp.int32),
+    uvs: wp.array2d(dtype=wp.vec2),
+    probes: wp.array2d(dtype=wp.vec4),
+    batch_count: int,
+    # out
+    albedo: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a sample."""
+    thread = wp.tid()
+    sample_count = texture_ids.shape[1]
+    instance = _instance(thread, sample_count, batch_count)
+    sample = thread - instance * sample_count
+    footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    texture = texture_ids[footprint, sample]
+    color = wp.vec3()
+    if texture >= 0:
+        of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
+        line = probes[footprint, sample]
+        level, coarse_part = _level_of(line[2], level_counts[texture])
+        reach = _reach(line[3])
+        for probe in range(-reach, reach + 1):
+            u = uvs[footprint, sample][0] + float(probe) * line[0]
+            v = uvs[footprint, sample][1] + float(probe) * line[1]
+            value = (1.0 - coarse_part) * _bilinear(of_instance, _cell(levels[texture, level], u, v))
+            if coarse_part > 0.0:
+                value += coarse_part * _bilinear(of_instance, _cell(levels[texture, level + 1], u, v))
+            color += _weight(probe, line[3]) * value
+    else:
+        fragment = wp.min(instance, face_ids.shape[0] - 1)
+        face = face_ids[fragment, sample]
+        if face >= 0:
+            of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
+            weights = barycentrics[fragment, sample]
+            color = (
+                weights[0] * of_vertices[faces[face][0]]
+                + weights[1] * of_vertices[faces[face][1]]
+                + weights[2] * of_vertices[faces[face][2]]
+            )
+    albedo[thread] = color
+
+
+@wp.func
+def _scatter(adj_texels: wp.array(dtype=wp.vec3), cell: _Cell, adj_color: wp.vec3):
+    """Add to the gradients of four texels: the adjoint of `_bilinear`, by what is interpolated."""
+    adj_above = (1.0 - cell.t) * adj_color
+    adj_below = cell.t * adj_color
+    wp.atomic_add(adj_texels, cell.above_left, (1.0 - cell.s) * adj_above)
+    wp.atomic_add(adj_texels, cell.above_right, cell.s * adj_above)
+    wp.atomic_add(adj_texels, cell.below_left, (1.0 - cell.s) * adj_below)
+    wp.atomic_add(adj_texels, cell.below_right, cell.s * adj_below)
+
+
+@wp.kernel(enable_backward=False)
+def _sample_adjoint_what(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array2d(dtype=wp.int32),
+    uvs: wp.array2d(dtype=wp.vec2),
+    probes: wp.array2d(dtype=wp.vec4),
+    batch_count: int,
+    adj_albedo: wp.array(dtype=wp.vec3),
+    # out
+    adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
+    adj_texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a sample: the adjoint of `_sample` by what reflects."""
+    thread = wp.tid()
+    sample_count = texture_ids.shape[1]
+    instance = _instance(thread, sample_count, batch_count)
+    sample = thread - instance * sample_count
+    footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    texture = texture_ids[footprint, sample]
+    adj_color = adj_albedo[thread]
+    if texture >= 0:
+        if adj_texels:
+            adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
+            line = probes[footprint, sample]
+            level, coarse_part = _level_of(line[2], level_counts[texture])
+            reach = _reach(line[3])
+            for probe in range(-reach, reach + 1):
+                u = uvs[footprint, sample][0] + float(probe) * line[0]
+                v = uvs[footprint, sample][1] + float(probe) * line[1]
+                share = _weight(probe, line[3]) * adj_color
+                _scatter(adj_of_instance, _cell(levels[texture, level], u, v), (1.0 - coarse_part) * share)
+                if coarse_part > 0.0:
+                    _scatter(adj_of_instance, _cell(levels[texture, level + 1], u, v), coarse_part * share)
+    elif adj_vertex_albedo:
+        fragment = wp.min(instance, face_ids.shape[0] - 1)
+        face = face_ids[fragment, sample]
+        if face >= 0:
+            row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
+            weights = barycentrics[fragment, sample]
+            for corner in range(3):
+                wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
+
+
+@wp.func
+def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, u: float, v: float, adj_color: wp.vec3):
+    """Derivatives of a level's color by u and v, and the color itself, each times ``adj_color``."""
+    cell = _cell(level, u, v)
+    above_left = wp.dot(texels[cell.above_left], adj_color)
+    above_right = wp.dot(texels[cell.above_right], adj_color)
+    below_left = wp.dot(texels[cell.below_left], adj_color)
+    below_right = wp.dot(texels[cell.below_right], adj_color)
+    above = (1.0 - cell.s) * above_left + cell.s * above_right
+    below = (1.0 - cell.s) * below_left + cell.s * below_right
+    across = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
+    return wp.vec3(across * float(level[1]), (above - below) * float(level[2]), (1.0 - cell.t) * above + cell.t * below)
+
+
+@wp.kernel(enable_backward=False)
+def _sample_adjoint_where(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    vertex_albedo: wp.array2d(dtype=wp.vec3),
+    texels: wp.array2d(dtype=wp.vec3),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array2d(dtype=wp.int32),
+    uvs: wp.array2d(dtype=wp.vec2),
+    probes: wp.array2d(dtype=wp.vec4),
+    batch_count: int,
+    adj_albedo: wp.array(dtype=wp.vec3),
+    # out
+    adj_barycentrics: wp.array2d(dtype=wp.vec3),
+    adj_uvs: wp.array2d(dtype=wp.vec2),
+    adj_probes: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a sample: the adjoint of `_sample` by where on its face, and how wide, the sample is."""
+    thread = wp.tid()
+    sample_count = texture_ids.shape[1]
+    instance = _instance(thread, sample_count, batch_count)
+    sample = thread - instance * sample_count
+    footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    texture = texture_ids[footprint, sample]
+    adj_color = adj_albedo[thread]
+    if texture >= 0:
+        of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
+        line = probes[footprint, sample]
+        count = line[3]
+        level, coarse_part = _level_of(line[2], level_counts[texture])
+        reach = _reach(count)
+        adj_u = float(0.0)
+        adj_v = float(0.0)
+        adj_line = wp.vec4()
+        for probe in range(-reach, reach + 1):
+            u = uvs[footprint, sample][0] + float(probe) * line[0]
+            v = uvs[footprint, sample][1] + float(probe) * line[1]
+            weight = _weight(probe, count)
+            slopes = _slopes(of_instance, levels[texture, level], u, v, adj_color)
+            adj_width = float(0.0)
+            if coarse_part > 0.0:
+                coarse = _slopes(of_instance, levels[texture, level + 1], u, v, adj_color)
+                adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
+                slopes += coarse_part * (coarse - slopes)
+            # as the line grows, the outermost probes gain half a width each, and all share a longer line
+            adj_count = -weight * slopes[2] / count
+            if wp.abs(probe) == reach:
+                adj_count += 0.5 * slopes[2] / count
+            adj_u += weight * slopes[0]
+            adj_v += weight * slopes[1]
+            along = float(probe) * weight
+            adj_line += wp.vec4(along * slopes[0], along * slopes[1], adj_width, adj_count)
+        if adj_uvs:
+            wp.atomic_add(adj_uvs, footprint, sample, wp.vec2(adj_u, adj_v))
+        if adj_probes:
+            if reach == 0:
+                adj_line[3] = 0.0
+            wp.atomic_add(adj_probes, footprint, sample, adj_line)
+    elif adj_barycentrics:
+        fragment = wp.min(instance, face_ids.shape[0] - 1)
+        face = face_ids[fragment, sample]
+        if face >= 0:
+            row = wp.min(instance, vertex_albedo.shape[0] - 1)
+            adj_weights = wp.vec3()
+            for corner in range(3):
+                adj_weights[corner] = wp.dot(vertex_albedo[row, faces[face][corner]], adj_color)
+            wp.atomic_add(adj_barycentrics, fragment, sample, adj_weights)
+
+
+def sample_albedo(
+    fragments: Fragments, faces: wp.array, vertex_albedo: wp.array, textures: Textures, footprints: Footprints
+) -> wp.array:
+    """Find the reflectance that each sample sees: that of its texture, or of the vertices where there is none.
+
+    It is a continuous function of the footprint: levels blend, and probes fade in at the ends of their line.
+
+    Args:
+        fragments: What each sample sees.
+        faces: Vertex indices, vec3i of shape [face].
+        vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex]; not seen on textured faces.
+        textures: The textures.
+        footprints: Of the samples, from :func:`find_footprints` with textures of these sizes.
+            Any batch may be 1 and then serves every instance.
+
+    Returns:
+        Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: textures, footprints, vertex_albedo, barycentrics of the fragments.
+    """
+    check.shape("vertex_albedo", vertex_albedo.shape, ("batch", "vertex"))
+    check.shape("footprints", footprints.uvs.shape, ("batch", *fragments.face_ids.shape[1:]))
+    what = [vertex_albedo, textures.texels]
+    where = [fragments.barycentrics, footprints.uvs, footprints.probes]
+    names = ["vertex_albedo", "textures", "fragments", "footprints"]
+    batch_count = common_batch(dict(zip(names, [*what, *where[:2]], strict=True)))
+    albedo = wp.empty(
+        (batch_count, *fragments.face_ids.shape[1:]),
+        dtype=wp.vec3,
+        device=vertex_albedo.device,
+        requires_grad=any(array.requires_grad for array in [*what, *where]),
+    )
+    face_ids, barycentrics = _rows(fragments.face_ids), _rows(fragments.barycentrics)
+    seen = [*_seen(textures, footprints), batch_count]
+    _launch(_sample, albedo.size, [face_ids, barycentrics, faces, *what, *seen], [albedo.flatten()])
+
+    def adjoint() -> None:
+        adj_albedo = albedo.grad.flatten()
+        if any(array.requires_grad for array in what):
+            inputs = [face_ids, barycentrics, faces, *seen, adj_albedo]
+            _launch(_sample_adjoint_what, albedo.size, inputs, [array.grad for array in what])
+        if any(array.requires_grad for array in where):
+            inputs = [face_ids, faces, *what, *seen, adj_albedo]
+            _launch(_sample_adjoint_where, albedo.size, inputs, [_rows(array.grad) for array in where])
+
+    record_adjoint(adjoint, [*what, *where, albedo])
+    return albedo
+
+
+def _seen(textures: Textures, footprints: Footprints) -> list[wp.array]:
+    """What kernels take of textures, but for the texels, and of footprints."""
+    images = footprints.texture_ids, footprints.uvs, footprints.probes
+    return [textures.levels, textures.level_counts, *map(_rows, images)]
+
+
+def surface_albedo(
+    fragments: Fragments,
+    faces: wp.array,
+    vertex_albedo: wp.array,
+    clip_positions: wp.array,
+    uvs: wp.array,
+    uv_faces: wp.array,
+    texture_of_face: wp.array,
+    textures: Textures | None,
+) -> wp.array:
+    """Find the reflectance that each sample sees: :func:`sample_albedo` of footprints found for this once.
+
+    Args:
+        fragments: What each sample sees.
+        faces: Vertex indices, vec3i of shape [face].
+        vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex].
+        clip_positions: The rasterized vertices in clip space, vec4 of shape [batch, vertex].
+        uvs: Texture coordinates, vec2 of shape [batch, uv].
+        uv_faces: Indices of uvs, vec3i of shape [face].
+        texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
+        textures: The textures, None for none; then only the vertices' reflectance is interpolated.
+
+    Returns:
+        Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: vertex_albedo, clip_positions, uvs, textures, barycentrics of the fragments.
+    """
+    if textures is None:
+        return interpolate(fragments, faces, vertex_albedo)
+    footprints = find_footprints(fragments, faces, clip_positions, uvs, uv_faces, texture_of_face, textures)
+    return sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
+
+
+# ---------------------------------------------------------------------------------------------------- export
+
+
+def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
+    """Sum what each texel weighs in the samples of all images that see it.
+
+    Args:
+        textures: The textures; what is in them does not matter.
+        footprints: Of the samples, from :func:`find_footprints`.
+
+    Returns:
+        For each texture the weights of its texels, 0 where none sees it, float32 of shape [batch, height, width].
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+    device = footprints.uvs.device
+    layout = _layout(textures.sizes, str(device))
+    batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
+    weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
+    ones = wp.ones(batch_count * footprints.uvs.size // footprints.uvs.shape[0], dtype=wp.vec3, device=device)
+    inputs = [None, None, None, *_seen(textures, footprints), batch_count, ones]
+    _launch(_sample_adjoint_what, ones.size, inputs, [None, weights])
+    images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
+    for number, image in enumerate(images):
+        _add_to_image(image, weights, layout, number)
+    return [image.numpy()[..., 0].copy() for image in images]
+
+
+def fill_unseen(texture: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Give texels that were never seen the color of the nearest one that was, so that seams do not bleed.
+
+    Args:
+        texture: Linear RGB, shape [height, width, 3].
+        weights: What each texel weighs in the images (:func:`seen_texels`), shape [height, width].
+
+    Returns:
+        The texture, filled, shape [height, width, 3]; unchanged where no texel was seen.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    check.shape("texture", texture.shape, ("height", "width", 3))
+    check.shape("weights", weights.shape, texture.shape[:2])
+    if not weights.any():
+        return texture.copy()
+    row, column = distance_transform_edt(weights == 0, return_distances=False, return_indices=True)
+    return texture[row, column]
