@@ -27,8 +27,8 @@ from warpshadow.directions import fibonacci
 from warpshadow.raster import interpolate, rasterize
 from warpshadow.renderer import Renderer
 from warpshadow.shading import shade
-from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.torch import TorchRenderer
+from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, log_sh
 from warpshadow.visibility.exponential import exponentiate
 

@@ -271,7 +271,7 @@ def test_textures(double, device, check, clip):
         fragments = raster.rasterize(clip_positions, faces, *SIZE)
         textures = texture.mip_pyramids([image])
         footprints = texture.find_footprints(fragments, faces, clip_positions, uvs, faces, texture_of_face, textures)
-        return texture.surface_albedo(fragments, faces, vertex_albedo, textures, footprints)
+        return texture.sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
 
     uvs, vertex_albedo, image = 2 * random(0, 1, 4, 2), random(1, 1, 4, 3), random(2, 1, 7, 5, 3)
     check(reflect, clip, (wp.vec2d, uvs), (wp.vec3d, vertex_albedo), (wp.vec3d, image))

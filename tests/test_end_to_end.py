@@ -189,9 +189,7 @@ def random_batch(renderer: TorchRenderer, count: int) -> dict[str, torch.Tensor]
 
 def image_of_batch(renderer: TorchRenderer, values: dict[str, torch.Tensor]) -> torch.Tensor:
     rotations, translations, scales = renderer.scene_poses()
-    geometry = renderer.placed(
-        rotation_matrices(values["turns"]) @ rotations, translations + values["shifts"], scales
-    )
+    geometry = renderer.placed(rotation_matrices(values["turns"]) @ rotations, translations + values["shifts"], scales)
     return renderer(
         values["light"],
         albedo=[values["albedo"], None],

@@ -6,7 +6,6 @@ import twins
 import warp as wp
 
 from warpshadow import directions as cells
-from warpshadow import sh
 from warpshadow import transfer as transfer_module
 from warpshadow.shading import shade
 from warpshadow.transfer import directional_transfer, sh_transfer

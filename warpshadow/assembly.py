@@ -43,7 +43,7 @@ class Assembly:
         self._progress = progress
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
-        uv_faces = [np.zeros_like(mesh.faces) if mesh.uvs is None else mesh.uv_faces for mesh in meshes]
+        uv_faces = [np.zeros_like(mesh.faces) if mesh.uv_faces is None else mesh.uv_faces for mesh in meshes]
         self.first_vertex = _starts([mesh.positions for mesh in meshes])
         self.first_face = _starts([mesh.faces for mesh in meshes])
         self.faces = self._array(_stacked_faces([mesh.faces for mesh in meshes], self.first_vertex), wp.vec3i)

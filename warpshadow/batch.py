@@ -73,4 +73,6 @@ def expand(array: wp.array, instances: int) -> wp.array:
     """
     if array.shape[0] == instances:
         return array
+    if array.shape[0] != 1:
+        raise ValueError(f"array: got a batch of {array.shape[0]}, expected 1 or {instances}")
     return concatenate([array], array.shape[1:], instances=instances)

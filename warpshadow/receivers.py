@@ -19,6 +19,7 @@ class Receivers(NamedTuple):
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3
     faces: wp.array  # [face + own] vec3i, indices of receivers
+    of_vertices: wp.array  # [vertex] int32, -1 for none
     fragments: Fragments  # a sample with a receiver of its own sees one of the added faces, whose corners are all it
 
 
@@ -96,7 +97,8 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     if not wants_samples.any():
-        return Receivers(positions, normals, faces, fragments)
+        every = wp.array(np.arange(len(keeps_vertex)), dtype=wp.int32, device=positions.device)
+        return Receivers(positions, normals, faces, every, fragments)
     device = positions.device
     face_ids = fragments.face_ids.numpy()
     is_own = (face_ids >= 0) & wants_samples[face_ids]
@@ -149,6 +151,7 @@ def find_receivers(
         points,
         point_normals,
         wp.array(all_faces, dtype=wp.vec3i, device=device),
+        wp.array(np.where(keeps_vertex, receiver_of_vertex, -1), dtype=wp.int32, device=device),
         Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights),
     )
 

@@ -1,13 +1,13 @@
 """The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
 
-    geometry, cameras → view → transfer → shading → image
-                                  light ↗     ↖ albedo, textures
+geometry, cameras → view → transfer → shading → image
+light ↗     ↖ albedo, textures
 """
 
 import functools
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -25,7 +25,7 @@ from warpshadow.receivers import Receivers, find_receivers
 from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
 from warpshadow.shading import shade
-from warpshadow.silhouette import Silhouettes, find_silhouettes, smooth_silhouettes
+from warpshadow.silhouette import Silhouettes, find_contrasts, find_silhouettes, smooth_silhouettes
 from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, exponential, log_sh
@@ -34,7 +34,7 @@ COARSE_FACE = 400
 """Pixels of an average face beyond which shading at its corners draws a warning."""
 
 Light = EnvironmentMap | np.ndarray | wp.array
-"""An environment map, SH coefficients [order², 3], or free coefficients in the renderer's basis [batch, coefficient]."""
+"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 
 class View(NamedTuple):
@@ -79,7 +79,7 @@ class Renderer:
             CellBasis(fibonacci(visibility.directions)) if is_cellular else HarmonicBasis(visibility.order)
         )
         self.basis = self._own_basis if basis is None else basis
-        self._kept_footprints: tuple[Any, Footprints | None] = (None, None)
+        self._kept_footprints: dict[tuple, Footprints] = {}
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
@@ -180,21 +180,23 @@ class Renderer:
         """Transfer vectors of a view's receivers to what the method computes in, or to other cells of directions."""
         points, normals, *_ = view.receivers
         visibility = self.scene.visibility
-        spheres = view.geometry.centers, view.geometry.radii
+        spheres = [view.geometry.centers, view.geometry.radii]
         has_spheres = spheres[0].shape[1] > 0
-        count = common_batch({"points": points, "centers": spheres[0], "radii": spheres[1]}) if has_spheres else 1
-        points, normals, *spheres = (expand(array, count) for array in (points, normals, *spheres))
+        if has_spheres:
+            count = common_batch({"points": points, "centers": spheres[0], "radii": spheres[1]})
+            points, normals, *spheres = (expand(array, count) for array in (points, normals, *spheres))
+        centers, radii = spheres
         if isinstance(self._own_basis, CellBasis):
             directions = self._own_basis.directions if directions is None else directions
             if has_spheres:
                 softness = visibility.softness
-                seen = directional.transmittance(points, normals, *spheres, directions, softness=softness)
+                seen = directional.transmittance(points, normals, centers, radii, directions, softness=softness)
             else:
                 seen = wp.full((*points.shape, len(directions)), 1.0, dtype=wp.float32, device=self.device)
             return directional_transfer(seen, normals, directions)
         seen = None
         if has_spheres:
-            log = log_sh.accumulate(points, normals, *spheres, order=visibility.order, log=visibility.log)
+            log = log_sh.accumulate(points, normals, centers, radii, order=visibility.order, log=visibility.log)
             seen = exponential.exponentiate(log, base=visibility.base)
         return sh_transfer(seen, normals, order=visibility.order)
 
@@ -332,7 +334,7 @@ class Renderer:
             if image is not None:
                 check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
                 if bodies[number].mesh.uvs is None:
-                    raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None, or uvs")
+                    raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None")
                 if albedo is not None and albedo[number] is not None:
                     raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
                 check.finite_arrays({f"textures[{number}]": image}, most=check.LARGEST)
@@ -353,8 +355,9 @@ class Renderer:
     def _footprints(self, view: View, pyramids: Textures, has_texture: tuple[bool, ...]) -> Footprints:
         """What each sample covers of its texture, kept for the scene's own view while sizes stay as they are."""
         key = pyramids.sizes, has_texture
-        if view is self.scene_view and key == self._kept_footprints[0]:
-            return self._kept_footprints[1]
+        is_static = view is self.scene_view
+        if is_static and key in self._kept_footprints:
+            return self._kept_footprints[key]
         assembly = self.assembly
         texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
         footprints = find_footprints(
@@ -366,8 +369,8 @@ class Renderer:
             self._array(texture_of_body[assembly.body_of_face], wp.int32),
             pyramids,
         )
-        if view is self.scene_view:
-            self._kept_footprints = key, footprints
+        if is_static:
+            self._kept_footprints = {key: footprints}
         return footprints
 
     # ------------------------------------------------------------------------------------------ image
@@ -400,8 +403,12 @@ class Renderer:
         lit = self.shade(light, view)
         reflected = self.reflect(albedo, textures, view)
         view = self.scene_view if view is None else view
-        samples = film.expose(view.receivers.fragments, view.receivers.faces, lit, reflected)
-        smoothed = smooth_silhouettes(samples, view.silhouettes, view.clip_positions)
+        receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
+        samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
+        contrasts = None
+        if clip_positions.requires_grad:
+            contrasts = find_contrasts(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
+        smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, contrasts)
         return film.average(smoothed, self.scene.supersampling)
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:

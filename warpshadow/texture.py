@@ -31,7 +31,7 @@ MAX_PROBES = 7
 # quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
 _REACH = 0.25
 
-# Derivatives of uv are cut off here [texels per sample], so that a face seen edge-on gives the coarsest level, not NaN.
+# Derivatives of uv are cut off here [texels per sample], so that their fourth powers stay finite.
 _MAX_DERIVATIVE = 1.0e6
 
 
@@ -289,7 +289,12 @@ def _uv_derivatives(
     total = volumes[0] + volumes[1] + volumes[2]
     by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
     by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
-    scale = wp.where(wp.abs(total) > 1.0e-18, total, 1.0e-18)  # edge-on: what follows is cut off
+    # seen edge-on the total vanishes: no less, then, than a millionth of what the volumes change within a sample
+    least = 1.0e-6 * (
+        pixel[0] * (wp.abs(by_x[0]) + wp.abs(by_x[1]) + wp.abs(by_x[2]))
+        + pixel[1] * (wp.abs(by_y[0]) + wp.abs(by_y[1]) + wp.abs(by_y[2]))
+    )
+    scale = wp.where(wp.abs(total) > least, total, least + 1.0e-30)
     x = (pixel[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
     y = (pixel[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
     return wp.mat22(x[0], y[0], x[1], y[1])
@@ -410,6 +415,7 @@ def find_footprints(
     """
     check.shape("uv_faces", uv_faces.shape, faces.shape)
     check.shape("texture_of_face", texture_of_face.shape, faces.shape)
+    check.finite_arrays({"uvs": uvs})
     variables = {"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs}
     batch_count = common_batch(variables)
     _, height, width = fragments.face_ids.shape
@@ -818,7 +824,8 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
         footprints: Of the samples, from :func:`find_footprints`.
 
     Returns:
-        For each texture the weights of its texels, 0 where none sees it, float32 of shape [batch, height, width].
+        For each texture the weights of its texels, float32 of shape [batch, height, width]: 0 where none sees the
+        texel, and small where it is only seen as a part of a coarser level.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.

@@ -5,6 +5,7 @@ mesh included; an iteration is then a matrix product and a gather.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ import warp as wp
 from warpshadow import check, deform
 from warpshadow.assembly import Geometry
 from warpshadow.basis import Basis
+from warpshadow.batch import common_batch
 from warpshadow.camera import compose_clip_matrices
 from warpshadow.deform import Poses, Vec6
 from warpshadow.light import EnvironmentMap
@@ -150,7 +152,7 @@ class TorchRenderer(torch.nn.Module):
         arguments.add("rotations", rotations, wp.mat33, (count,))
         arguments.add("translations", translations, wp.vec3, (count,))
         arguments.add("scales", scales, wp.float32, (count,))
-        arguments.tensors = list(_same_batch(arguments.tensors))
+        arguments.expand()
         for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
             arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
 
@@ -276,10 +278,10 @@ class _Arguments:
         self.tensors.append(tensor if has_batch else tensor[None])
         self.dtypes.append(dtype)
 
-
-def _same_batch(tensors: list[torch.Tensor]) -> list[torch.Tensor]:
-    count = max(tensor.shape[0] for tensor in tensors)
-    return [tensor.expand(count, *tensor.shape[1:]) if tensor.shape[0] == 1 else tensor for tensor in tensors]
+    def expand(self) -> None:
+        """Repeat tensors with a batch of 1 for every instance of the others."""
+        count = common_batch(dict(zip(self.names, self.tensors, strict=True)))
+        self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
 
 def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...]) -> None:
@@ -301,7 +303,7 @@ def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: 
 
 def apply(
     function: Callable, *tensors: torch.Tensor, dtypes: Sequence[type], device: torch.device | None = None
-) -> torch.Tensor | tuple[torch.Tensor, ...]:
+) -> Any:
     """Apply a differentiable function of Warp arrays to tensors.
 
     Args:
@@ -313,7 +315,7 @@ def apply(
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
 
     Returns:
-        A tensor for each array.
+        The array as a tensor, or a tuple of tensors for a tuple of arrays.
 
     Differentiable: as the function is, once.
     """

@@ -45,7 +45,8 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
         x, y, z = load(normals[batch], group)
-        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))  # no cosine around none
+        # there is no cosine around a zero normal
+        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
