@@ -8,6 +8,7 @@ Figures are medians of runs that take turns, so that a slow moment of the machin
 
 import argparse
 import dataclasses
+import itertools
 import os
 import statistics
 import subprocess
@@ -27,6 +28,7 @@ from warpshadow.directions import fibonacci
 from warpshadow.raster import interpolate, rasterize
 from warpshadow.renderer import Renderer
 from warpshadow.shading import shade
+from warpshadow.silhouette import find_silhouettes, smooth_silhouettes
 from warpshadow.torch import TorchRenderer
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, log_sh
@@ -35,6 +37,7 @@ from warpshadow.visibility.exponential import exponentiate
 
 def main(device: str, runs: int) -> None:
     ws.quiet()
+    torch.set_num_threads(1)  # as Warp has; threads of two libraries wait for each other
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
     points, normals, *_ = renderer.scene_view.receivers
@@ -78,10 +81,36 @@ def main(device: str, runs: int) -> None:
         Renderer(scene, device=device).render()
 
     torch_renderer = TorchRenderer(scene, device=device)
+    rotations, translations, scales = torch_renderer.scene_poses()
+    translations.requires_grad_()
+    batch = rotations.expand(8, *rotations.shape), translations.expand(8, *translations.shape)
+    ground_texture = torch.full((256, 256, 3), 0.5, device=torch_renderer.device, requires_grad=True)
     light = torch.from_numpy(cells.coefficients(scene.light)).to(torch_renderer.device).requires_grad_()
 
     def fit_light() -> None:
         torch_renderer(light).square().sum().backward()
+
+    def fit_texture() -> None:
+        torch_renderer(textures=[None, ground_texture]).square().sum().backward()
+
+    def fit_pose() -> None:
+        geometry = torch_renderer.placed(rotations, translations, scales)
+        torch_renderer(geometry=geometry).square().sum().backward()
+
+    def fit_poses() -> None:
+        torch_renderer(geometry=torch_renderer.placed(*batch, scales)).square().sum().backward()
+
+    free_matrices = wp.clone(clip_matrices, requires_grad=True)
+
+    def draw_and_back() -> None:
+        with wp.Tape() as tape:
+            clip = to_clip(renderer.geometry.positions, free_matrices)
+            fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
+            found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.surfaces)
+            image = smooth_silhouettes(interpolate(fragments, faces, shading), found, clip)
+        image.grad.fill_(1.0)
+        tape.backward()
+        tape.zero()
 
     rows: dict[str, Callable[[], None]] = {
         "visibility and shading, directional, 128 directions": shade_directional,
@@ -89,8 +118,12 @@ def main(device: str, runs: int) -> None:
         "directional, forward and backward": shade_directional_and_back,
         "log-SH, forward and backward": shade_log_sh_and_back,
         "project, rasterize and interpolate": draw,
+        "rasterize, interpolate, smooth, forward and backward": draw_and_back,
         "whole image from the scene, directional": whole_image,
-        "one iteration of a light fit, forward and backward": fit_light,
+        "iteration of a light fit in torch": fit_light,
+        "iteration of a texture fit in torch, 256 × 256 texels": fit_texture,
+        "iteration of a pose fit in torch": fit_pose,
+        "iteration of 8 pose fits in a batch": fit_poses,
     }
     vertex_count, sphere_count = points.shape[1], radii.shape[1]
     print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs}")
@@ -120,24 +153,34 @@ def bunny_scene() -> ws.Scene:
 
 
 def time_compilation(device: str) -> None:
-    """Compile what each method of rendering needs in a new process with an empty kernel cache."""
-    for method in ("directional", "log-sh", "none"):
-        program = (
-            "import time, warpshadow as ws; ws.quiet()\n"
-            "scene = ws.Scene((ws.Body(ws.icosphere(), blockers=ws.Spheres([[0, 0, 0]], [1])), "
-            "ws.Body(ws.plane(), blockers=0)), "
-            "ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 1, 5), (0, 0, 0)), "
-            f"ws.Visibility(method={method!r}))\n"
-            f"start = time.perf_counter(); ws.render(scene, device={device!r}); cold = time.perf_counter() - start\n"
-            f"start = time.perf_counter(); ws.render(scene, device={device!r}); warm = time.perf_counter() - start\n"
-            "print(cold - warm)"
-        )
+    """Compile what each method needs, for an image and for a pose fit, in a new process with an empty kernel cache."""
+    scene = (
+        "import time, torch, warpshadow as ws; from warpshadow.torch import TorchRenderer; ws.quiet()\n"
+        "scene = ws.Scene((ws.Body(ws.icosphere(), blockers=ws.Spheres([[0, 0, 0]], [1])), "
+        "ws.Body(ws.plane(), blockers=0)), "
+        "ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 1, 5), (0, 0, 0)), ws.Visibility(method={method!r}))\n"
+    )
+    tasks = {
+        "an image": "def run(): ws.render(scene, device={device!r})\n",
+        "a pose fit": (
+            "renderer = TorchRenderer(scene, device={device!r})\n"
+            "def run():\n"
+            "    poses = [pose.requires_grad_() for pose in renderer.scene_poses()]\n"
+            "    renderer(geometry=renderer.placed(*poses)).sum().backward()\n"
+        ),
+    }
+    timing = (
+        "start = time.perf_counter(); run(); cold = time.perf_counter() - start\n"
+        "start = time.perf_counter(); run(); print(cold - (time.perf_counter() - start))\n"
+    )
+    for method, (task, steps) in itertools.product(("directional", "log-sh", "none"), tasks.items()):
+        program = (scene + steps).format(method=method, device=device) + timing
         with tempfile.TemporaryDirectory() as cache:
             environment = os.environ | {"WARP_CACHE_PATH": cache}
             run = subprocess.run(
                 [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
             )
-        print(f"  cold compile for {method:37}{float(run.stdout.split()[-1]):8.1f} s")
+        print(f"  {f'cold compile for {task}, {method}':54}{float(run.stdout.split()[-1]):8.1f} s")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from scenes import on_ground
 SPHERES = ws.Spheres([(0.2, 0, 0), (-0.2, 0.1, 0), (0, 0.2, 0.2)], [0.3, 0.25, 0.2])
 
 
-@pytest.mark.usefixtures("verified_tape")
 def test_the_pure_warp_loop_finds_the_way_to_a_pose():
     mesh = ws.icosphere(1.0, 2)
     mesh = ws.Mesh(mesh.positions * np.float32([1.0, 0.7, 0.5]), mesh.faces)

@@ -68,9 +68,8 @@ def test_gradients_through_receivers_are_central_differences(device, verified_ta
     with wp.Tape() as tape:
         points, normals = loss(positions)
     weights = rng.normal(size=(2, *points.shape, 3)).astype(np.float32)
-    tape.backward(
-        grads=dict(zip((points, normals), (wp.array(w, dtype=wp.vec3, device=device) for w in weights), strict=True))
-    )
+    seeds = [wp.array(weight, dtype=wp.vec3, device=device) for weight in weights]
+    tape.backward(grads={points: seeds[0], normals: seeds[1]})
     direction = rng.normal(size=(1, 6, 3))
     losses = []
     for step in (2e-3, -2e-3):

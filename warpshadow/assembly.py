@@ -10,8 +10,8 @@ from warpshadow import check
 from warpshadow.batch import common_batch, concatenate
 from warpshadow.blockers import scene_blockers
 from warpshadow.deform import DeformationGraph, Poses
+from warpshadow.mesh import edge_neighbors
 from warpshadow.scene import Scene
-from warpshadow.silhouette import edge_neighbors
 
 
 class Geometry(NamedTuple):
@@ -62,7 +62,7 @@ class Assembly:
 
     @functools.cached_property
     def edges(self) -> wp.array:
-        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.silhouette.edge_neighbors`."""
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.mesh.edge_neighbors`."""
         parts = [edge_neighbors(body.mesh.faces, body.mesh.positions) for body in self.scene.bodies]
         moved = [
             np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)

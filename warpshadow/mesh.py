@@ -1,4 +1,4 @@
-"""Triangle meshes: files, primitives, unwrapping and vertex normals.
+"""Triangle meshes: files, primitives, topology, unwrapping and vertex normals.
 
 Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals.
 Vertices keep the order they have in the file. Texture coordinates have their origin at the lower left of the
@@ -19,7 +19,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.silhouette import edge_neighbors
 from warpshadow.tape import launch
 
 
@@ -465,6 +464,48 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
         faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
         positions /= np.linalg.norm(positions, axis=1, keepdims=True)
     return Mesh(positions * (radius / np.linalg.norm(positions, axis=1, keepdims=True)), faces, name="icosphere")
+
+
+# --------------------------------------------------------------------------------------------------- topology
+
+_NOT_MANIFOLD = -2
+
+
+def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
+    """Find the face on the other side of each edge.
+
+    Args:
+        faces: Indices of positions, shape [face, 3]: edges belong together by position topology, whatever the uvs.
+        positions: Vertices, shape [vertex, 3]; when given, those at the same place count as one, as a mesh needs
+            whose faces have vertices of their own.
+
+    Returns:
+        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
+        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
+        and has no neighbors itself.
+    """
+    check.shape("faces", faces.shape, ("face", 3))
+    faces = faces.astype(np.int64) if positions is None else _places(positions)[faces]
+    across = np.full(faces.shape, -1, np.int32)
+    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
+    first, last = ends.reshape(-1, 2).T
+    _, edge, sharing = np.unique(first * (faces.max(initial=0) + 1) + last, return_inverse=True, return_counts=True)
+    owner = np.repeat(proper, 3)
+    total = np.zeros(len(sharing), np.int64)
+    np.add.at(total, edge, owner)
+    found = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
+    across[proper] = found.reshape(-1, 3)
+    return across
+
+
+def _places(positions: np.ndarray) -> np.ndarray:
+    """Number the places of vertices, the same for those at the same, shape [vertex]."""
+    order = np.lexsort(positions.T)
+    is_new = (np.diff(positions[order], axis=0) != 0).any(axis=1)
+    places = np.zeros(len(positions), np.int64)
+    places[order[1:]] = np.cumsum(is_new)
+    return places
 
 
 # ------------------------------------------------------------------------------------------------- unwrapping

@@ -31,7 +31,6 @@ a rigid motion), and at edges far below a pixel it would outweigh the rest, pull
 import functools
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -45,8 +44,6 @@ MOST_STEPS = 32
 
 LEAST_OPENING = 1e-4
 """Relative change of two surfaces' distance over a pixel, below which rounding hides where they intersect."""
-
-_NOT_MANIFOLD = -2
 
 # Rasterization moves vertices by up to 1/8192 pixel, so an edge may be this far on the wrong side of a center [pixels].
 _SNAP = 1.0 / 2048.0
@@ -75,36 +72,6 @@ class Silhouettes:
     shares: wp.array
     fragments: Fragments
     faces: wp.array
-
-
-def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
-    """Find the face on the other side of each edge.
-
-    Args:
-        faces: Indices of positions, shape [face, 3]: edges belong together by position topology, whatever the uvs.
-        positions: Vertices, shape [vertex, 3]; when given, those at the same place count as one, as a mesh needs
-            whose faces have vertices of their own.
-
-    Returns:
-        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
-        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
-        and has no neighbors itself.
-    """
-    check.shape("faces", faces.shape, ("face", 3))
-    if positions is not None:
-        *_, place = np.unique(positions, axis=0, return_inverse=True)
-        faces = place.reshape(-1)[faces]
-    across = np.full(faces.shape, -1, np.int32)
-    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
-    _, edge, sharing = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True)
-    edge = edge.reshape(-1)
-    owner = np.repeat(proper, 3)
-    total = np.zeros(len(sharing), np.int64)
-    np.add.at(total, edge, owner)
-    found = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
-    across[proper] = found.reshape(-1, 3)
-    return across
 
 
 # --------------------------------------------------------------------------------------------------- lines on screen
@@ -562,7 +529,7 @@ def find_silhouettes(
     Args:
         fragments: What each pixel sees.
         faces: The rasterized faces, vec3i of shape [face].
-        neighbors: :func:`edge_neighbors` of the faces, vec3i of shape [face].
+        neighbors: :func:`warpshadow.mesh.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
         surfaces: A number for each face, the same all over a body, int32 of shape [face]. Intersections are looked for
             between different ones; without it there are none, and where bodies intersect they have no gradient.

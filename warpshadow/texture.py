@@ -587,7 +587,7 @@ def _scatter(adj_texels: wp.array(dtype=wp.vec3), cell: _Cell, adj_color: wp.vec
 
 
 @wp.kernel(enable_backward=False)
-def _sample_adjoint_what(
+def _sample_adjoint_by_albedo(
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -649,7 +649,7 @@ def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, u: float, v: float
 
 
 @wp.kernel(enable_backward=False)
-def _sample_adjoint_where(
+def _sample_adjoint_by_place(
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
@@ -744,30 +744,30 @@ def sample_albedo(
     """
     check.shape("vertex_albedo", vertex_albedo.shape, ("batch", "vertex"))
     check.shape("footprints", footprints.uvs.shape, ("batch", *fragments.face_ids.shape[1:]))
-    what = [vertex_albedo, textures.texels]
-    where = [fragments.barycentrics, footprints.uvs, footprints.probes]
+    reflecting = [vertex_albedo, textures.texels]
+    placed = [fragments.barycentrics, footprints.uvs, footprints.probes]
     names = ["vertex_albedo", "textures", "fragments", "footprints"]
-    batch_count = common_batch(dict(zip(names, [*what, *where[:2]], strict=True)))
+    batch_count = common_batch(dict(zip(names, [*reflecting, *placed[:2]], strict=True)))
     albedo = wp.empty(
         (batch_count, *fragments.face_ids.shape[1:]),
         dtype=wp.vec3,
         device=vertex_albedo.device,
-        requires_grad=any(array.requires_grad for array in [*what, *where]),
+        requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
     )
     face_ids, barycentrics = _rows(fragments.face_ids), _rows(fragments.barycentrics)
     seen = [*_seen(textures, footprints), batch_count]
-    _launch(_sample, albedo.size, [face_ids, barycentrics, faces, *what, *seen], [albedo.flatten()])
+    _launch(_sample, albedo.size, [face_ids, barycentrics, faces, *reflecting, *seen], [albedo.flatten()])
 
     def adjoint() -> None:
         adj_albedo = albedo.grad.flatten()
-        if any(array.requires_grad for array in what):
+        if any(array.requires_grad for array in reflecting):
             inputs = [face_ids, barycentrics, faces, *seen, adj_albedo]
-            _launch(_sample_adjoint_what, albedo.size, inputs, [array.grad for array in what])
-        if any(array.requires_grad for array in where):
-            inputs = [face_ids, faces, *what, *seen, adj_albedo]
-            _launch(_sample_adjoint_where, albedo.size, inputs, [_rows(array.grad) for array in where])
+            _launch(_sample_adjoint_by_albedo, albedo.size, inputs, [array.grad for array in reflecting])
+        if any(array.requires_grad for array in placed):
+            inputs = [face_ids, faces, *reflecting, *seen, adj_albedo]
+            _launch(_sample_adjoint_by_place, albedo.size, inputs, [_rows(array.grad) for array in placed])
 
-    record_adjoint(adjoint, [*what, *where, albedo])
+    record_adjoint(adjoint, [*reflecting, *placed, albedo])
     return albedo
 
 
@@ -836,7 +836,7 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
     ones = wp.ones(batch_count * footprints.uvs.size // footprints.uvs.shape[0], dtype=wp.vec3, device=device)
     inputs = [None, None, None, *_seen(textures, footprints), batch_count, ones]
-    _launch(_sample_adjoint_what, ones.size, inputs, [None, weights])
+    _launch(_sample_adjoint_by_albedo, ones.size, inputs, [None, weights])
     images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
     for number, image in enumerate(images):
         _add_to_image(image, weights, layout, number)
