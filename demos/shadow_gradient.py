@@ -58,7 +58,7 @@ class Shadow:
         x, z, scale = values
         moved = torch.stack([torch.stack([x, translations[0, 1], z]), translations[1]])
         geometry = self.renderer.placed(rotations, moved, torch.stack([scale, scales[1]]))
-        return self.renderer(geometry=geometry)[0]
+        return self.renderer(geometry=geometry)
 
 
 def by_adjoint(shadow: Shadow) -> torch.Tensor:

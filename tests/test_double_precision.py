@@ -279,13 +279,13 @@ def test_textures(double, device, check, clip):
 
 def test_upright_silhouettes(double, device, check):
     """Of edges that lean, how the lean changes is left out of the gradient."""
-    raster, silhouette = double("raster"), double("silhouette")
+    mesh, raster, silhouette = double("mesh"), double("raster"), double("silhouette")
     corners = np.array([[2.3, 1.2], [5.6, 1.2], [5.6, 4.4], [2.3, 4.4]])  # [pixels]
     depths = np.array([[1.0], [1.5], [2.0], [1.2]])
     clip_positions = np.hstack([depths * (2 * corners / SIZE - 1), np.full((4, 1), 0.1), depths])[None]
     sides = np.int32([[0, 1, 2], [0, 2, 3]])
     faces = put(sides, wp.vec3i, device)
-    neighbors = put(silhouette.edge_neighbors(sides), wp.vec3i, device)
+    neighbors = put(mesh.edge_neighbors(sides), wp.vec3i, device)
 
     def smooth(image, clip_positions):
         fragments = raster.rasterize(clip_positions, faces, *SIZE)

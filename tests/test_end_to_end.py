@@ -89,7 +89,7 @@ class Cameras:
         matrices = self.renderer.clip_matrices(
             rotation_matrices(values[None, :3])[0] @ turn, shift + values[3:6], matrix @ focal
         )
-        return self.renderer(clip_matrices=matrices)[0]
+        return self.renderer(clip_matrices=matrices)
 
 
 class Deformations:
@@ -257,4 +257,4 @@ def test_geometry_that_does_not_move_gives_the_scenes_image():
     for method in METHODS:
         renderer = TorchRenderer(scene_of(method, ON_BOTH))
         geometry = renderer.placed(*renderer.scene_poses())
-        assert torch.equal(renderer(geometry=geometry)[0], renderer())
+        assert torch.equal(renderer(geometry=geometry), renderer())

@@ -119,8 +119,7 @@ class TorchRenderer(torch.nn.Module):
                 view = renderer.view(moved, given.get("clip_matrices"))
             return renderer.draw(given.get("light", light), albedo=colors, textures=images, view=view)
 
-        image = apply(draw, *arguments.tensors, dtypes=arguments.dtypes, device=self.device)
-        return image if arguments.has_batch else image[0]
+        return arguments.apply(draw)
 
     def placed(
         self,
@@ -139,7 +138,7 @@ class TorchRenderer(torch.nn.Module):
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
 
         Returns:
-            Vertices and spheres for :meth:`forward`.
+            Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
@@ -159,7 +158,7 @@ class TorchRenderer(torch.nn.Module):
         def place(rotations: wp.array, translations: wp.array, scales: wp.array, *parts: wp.array) -> Geometry:
             return assembly.placed(Poses(rotations, translations, scales), Geometry(*parts) if parts else None)
 
-        return Geometry(*apply(place, *arguments.tensors, dtypes=arguments.dtypes, device=self.device))
+        return Geometry(*arguments.apply(place))
 
     def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotations [body, 3, 3], translations [body, 3] and scales [body] of the scene's bodies, as copies."""
@@ -207,7 +206,7 @@ class TorchRenderer(torch.nn.Module):
             whole = Geometry(*(given[f"rest.{name}"] for name in Geometry._fields)) if rest else None
             return assembly.deformed(number, *(given.get(name) for name in parts), rest=whole)
 
-        return Geometry(*apply(exchange, *arguments.tensors, dtypes=arguments.dtypes, device=self.device))
+        return Geometry(*arguments.apply(exchange))
 
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
@@ -220,7 +219,7 @@ class TorchRenderer(torch.nn.Module):
             intrinsics: K [pixels], last row (0, 0, 1), [3, 3] or [batch, 3, 3].
 
         Returns:
-            Maps from world to clip space, [batch, 4, 4].
+            Maps from world to clip space, [4, 4] or [batch, 4, 4].
 
         Differentiable: all, so focal lengths and the principal point, too.
         """
@@ -233,7 +232,7 @@ class TorchRenderer(torch.nn.Module):
         def compose(*arrays: wp.array) -> wp.array:
             return compose_clip_matrices(*arrays, size=(camera.width, camera.height), near=camera.near)
 
-        return apply(compose, *arguments.tensors, dtypes=arguments.dtypes, device=self.device)
+        return arguments.apply(compose)
 
 
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
@@ -266,14 +265,14 @@ class _Arguments:
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
-        self.has_batch = False
+        self._has_batch = False
 
     def add(self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...]) -> None:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
         shape = (*shape, *getattr(dtype, "_shape_", ()))
         _check_tensor(name, tensor, self.device, shape)
         has_batch = tensor.ndim > len(shape)
-        self.has_batch |= has_batch
+        self._has_batch |= has_batch
         self.names.append(name)
         self.tensors.append(tensor if has_batch else tensor[None])
         self.dtypes.append(dtype)
@@ -282,6 +281,13 @@ class _Arguments:
         """Repeat tensors with a batch of 1 for every instance of the others."""
         count = common_batch(dict(zip(self.names, self.tensors, strict=True)))
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
+
+    def apply(self, function: Callable) -> Any:
+        """Apply a function of arrays to them; the results have a batch dimension if one of the tensors had."""
+        results = apply(function, *self.tensors, dtypes=self.dtypes, device=self.device)
+        if self._has_batch:
+            return results
+        return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
 
 
 def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...]) -> None:
