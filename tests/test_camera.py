@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warpshadow.camera import Camera, to_clip
+from warpshadow.camera import Camera, compose_clip_matrices, to_clip
 
 INTRINSICS = np.array([[100.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 SIZE = (96, 64)
@@ -237,3 +237,22 @@ def test_the_gradient_of_to_clip_is_that_of_a_matrix_product(device, verified_ta
     np.testing.assert_allclose(positions.grad.numpy(), seed @ matrices[:, :, :3], rtol=1e-4, atol=1e-5)
     expected = np.einsum("bvi,bvj->bij", seed, homogeneous)
     np.testing.assert_allclose(clip_matrices.grad.numpy(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_composed_clip_matrices_are_those_of_the_cameras(device):
+    cameras = [
+        Camera.look_at((1 + k, 2, 3), (0, 0.1 * k, 0), fov_y=30 + 5 * k, size=(40, 30), near=0.05) for k in range(3)
+    ]
+    parts = [
+        np.stack([getattr(camera, name) for camera in cameras]) for name in ("intrinsics", "rotation", "translation")
+    ]
+    arrays = [to_device(part, dtype, device) for part, dtype in zip(parts, (wp.mat33, wp.mat33, wp.vec3), strict=True)]
+    matrices = compose_clip_matrices(*arrays, size=(40, 30), near=0.05).numpy()
+    expected = np.stack([camera.clip_matrix() for camera in cameras])
+    np.testing.assert_allclose(matrices, expected, rtol=1e-5, atol=1e-5)
+    one_lens = compose_clip_matrices(arrays[0][:1], *arrays[1:], size=(40, 30), near=0.05).numpy()
+    np.testing.assert_array_equal(one_lens[0], matrices[0])
+    with pytest.raises(ValueError, match="^translations: got a batch of 2, expected 1 or 3"):
+        compose_clip_matrices(*arrays[:2], to_device(parts[2][:2], wp.vec3, device), size=(40, 30))
+    with pytest.raises(ValueError, match="^near: got 0"):
+        compose_clip_matrices(*arrays, size=(40, 30), near=0)

@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
+from warpshadow import renderer as renderer_module
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
 
 # Where no silhouette moves the loss is smooth, and what is left is float32 rounding over the step.
@@ -167,6 +168,21 @@ def test_what_moves_the_image_has_the_gradient_of_the_image(method, parameters):
     renderer = TorchRenderer(scene_of(method, ON_BOTH))
     got, expected = gradient_and_differences(parameters(renderer), np.eye(7), 4e-3, slice(4))
     assert relative_error(got, expected) < SILHOUETTE
+
+
+def test_a_limb_pulls_by_the_color_it_has_at_its_edge(monkeypatch):
+    """Shading changes fast where a ball turns away: by the pixel beside the edge the gradient would be far off."""
+    ball = ws.Body(ws.icosphere(0.7, 4), albedo=(0.75, 0.62, 0.5), blockers=0, translation=(0, 1.2, 0))
+    ground = ws.Body(ws.plane(6.0, 16), blockers=0)
+    camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.9, 0), fov_y=36, size=(64, 64))
+    scene = ws.Scene((ball, ground), ws.synthetic_sky(), camera, ws.Visibility("none"))
+    image_of = Poses(TorchRenderer(scene))
+    shifts = np.eye(7)[3:6]
+    got, expected = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
+    assert relative_error(got, expected) < SILHOUETTE
+    monkeypatch.setattr(renderer_module, "find_contrasts", lambda *arguments: None)
+    beside, _ = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
+    assert relative_error(beside, expected) > 3 * relative_error(got, expected)
 
 
 # ---------------------------------------------------------------------------------------------- batches

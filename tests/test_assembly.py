@@ -1,0 +1,103 @@
+"""Assembly: bodies as one mesh and one set of spheres, placed, deformed, and their arguments checked."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.assembly import Assembly, Geometry
+from warpshadow.deform import Poses
+
+# Rotated float32 positions of size 2.
+FLOAT32 = 2e-6
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+
+def two_bodies(device) -> Assembly:
+    rng = np.random.default_rng(0)
+    bodies = [
+        ws.Body(
+            ws.icosphere(1.0, level),
+            blockers=ws.Spheres(rng.normal(size=(5 + level, 3)), rng.uniform(0.1, 1, 5 + level)),
+            rotation=rng.normal(size=3) * 40,
+            translation=rng.normal(size=3),
+            scale=0.5 + level,
+        )
+        for level in (0, 1)
+    ]
+    camera = ws.Camera.look_at((0, 0, 9), (0, 0, 0), size=(8, 8))
+    return Assembly(ws.Scene(bodies, ws.EnvironmentMap.constant(), camera), device=device)
+
+
+def test_placed_bodies_are_where_the_scene_has_them(device):
+    assembly = two_bodies(device)
+    bodies = assembly.scene.bodies
+    geometry = Geometry(*(array.numpy()[0] for array in assembly.placed()))
+    expected = np.concatenate([body.world_mesh().positions for body in bodies])
+    assert np.abs(geometry.positions - expected).max() < FLOAT32
+    placed = [
+        body.blockers.transformed(rotation=body.rotation_matrix(), translation=body.translation, scale=body.scale)
+        for body in bodies
+    ]
+    assert np.abs(geometry.centers - np.concatenate([part.centers for part in placed])).max() < 4 * FLOAT32
+    assert np.abs(geometry.radii - np.concatenate([part.radii for part in placed])).max() < FLOAT32
+
+
+def test_faces_belong_to_the_vertices_of_their_body(device):
+    assembly = two_bodies(device)
+    faces, body_of_face = assembly.faces.numpy(), assembly.body_of_face
+    for number, body in enumerate(assembly.scene.bodies):
+        own = faces[body_of_face == number] - assembly.first_vertex[number]
+        np.testing.assert_array_equal(own, body.mesh.faces)
+    edges = assembly.edges.numpy()
+    assert (body_of_face[edges] == body_of_face[:, None]).all()  # closed meshes: each edge has its other face
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_deforming_a_body_leaves_the_other_as_it_is(device, number, verified_tape):
+    assembly = two_bodies(device)
+    rng = np.random.default_rng(1)
+    vertices = slice(*assembly.first_vertex[number : number + 2])
+    spheres = slice(*assembly.first_sphere[number : number + 2])
+    shapes = (3, vertices.stop - vertices.start), (3, spheres.stop - spheres.start)
+    positions, centers = (
+        wp.array(rng.normal(size=(*shape, 3)), dtype=wp.vec3, device=device, requires_grad=True) for shape in shapes
+    )
+    with wp.Tape() as tape:
+        rest = assembly.deformed(number, positions, centers)
+    assert rest.radii is assembly.rest.radii
+    for got, given, kept, place in (
+        (rest.positions, positions, assembly.rest.positions, vertices),
+        (rest.centers, centers, assembly.rest.centers, spheres),
+    ):
+        expected = np.repeat(kept.numpy(), 3, axis=0)
+        expected[:, place] = given.numpy()
+        np.testing.assert_array_equal(got.numpy(), expected)
+    weights = rng.normal(size=(*rest.positions.shape, 3)).astype(np.float32)
+    tape.backward(grads={rest.positions: wp.array(weights, dtype=wp.vec3, device=device)})
+    np.testing.assert_array_equal(positions.grad.numpy(), weights[:, vertices])
+
+
+def test_a_graph_that_does_not_move_leaves_its_body_as_it_is(device):
+    assembly = two_bodies(device)
+    graph = assembly.graph(1, count=3)
+    count = len(assembly.scene.bodies[1].blockers)
+    still = wp.zeros((1, count), dtype=wp.vec3, device=device)
+    matrices = wp.full((1, count), wp.mat33(np.eye(3)), dtype=wp.mat33, device=device)
+    rest = assembly.deformed(1, graph.points(matrices, still), graph.centers(still))
+    for got, expected in zip(assembly.placed(rest=rest), assembly.placed(), strict=True):
+        assert np.abs(got.numpy() - expected.numpy()).max() < 4 * FLOAT32
+
+
+def test_what_does_not_fit_is_refused(device):
+    assembly = two_bodies(device)
+    with pytest.raises(ValueError, match="^number: got 2, expected one of 0, 1"):
+        assembly.graph(2)
+    wrong = wp.zeros((1, 7), dtype=wp.vec3, device=device)
+    with pytest.raises(ValueError, match=r"^positions: got shape \(1, 7\), expected \[batch, 12\]"):
+        assembly.deformed(0, wrong)
+    one = assembly.poses
+    poses = Poses(one.rotations[:, :1], one.translations[:, :1], one.scales[:, :1])
+    with pytest.raises(ValueError, match=r"^poses: got shape \(1, 1\), expected \[batch, 2\]"):
+        assembly.placed(poses)
