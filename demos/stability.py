@@ -326,7 +326,9 @@ def overlap_errors() -> dict[str, list[float]]:
         for log in ("eigen", "cap"):
             one = twins.log_sh(points, None, centers[:1], radii[:1], 8, log)
             with np.errstate(all="ignore"):
-                results[f"{log} 8, plain squaring"] = twins.exponential(depth * one, "quadratic", 0.5, quiet=None)
+                results[f"{log} 8, plain squaring"] = twins.exponential(
+                    depth * one, "quadratic", exponential.THRESHOLDS["quadratic"].default, quiet=None
+                )
         for label, visibility in results.items():
             with np.errstate(all="ignore"):
                 error = np.sqrt(np.mean((ambient(visibility, normals) - exact) ** 2))

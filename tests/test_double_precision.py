@@ -169,7 +169,7 @@ def test_log_visibility_without_a_horizon(double, device, check, spheres):
 
 
 def logs(*sizes):
-    """Log-visibility of one instance, of these norms; powers of 2 would be where the number of squarings changes."""
+    """Log-visibility of one instance, of these norms."""
     rows = random(0, 1, len(sizes), 9)
     return rows * np.array(sizes)[:, None] / np.linalg.norm(rows, axis=-1, keepdims=True)
 
@@ -177,7 +177,7 @@ def logs(*sizes):
 @pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
 def test_the_exponential(base, double, check):
     exponentiate = double("visibility.exponential").exponentiate
-    check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(0.05, 0.3, 1.7)))
+    check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(0.05, 0.3, 1.7, 2.4, 4)))
 
 
 @pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])

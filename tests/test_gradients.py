@@ -109,12 +109,11 @@ def test_the_adjoint_of_accumulation_without_a_horizon_is_that_of_its_twin(scene
 
 
 @pytest.mark.parametrize("order, base", [(2, "quadratic"), (4, "linear"), (4, "quadratic"), (6, "quadratic")])
-@pytest.mark.parametrize("size", [0.1, 3.0, 20.0])
+@pytest.mark.parametrize("size", [0.1, 0.6, 2.2, 3.0, 20.0])
 def test_the_adjoint_of_the_exponential_is_that_of_its_twin(order, base, size, device):
     rows = np.random.default_rng(order).normal(size=(3, order**2))
     rows[:, 0] = -np.abs(rows[:, 0])
     rows *= size / np.linalg.norm(rows, axis=1, keepdims=True)
-    # the twin takes float64 |f̂|: keep away from where float32 would square once more
     threshold = exponential.THRESHOLDS[base].default
     check(
         lambda f: exponential.exponentiate(f, base=base),

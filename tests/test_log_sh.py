@@ -21,6 +21,10 @@ CORNER = 6e-3
 CORNER_WIDTH = 3 / 2048
 # Each of p squarings doubles the relative error, 6e-8·2^p; measured 1.4e-6 for quadratic, 1.9e-5 for linear.
 EXPONENTIATE = 5e-5
+# Between neighbors of a scan: what the value rises beyond its adjoint's integral, measured 4e-6, and steps of
+# the adjoint, measured 1.5e-3. A number of squarings that jumps has 3e-3 and 5e-3 or more.
+SMOOTH = 1e-4
+STEEPEST = 3e-3
 # The golden zonal vectors are given to 1e-6 of numbers up to 10.
 ZONAL = 1e-5
 
@@ -309,6 +313,25 @@ def test_the_constant_part_scales_the_result_and_may_be_far_below_zero(device):
     assert np.abs(got - expected).max() < EXPONENTIATE * np.abs(expected).max()
     darkest = rows + np.eye(1, 64) * -500 * twins.UNIT
     assert np.abs(exponentiate(darkest, device)).max() == 0  # below float32, not NaN
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_nothing_jumps_where_the_number_of_squarings_changes(base, device):
+    """Over four octaves of |f̂|: the value rises by the integral of its adjoint, and the adjoint has no steps."""
+    rng = np.random.default_rng(16)
+    direction, weights = -np.abs(rng.normal(size=(2, 16)))
+    direction /= np.linalg.norm(direction[1:])
+    sizes = exponential.THRESHOLDS[base].default * np.geomspace(0.4, 6.4, 4000)
+    rows = wp.array((sizes[:, None] * direction)[None].astype(np.float32), device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        visibility = exponential.exponentiate(rows, base=base)
+    visibility.grad.assign(np.tile(weights, (1, len(sizes), 1)).astype(np.float32))
+    tape.backward()
+    values = visibility.numpy()[0] @ weights
+    slopes = rows.grad.numpy()[0] @ direction * sizes  # by log |f̂|
+    rises = (slopes[1:] + slopes[:-1]) / 2 * np.diff(np.log(sizes))
+    assert np.abs(np.diff(values) - rises).max() < SMOOTH * np.ptp(values)
+    assert np.abs(np.diff(slopes)).max() < STEEPEST * np.ptp(slopes)
 
 
 @pytest.mark.parametrize("base", BASES)

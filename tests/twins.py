@@ -154,38 +154,48 @@ def optimal_linear(order, norm):
     return np.interp(norm, norms, a), np.interp(norm, norms, b)
 
 
+def base_approximation(f, base, scale):
+    """exp*(f scale) of rows [vertex, order²], by a base approximation with DC isolation."""
+    order = int(np.sqrt(f.shape[1]))
+    one = np.eye(1, order**2) * UNIT
+    h = (f - f[:, :1] * np.eye(1, order**2)) * scale[:, None]
+    if base == "quadratic":
+        result = one + h + Product(order)(h, h) / 2
+    elif base == "linear":
+        result = one + h
+    else:
+        a, b = optimal_linear(order, np.linalg.norm(h, axis=1))
+        result = a[:, None] * one + b[:, None] * h
+    return np.exp(scale[:, None] * f[:, :1] / UNIT) * result
+
+
+def held_square(rows, depth, quiet, loud):
+    """Squares of rows [vertex, order²], held where |f̂|(⟨v²⟩ − ⟨v⟩) is between quiet and loud; None holds nothing."""
+    square = Product(int(np.sqrt(rows.shape[1])))(rows, rows)
+    if quiet is None:
+        return square
+    loudness = depth * (square[:, 0] - rows[:, 0]) / UNIT
+    share = 1 - smoothstep(np.log(np.maximum(loudness / quiet, 1)) / np.log(loud / quiet))
+    return rows + share[:, None] * (square - rows)
+
+
 def exponential(f, base, threshold, *, quiet=6.0, loud=24.0):
     """exp*(f) of rows [vertex, order²] by DC isolation, scaling and squaring, each row with its own p.
 
-    Squarings are held where |f̂|(⟨v²⟩ − ⟨v⟩) is between quiet and loud, and given up beyond; None holds nothing.
+    The base approximation passes into the square of that of half the log from 0.5 to 0.7 thresholds, so that nothing
+    jumps with p. Squarings are held where |f̂|(⟨v²⟩ − ⟨v⟩) is between quiet and loud, and given up beyond; None holds
+    nothing.
     """
-    order = int(np.sqrt(f.shape[1]))
-    product = Product(order)
-    residual = f.copy()
-    residual[:, 0] = 0
-    norm = np.linalg.norm(residual, axis=1)
-    depth = np.hypot(norm, np.maximum(f[:, 0], 0))
+    depth = np.hypot(np.linalg.norm(f[:, 1:], axis=1), np.maximum(f[:, 0], 0))
     with np.errstate(divide="ignore"):
         halvings = np.maximum(np.ceil(np.log2(depth / threshold)), 0).astype(int)
     powers = np.minimum(halvings, 20)
     scale = 0.5**halvings
-    h = residual * scale[:, None]
-    one = np.eye(1, order**2) * UNIT
-    if base == "quadratic":
-        result = one + h + product(h, h) / 2
-    elif base == "linear":
-        result = one + h
-    else:
-        a, b = optimal_linear(order, norm * scale)
-        result = a[:, None] * one + b[:, None] * h
-    result = np.exp(scale[:, None] * f[:, :1] / UNIT) * result
+    blend = smoothstep((scale * depth / threshold - 0.5) / 0.2)[:, None]
+    squared = held_square(base_approximation(f, base, scale / 2), depth, quiet, loud)
+    result = (1 - blend) * base_approximation(f, base, scale) + blend * squared
     for step in range(powers.max(initial=0)):
-        square = product(result, result)
-        share = np.ones(len(f))
-        if quiet is not None:
-            loudness = depth * (square[:, 0] - result[:, 0]) / UNIT
-            share = 1 - smoothstep(np.log(np.maximum(loudness / quiet, 1)) / np.log(loud / quiet))
-        result = np.where((step < powers)[:, None], result + share[:, None] * (square - result), result)
+        result = np.where((step < powers)[:, None], held_square(result, depth, quiet, loud), result)
     return result
 
 

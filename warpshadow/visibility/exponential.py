@@ -13,6 +13,14 @@ is plain squaring while |f̂| d ≤ QUIET, and no squaring from LOUD on: the res
 f, 2^−k of it. The factor |f̂|, which is as large as spheres are deep, holds deep logs earlier: they are dark long
 before all their squarings. QUIET to LOUD are two octaves, since by that or more one squaring raises d: so v moves
 smoothly with f. The mean is the product's first coefficient, and the rule costs nothing.
+
+The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps with |f̂|, and with it would the value by
+some tenths of a percent, which the difference of two images divides by their distance. So from t = |f̂| / 2^p T = ½ on,
+where p is just enough, the base approximation q of f / 2^p passes into the square of that of f / 2^{p+1},
+
+    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
+
+which at t = 1 is what p + 1 begins with: v has a continuous derivative. It takes one product more and halves |h|.
 """
 
 import functools
@@ -37,13 +45,13 @@ class Threshold(NamedTuple):
 
 
 THRESHOLDS = {
-    "quadratic": Threshold(0.5, 1.0),
-    "linear": Threshold(0.06, 1.0),
-    "optimal_linear": Threshold(0.06, 2.0),
+    "quadratic": Threshold(1.0, 1.0),
+    "linear": Threshold(0.12, 1.0),
+    "optimal_linear": Threshold(0.12, 2.0),
 }
 """Base approximations of the exponential. Beyond the limits, plain squaring explodes: for `quadratic` the error is
-12-fold at twice its limit and 48 000-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.6%
-(`linear`) and 3% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
+3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
+(`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
 LEAST_THRESHOLD = 0.01
 """Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
@@ -56,6 +64,9 @@ QUIET = 6.0
 
 LOUD = 24.0
 """|f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared."""
+
+BLENDED = 0.7
+"""|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
@@ -79,33 +90,29 @@ def _optimal_table(order: int, device: str) -> wp.array:
 
 
 @functools.cache
-def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
+def _measure_function(order: int, lanes: int) -> wp.Function:
     """Make the kernel function that measures f.
 
-    It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; and of
-    the base e^{…}, a, b, da/d|h|, db/d|h|.
+    It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; of the
+    base e^{…/2}, the share w of the square and its derivative by |f̂|.
     """
     Lane = lane_type(lanes)
     sqrt = lane_functions(lanes).sqrt
-    STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
-    is_optimal = base == "optimal_linear"
+    PER_BLEND = wp.constant(1 / (BLENDED - 0.5))
 
     @wp.func
-    def scale_(log: wp.array(dtype=Lane), threshold: float, optimal: wp.array(dtype=wp.vec2)):
+    def measure(log: wp.array(dtype=Lane), threshold: float):
         norm2 = Lane(0.0)
         for i in range(1, wp.static(order**2)):
             norm2 += wp.cw_mul(log[i], log[i])
-        norm = sqrt(norm2)
         above = wp.max(log[0], Lane(0.0))
         depth = sqrt(norm2 + wp.cw_mul(above, above))
         count = Lane(0.0)
         scale = Lane(1.0)
         most = int(0)
-        factor = Lane(0.0)
-        constant = Lane(1.0)
-        slope = Lane(1.0)
-        constant_change = Lane(0.0)
-        slope_change = Lane(0.0)
+        root = Lane(0.0)
+        blend = Lane(0.0)
+        blend_slope = Lane(0.0)
         for lane in range(lanes):
             # the least p with |f̂| / 2^p ≤ threshold, of each receiver by itself
             p = int(0)
@@ -118,9 +125,31 @@ def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
             scale[lane] = s
             most = wp.max(most, p)
             # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing overflows
-            factor[lane] = wp.exp(s * log[0][lane] / _UNIT)
-            if wp.static(is_optimal):
-                position = s * norm[lane] / STEP
+            root[lane] = wp.exp(0.5 * s * log[0][lane] / _UNIT)
+            t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
+            blend[lane] = t * t * (3.0 - 2.0 * t)
+            blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
+        return count, scale, sqrt(norm2), depth, most, root, blend, blend_slope
+
+    return measure
+
+
+@functools.cache
+def _factor_function(base: str, lanes: int) -> wp.Function:
+    """Make the kernel function of the base's factors: |h| → a, b of a 1 + b h, and their derivatives."""
+    Lane = lane_type(lanes)
+    STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
+    is_optimal = base == "optimal_linear"
+
+    @wp.func
+    def factors(length: Lane, optimal: wp.array(dtype=wp.vec2)):
+        constant = Lane(1.0)
+        slope = Lane(1.0)
+        constant_change = Lane(0.0)
+        slope_change = Lane(0.0)
+        if wp.static(is_optimal):
+            for lane in range(lanes):
+                position = length[lane] / STEP
                 interval = wp.min(int(position), _KNOTS - 1)
                 ab = wp.lerp(optimal[interval], optimal[interval + 1], position - float(interval))
                 change = (optimal[interval + 1] - optimal[interval]) / STEP
@@ -128,9 +157,40 @@ def _scale_function(order: int, base: str, lanes: int) -> wp.Function:
                 slope[lane] = ab[1]
                 constant_change[lane] = change[0]
                 slope_change[lane] = change[1]
-        return count, scale, norm, depth, most, factor, constant, slope, constant_change, slope_change
+        return constant, slope, constant_change, slope_change
 
-    return scale_
+    return factors
+
+
+@functools.cache
+def _base_function(order: int, base: str, lanes: int) -> wp.Function:
+    """Make the kernel function of the base approximation F (a 1 + b h + q h * h), h = s f̂."""
+    Lane = lane_type(lanes)
+    factors = _factor_function(base, lanes)
+
+    @wp.func
+    def approximate(
+        residual: wp.array(dtype=Lane),
+        square: wp.array(dtype=Lane),
+        norm: Lane,
+        scale: Lane,
+        factor: Lane,
+        optimal: wp.array(dtype=wp.vec2),
+        result: wp.array(dtype=Lane),
+    ):
+        """The result may be the residual's own memory; the square, f̂ * f̂, is read for `quadratic` only."""
+        constant, slope, _c, _s = factors(wp.cw_mul(scale, norm), optimal)
+        first_power = wp.cw_mul(factor, scale)
+        linear = wp.cw_mul(first_power, slope)
+        quadratic = 0.5 * wp.cw_mul(first_power, scale)
+        for i in range(wp.static(order**2)):
+            value = wp.cw_mul(linear, residual[i])
+            if wp.static(base == "quadratic"):
+                value += wp.cw_mul(quadratic, square[i])
+            result[i] = value
+        result[0] = result[0] + _UNIT * wp.cw_mul(factor, constant)
+
+    return approximate
 
 
 @functools.cache
@@ -155,11 +215,81 @@ def _hold_function(lanes: int) -> wp.Function:
 
 
 @functools.cache
+def _square_function(order: int, lanes: int) -> wp.Function:
+    """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
+    Lane = lane_type(lanes)
+    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+
+    @wp.func
+    def square_held(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        square: wp.array(dtype=Lane),
+    ):
+        multiply_(row, row, first, pairs, values, square)
+        share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
+        rest = Lane(1.0) - share
+        if wp.max(rest) > 0.0:
+            for i in range(wp.static(order**2)):
+                square[i] = wp.cw_mul(rest, row[i]) + wp.cw_mul(share, square[i])
+        return rest
+
+    return square_held
+
+
+@functools.cache
+def _square_adjoint_function(order: int, lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`_square_function`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
+
+    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the loudness
+    λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄ λ/|f̂|.
+    """
+    Lane = lane_type(lanes)
+    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+
+    @wp.func
+    def square_held_adjoint(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        adj_square: wp.array(dtype=Lane),
+        adj_row: wp.array(dtype=Lane),
+    ):
+        multiply_(row, adj_square, first, pairs, values, adj_row)
+        mean_square = Lane(0.0)
+        along = Lane(0.0)
+        adj_share = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            mean_square += wp.cw_mul(row[i], row[i])
+            along += wp.cw_mul(row[i], adj_square[i])
+            adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
+        growth = (mean_square / _UNIT - row[0]) / _UNIT
+        share, share_slope = hold(wp.cw_mul(depth, growth))
+        for i in range(wp.static(order**2)):
+            adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
+        adj_loudness = wp.cw_mul(adj_share, share_slope)
+        if wp.min(share_slope) < 0.0:
+            adj_growth = wp.cw_mul(adj_loudness, depth)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, row[i])
+            adj_row[0] = adj_row[0] - adj_growth / _UNIT
+        return along + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
+
+    return square_held_adjoint
+
+
+@functools.cache
 def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    load_rows, store_rows = fn.load_rows, fn.store_rows
-    scale_, hold, multiply_ = _scale_function(order, base, lanes), _hold_function(lanes), multiply(order, lanes)
+    load_rows, store_rows, multiply_ = fn.load_rows, fn.store_rows, multiply(order, lanes)
+    measure, approximate = _measure_function(order, lanes), _base_function(order, base, lanes)
+    square_held = _square_function(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def exponentiate_log_sh(
@@ -179,37 +309,34 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
     ):
         """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
 
-        Faults count the receivers whose squarings are held, and those whose log is too large or not finite.
+        Powers are the approximation of f / 2^{p+1}, then what is squared. Faults count the receivers whose squarings
+        are held, and those whose log is too large or not finite.
         """
         batch, group = wp.tid()
         row = scratch[batch, group, 0]
         square = scratch[batch, group, 1]
+        half = powers[batch, group, 0]
         load_rows(log_sh[batch], group, row)
-        count, scale, _norm, depth, most, factor, constant, slope, _c, _s = scale_(row, threshold, optimal)
+        count, scale, norm, depth, most, root, blend, _slope = measure(row, threshold)
         mean = row[0]
         row[0] = Lane(0.0)
-        linear = wp.cw_mul(wp.cw_mul(factor, scale), slope)
         if wp.static(base == "quadratic"):
             multiply_(row, row, first, pairs, values, square)
-            quadratic = 0.5 * wp.cw_mul(linear, scale)
-            for i in range(wp.static(order**2)):
-                row[i] = wp.cw_mul(linear, row[i]) + wp.cw_mul(quadratic, square[i])
-        else:
-            for i in range(wp.static(order**2)):
-                row[i] = wp.cw_mul(linear, row[i])
-        row[0] = row[0] + _UNIT * wp.cw_mul(factor, constant)
+        approximate(row, square, norm, 0.5 * scale, root, optimal, half)
+        approximate(row, square, norm, scale, wp.cw_mul(root, root), optimal, row)
         held = Lane(0.0)
+        if wp.max(blend) > 0.0:
+            held = wp.cw_mul(blend, square_held(half, depth, first, pairs, values, square))
+            for i in range(wp.static(order**2)):
+                row[i] = wp.cw_mul(Lane(1.0) - blend, row[i]) + wp.cw_mul(blend, square[i])
         for step in range(most):
             if wp.static(keeps_powers):
                 for i in range(wp.static(order**2)):
-                    powers[batch, group, step, i] = row[i]
-            multiply_(row, row, first, pairs, values, square)
-            share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
+                    powers[batch, group, step + 1, i] = row[i]
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
-            held += wp.cw_mul(is_due, Lane(1.0) - share)
-            share = wp.cw_mul(is_due, share)
+            held += wp.cw_mul(is_due, square_held(row, depth, first, pairs, values, square))
             for i in range(wp.static(order**2)):
-                row[i] = row[i] + wp.cw_mul(share, square[i] - row[i])
+                row[i] = wp.cw_mul(Lane(1.0) - is_due, row[i]) + wp.cw_mul(is_due, square[i])
         for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
             if not wp.isfinite(depth[lane] + mean[lane]):
                 wp.atomic_add(faults, 1, 1)
@@ -224,9 +351,9 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
 def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    load_rows, add_rows = fn.load_rows, fn.add_rows
-    scale_, hold, multiply_ = _scale_function(order, base, lanes), _hold_function(lanes), multiply(order, lanes)
-    is_optimal = base == "optimal_linear"
+    load_rows, add_rows, multiply_ = fn.load_rows, fn.add_rows, multiply(order, lanes)
+    measure, factors = _measure_function(order, lanes), _factor_function(base, lanes)
+    square_held_adjoint = _square_adjoint_function(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def exponentiate_log_sh_adjoint(
@@ -246,71 +373,83 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
     ):
         """A thread owns a group of receivers and goes back through the squarings, then the base.
 
-        Γ is symmetric, so v' = v + w (v * v − v) has v̄ = v̄' + w (2 v * v̄' − v̄'), w̄ = Σ v (v * v̄' − v̄') and, as
-        (v * v)_0 = |v|²/√4π, with the loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also
-        v̄ += λ̄ |f̂| (2v/4π − e0/√4π) and |f̂|¯ += λ̄ λ/|f̂|.
-        The base is v = F (a 1 + b h + q h * h), h = f̂ / 2^p and F = exp(2^−p f0/√4π):  f̄0 = 2^−p/√4π Σ v̄ v,
-        h̄ = F (b v̄ + 2q h * v̄), and for a(|h|), b(|h|) also F (√4π v̄0 a' + b' Σ v̄ h) h/|h|
+        The base is v = q + w (H(u) − q) with q of h = f̂ / 2^p and u of h/2, each F (a 1 + b h + c h * h), and
+        F = exp(2^−p f0/√4π), of u its root. So q̄ = (1 − w) v̄, ū = w H̄, w̄ = Σ v̄ H(u) − Σ v̄ q, |f̂|¯ = w̄ w', and
+        f̄0 = 2^−p/√4π (Σ q̄ q + ½ Σ ū u), h̄ = F (b q̄ + 2c h * q̄) + ½ √F (b ū + 2c (h/2) * ū), and for a(|h|), b(|h|)
+        also F (√4π q̄0 a' + b' Σ q̄ h) h/|h| and the like of ū. For `quadratic` q = 4 √F u − F (3 + h).
         """
         batch, group = wp.tid()
         log = scratch[batch, group, 0]
         adj_row = scratch[batch, group, 1]
         product = scratch[batch, group, 2]
+        bent = scratch[batch, group, 3]
         load_rows(log_sh[batch], group, log)
         load_rows(adj_visibility[batch], group, adj_row)
-        count, scale, norm, depth, most, factor, constant, slope, constant_change, slope_change = scale_(
-            log, threshold, optimal
-        )
+        count, scale, norm, depth, most, root, blend, blend_slope = measure(log, threshold)
         adj_depth = Lane(0.0)
         for back in range(most):
             step = most - 1 - back
-            power = powers[batch, group, step]
-            multiply_(power, adj_row, first, pairs, values, product)
-            mean_square = Lane(0.0)
-            for i in range(wp.static(order**2)):
-                mean_square += wp.cw_mul(power[i], power[i])
-            growth = (mean_square / _UNIT - power[0]) / _UNIT
-            share, share_slope = hold(wp.cw_mul(depth, growth))
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
-            adj_growth = Lane(0.0)
-            if wp.min(share_slope) < 0.0:
-                adj_share = Lane(0.0)
-                for i in range(wp.static(order**2)):
-                    adj_share += wp.cw_mul(power[i], product[i] - adj_row[i])
-                adj_loudness = wp.cw_mul(wp.cw_mul(is_due, adj_share), share_slope)
-                adj_growth = wp.cw_mul(adj_loudness, depth)
-                adj_depth += wp.cw_mul(adj_loudness, growth)
-            share = wp.cw_mul(is_due, share)
+            _along, change = square_held_adjoint(
+                powers[batch, group, step + 1], depth, first, pairs, values, adj_row, product
+            )
+            adj_depth += wp.cw_mul(is_due, change)
             for i in range(wp.static(order**2)):
-                adj_row[i] = adj_row[i] + wp.cw_mul(share, 2.0 * product[i] - adj_row[i])
-            if wp.min(share_slope) < 0.0:
-                for i in range(wp.static(order**2)):
-                    adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, power[i])
-                adj_row[0] = adj_row[0] - adj_growth / _UNIT
+                adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])
 
-        adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
+        half = powers[batch, group, 0]
         above = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
         log[0] = Lane(0.0)
-        linear = wp.cw_mul(factor, slope)
+        factor = wp.cw_mul(root, root)
+        length = wp.cw_mul(scale, norm)
+        constant, slope, constant_change, slope_change = factors(length, optimal)
+        _constant, half_slope, half_constant_change, half_slope_change = factors(0.5 * length, optimal)
+
         along = Lane(0.0)  # Σ v̄ h
-        for i in range(1, wp.static(order**2)):
+        half_along = Lane(0.0)  # Σ v̄ u
+        for i in range(wp.static(order**2)):
             log[i] = wp.cw_mul(scale, log[i])
             along += wp.cw_mul(adj_row[i], log[i])
-        dc = wp.cw_mul(linear, along) + _UNIT * wp.cw_mul(wp.cw_mul(factor, constant), adj_row[0])  # Σ v̄ v
+            half_along += wp.cw_mul(adj_row[i], half[i])
+        whole = wp.cw_mul(factor, _UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, along))  # Σ v̄ q
         if wp.static(base == "quadratic"):
-            multiply_(log, adj_row, first, pairs, values, product)
+            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * _UNIT * adj_row[0] + along)
+        rest = Lane(1.0) - blend
+        dc = wp.cw_mul(rest, whole)
+        if wp.max(blend) > 0.0:
+            squared, change = square_held_adjoint(half, depth, first, pairs, values, adj_row, product)
+            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared - whole)
             for i in range(wp.static(order**2)):
-                dc += 0.5 * wp.cw_mul(factor, wp.cw_mul(product[i], log[i]))
+                adj_half = 0.5 * wp.cw_mul(blend, product[i])
+                dc += wp.cw_mul(adj_half, half[i])
+                product[i] = wp.cw_mul(root, adj_half)
+        else:
+            for i in range(wp.static(order**2)):
+                product[i] = Lane(0.0)
+
+        # from here on adj_row is F q̄ and product ½ √F ū
+        half_along = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            adj_row[i] = wp.cw_mul(wp.cw_mul(factor, rest), adj_row[i])
+            half_along += wp.cw_mul(product[i], log[i])
+        along = wp.cw_mul(wp.cw_mul(factor, rest), along)
         radial = Lane(0.0)
-        if wp.static(is_optimal):
-            length = wp.max(wp.cw_mul(scale, norm), Lane(1.0e-20))
-            radial = wp.cw_mul(factor, _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(along, slope_change))
-            radial = wp.cw_div(radial, length)
+        if wp.static(base == "optimal_linear"):
+            radial = _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(along, slope_change)
+            radial += _UNIT * wp.cw_mul(product[0], half_constant_change)
+            radial += 0.5 * wp.cw_mul(half_along, half_slope_change)
+            radial = wp.cw_div(radial, wp.max(length, Lane(1.0e-20)))
+        for i in range(wp.static(order**2)):
+            whole_and_half = adj_row[i] + 0.5 * product[i]
+            adj_row[i] = wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial, log[i])
+            product[i] = whole_and_half
+        if wp.static(base == "quadratic"):
+            multiply_(log, product, first, pairs, values, bent)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + bent[i]
+        adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
         for i in range(1, wp.static(order**2)):
-            adj_h = wp.cw_mul(linear, adj_row[i]) + wp.cw_mul(radial, log[i])
-            if wp.static(base == "quadratic"):
-                adj_h += wp.cw_mul(factor, product[i])
-            adj_row[i] = wp.cw_mul(scale, adj_h) + wp.cw_mul(adj_depth, log[i])
+            adj_row[i] = wp.cw_mul(scale, adj_row[i]) + wp.cw_mul(adj_depth, log[i])
         adj_row[0] = wp.cw_mul(scale, dc) / _UNIT + wp.cw_mul(adj_depth, above)
         add_rows(adj_row, group, adj_log_sh[batch])
 
@@ -341,7 +480,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             (Reading the counts waits for the device. While a CUDA graph is captured that cannot be, and nothing is
             checked.)
 
-    Differentiable: log_sh, for the p that it has.
+    Differentiable: log_sh.
     """
     check.choice("base", base, THRESHOLDS)
     default, limit = THRESHOLDS[base]
@@ -361,9 +500,9 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     groups = group_count(vertex_count, lanes)
     needs_gradient = log_sh.requires_grad
     # memory that no squaring reaches is never touched
-    powers_shape = (batch_count, groups, MOST_SQUARINGS if needs_gradient else 0, order**2)
+    powers_shape = (batch_count, groups, MOST_SQUARINGS + 1 if needs_gradient else 1, order**2)
     powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device)
-    scratch = wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device)
+    scratch = wp.empty((batch_count, groups, 4, order**2), dtype=lane_type(lanes), device=device)
     visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = wp.zeros(2, dtype=wp.int32, device=device)
