@@ -269,6 +269,20 @@ def test_only_one_argument_in_a_batch_makes_a_batch_of_images(name):
     assert not torch.equal(images[0], images[1])
 
 
+def test_colors_in_a_batch_make_a_batch_of_images_without_any_texture():
+    renderer = TorchRenderer(scene_of("none", ON_BOTH))
+    colors = torch.rand(3, 1, 3, generator=torch.Generator().manual_seed(3), requires_grad=True)
+    images = renderer(albedo=[colors, None])
+    weights = torch.randn(images.shape, generator=torch.Generator().manual_seed(4))
+    (images * weights).sum().backward()
+    for instance, color in enumerate(colors.detach()):
+        alone = color.clone().requires_grad_()
+        image = renderer(albedo=[alone, None])
+        assert torch.equal(image, images[instance])
+        (image * weights[instance]).sum().backward()
+        torch.testing.assert_close(alone.grad, colors.grad[instance])
+
+
 def test_geometry_that_does_not_move_gives_the_scenes_image():
     for method in METHODS:
         renderer = TorchRenderer(scene_of(method, ON_BOTH))

@@ -400,10 +400,35 @@ def test_image_sizes_out_of_range_are_refused(width, height, name, device):
 def test_attributes_of_a_wrong_batch_or_dtype_are_refused(device):
     clip, faces = on_device(*random_triangles(np.random.default_rng(18), 3), device)
     fragments = rasterize(clip, faces, 4, 4)
-    with pytest.raises(ValueError, match="^attributes: got a batch of 3"):
-        interpolate(fragments, faces, wp.zeros((3, 9), dtype=wp.vec3, device=device))
+    two = Fragments(
+        *(
+            wp.array(np.repeat(array.numpy(), 2, axis=0), dtype=array.dtype, device=device)
+            for array in (fragments.face_ids, fragments.barycentrics)
+        )
+    )
+    with pytest.raises(ValueError, match="^attributes: got a batch of 3, expected 1 or 2"):
+        interpolate(two, faces, wp.zeros((3, 9), dtype=wp.vec3, device=device))
     with pytest.raises(ValueError, match="^attributes: got dtype"):
         interpolate(fragments, faces, wp.zeros((1, 9), dtype=wp.vec3d, device=device))
+
+
+def test_one_instance_of_fragments_or_attributes_serves_all_of_the_other(device, verified_tape):
+    clip, faces = on_device(*random_triangles(np.random.default_rng(20), 5), device)
+    fragments = rasterize(clip, faces, 12, 12)
+    rng = np.random.default_rng(21)
+    attributes = wp.array(rng.normal(size=(3, 15, 3)), dtype=wp.vec3, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        images = interpolate(fragments, faces, attributes)
+    weights = rng.normal(size=(*images.shape, 3)).astype(np.float32)
+    tape.backward(grads={images: wp.array(weights, dtype=wp.vec3, device=device)})
+    for instance in range(3):
+        own = attributes[instance : instance + 1]
+        alone = wp.array(own.numpy(), dtype=wp.vec3, device=device, requires_grad=True)
+        with wp.Tape() as tape:
+            image = interpolate(fragments, faces, alone)
+        tape.backward(grads={image: wp.array(weights[instance][None], dtype=wp.vec3, device=device)})
+        np.testing.assert_array_equal(image.numpy()[0], images.numpy()[instance])
+        np.testing.assert_allclose(alone.grad.numpy()[0], attributes.grad.numpy()[instance], atol=1e-5)
 
 
 def test_the_gradient_of_barycentrics_matches_central_differences_also_across_the_near_plane(device, verified_tape):

@@ -1,14 +1,10 @@
 """Textures: mip levels and filtering against float64 twins, gradients, and that a fit leaves no holes."""
 
-import importlib
-
-import double_precision
 import numpy as np
 import pytest
-import torch
 import warp as wp
 
-from warpshadow import raster, texture
+from warpshadow import raster
 from warpshadow.camera import Camera, to_clip
 from warpshadow.image import read_image, write_image
 from warpshadow.mesh import plane
@@ -20,7 +16,6 @@ from warpshadow.texture import (
     mip_pyramids,
     sample_albedo,
     seen_texels,
-    surface_albedo,
 )
 
 MEAN = 5e-7  # float32 means of texels in [0, 1]
@@ -227,7 +222,7 @@ def sampled(device, image, fragments, footprints):
 def facing(device, texels_a_sample, *, size=24, tilt=0.0, mesh=None):
     """A textured plane that fills the image, its uvs repeated so that a sample covers so many of 64 texels.
 
-    Returns what `surface_albedo` takes of it, but for the texture.
+    Returns what `surface_albedo` takes, but for the texture.
     """
     mesh = plane(size=2.0, segments=1) if mesh is None else mesh
     eye = (0.0, np.cos(tilt), np.sin(tilt))
@@ -246,6 +241,11 @@ def facing(device, texels_a_sample, *, size=24, tilt=0.0, mesh=None):
         wp.array(mesh.uv_faces, dtype=wp.vec3i, device=device),
         wp.zeros(len(mesh.faces), dtype=wp.int32, device=device),
     )
+
+
+def surface_albedo(fragments, faces, vertex_albedo, clip_positions, uvs, uv_faces, texture_of_face, textures):
+    footprints = find_footprints(fragments, faces, clip_positions, uvs, uv_faces, texture_of_face, textures)
+    return sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
 
 
 def tape_gradients(function, variables, weights):
@@ -491,17 +491,6 @@ def test_faces_seen_edge_on_or_mapped_to_a_point_give_finite_colors(device):
     assert np.isfinite(gradient).all()
 
 
-def test_without_textures_the_vertices_are_interpolated_and_nothing_else_is_launched(device, monkeypatch):
-    bodies = Bodies(device)
-    clip, uvs, vertex_albedo, *_ = bodies.variables()
-    faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, raster.barycentrics(bodies.face_ids, faces, clip))
-    monkeypatch.setattr(texture, "launch", None)
-    monkeypatch.setattr(texture, "_launch", None)
-    got = surface_albedo(fragments, faces, vertex_albedo, clip, uvs, faces, None, None)
-    np.testing.assert_array_equal(got.numpy(), raster.interpolate(fragments, faces, vertex_albedo).numpy())
-
-
 @pytest.mark.parametrize("batched", ["fragments", "clip_positions", "uvs", "vertex_albedo", "images"])
 def test_a_batch_of_1_serves_every_instance(device, batched):
     """With one input in a batch of three, of which only the last is another, the others' single ones serve all."""
@@ -581,43 +570,6 @@ def test_gradients_of_reflectance_are_central_differences_of_the_twin(device, ve
                 sums.append(np.sum(weights * bodies.albedo_twin(*moved)))
             expected.append((sums[0] - sums[1]) / 2e-6)
         assert relative(np.array(got), np.array(expected)) < GRADIENT, number
-
-
-def test_gradients_in_float64_are_exact(device, tmp_path):
-    """All of a texture's stages, built in float64, against central differences of their own."""
-    package = double_precision.build(tmp_path).__name__
-    double, apply = importlib.import_module(f"{package}.texture"), importlib.import_module(f"{package}.torch").apply
-    bodies = Bodies(device)
-    face_ids = wp.array(bodies.face_ids.numpy()[:1, 4:10, 6:14], device=device)
-    faces = bodies.topology(bodies.faces)
-    fragments_of, barycentrics = (
-        getattr(importlib.import_module(f"{package}.raster"), name) for name in ("Fragments", "barycentrics")
-    )
-
-    def albedo(clip, uvs, vertex_albedo, *images):
-        return double.surface_albedo(
-            fragments_of(face_ids, barycentrics(face_ids, faces, clip)),
-            faces,
-            vertex_albedo,
-            clip,
-            uvs,
-            bodies.topology(bodies.uv_faces),
-            bodies.put(bodies.texture_of_face, wp.int32),
-            double.mip_pyramids(images),
-        )
-
-    dtypes = [wp.vec4d, wp.vec2d, wp.vec3d, wp.vec3d, wp.vec3d]
-    values = [bodies.clip_positions[:1], bodies.uvs[None], bodies.vertex_albedo[:1], bodies.images[0][:1, :5, :4]]
-    options = {"dtype": torch.float64, "device": wp.device_to_torch(device), "requires_grad": True}
-    tensors = [torch.tensor(value, **options) for value in (*values, bodies.images[1][:, :3, :4])]
-    assert torch.autograd.gradcheck(
-        lambda *tensors: apply(albedo, *tensors, dtypes=dtypes),
-        tensors,
-        eps=1e-6,
-        rtol=1e-6,
-        atol=1e-7,
-        nondet_tol=1e-12,
-    )
 
 
 def test_a_round_footprint_has_a_gradient(device):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
+from warpshadow.batch import common_batch
 from warpshadow.tape import launch
 
 MAX_SIZE = 1 << 15
@@ -450,11 +451,14 @@ def _interpolation(dtype: type):
     ):
         """One thread owns one pixel; the image is zero before."""
         pixel = wp.tid()
-        face = face_ids[pixel]
+        instance = _instance(pixel, pixels_per_instance, attributes.shape[0])
+        seen = pixel
+        if face_ids.shape[0] == pixels_per_instance:
+            seen = pixel - instance * pixels_per_instance
+        face = face_ids[seen]
         if face >= 0:
-            instance = _instance(pixel, pixels_per_instance, attributes.shape[0])
             corners = faces[face]
-            weights = barycentrics[pixel]
+            weights = barycentrics[seen]
             image[pixel] = (
                 weights[0] * attributes[instance, corners[0]]
                 + weights[1] * attributes[instance, corners[1]]
@@ -527,8 +531,8 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         fragments: What each pixel sees.
         faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology
             of the same mesh (uv_faces), face by face.
-        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute]; batch may be 1
-            and then serves every instance.
+        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute].
+            Either batch may be 1 and then serves every instance of the other.
     Returns:
         Image, dtype of the attributes, shape [batch, height, width], zero where there is no face.
     Raises:
@@ -537,19 +541,18 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
     """
     face_ids = fragments.face_ids
     check.shape("attributes", attributes.shape, ("batch", "attribute"))
-    if attributes.shape[0] not in (1, face_ids.shape[0]):
-        raise ValueError(f"attributes: got a batch of {attributes.shape[0]}, expected 1 or {face_ids.shape[0]}")
+    instances = common_batch({"fragments": face_ids, "attributes": attributes})
     if getattr(attributes.dtype, "_wp_scalar_type_", attributes.dtype) is not wp.float32:
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     image = wp.zeros(
-        face_ids.shape,
+        (instances, *face_ids.shape[1:]),
         dtype=attributes.dtype,
         device=face_ids.device,
         requires_grad=attributes.requires_grad or fragments.barycentrics.requires_grad,
     )
     launch(
         _interpolation(attributes.dtype),
-        dim=face_ids.size,
+        dim=image.size,
         inputs=[
             face_ids.flatten(),
             fragments.barycentrics.flatten(),

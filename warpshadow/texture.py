@@ -21,7 +21,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch
-from warpshadow.raster import Fragments, _instance, _relative, _volumes, interpolate
+from warpshadow.raster import Fragments, _instance, _relative, _volumes
 from warpshadow.tape import launch, record_adjoint
 
 MAX_PROBES = 7
@@ -775,42 +775,6 @@ def _seen(textures: Textures, footprints: Footprints) -> list[wp.array]:
     """What kernels take of textures, but for the texels, and of footprints."""
     images = footprints.texture_ids, footprints.uvs, footprints.probes
     return [textures.levels, textures.level_counts, *map(_rows, images)]
-
-
-def surface_albedo(
-    fragments: Fragments,
-    faces: wp.array,
-    vertex_albedo: wp.array,
-    clip_positions: wp.array,
-    uvs: wp.array,
-    uv_faces: wp.array,
-    texture_of_face: wp.array,
-    textures: Textures | None,
-) -> wp.array:
-    """Find the reflectance that each sample sees: :func:`sample_albedo` of footprints found for this once.
-
-    Args:
-        fragments: What each sample sees.
-        faces: Vertex indices, vec3i of shape [face].
-        vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex].
-        clip_positions: The rasterized vertices in clip space, vec4 of shape [batch, vertex].
-        uvs: Texture coordinates, vec2 of shape [batch, uv].
-        uv_faces: Indices of uvs, vec3i of shape [face].
-        texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
-        textures: The textures, None for none; then only the vertices' reflectance is interpolated.
-
-    Returns:
-        Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
-    Differentiable: vertex_albedo, clip_positions, uvs, textures, barycentrics of the fragments.
-    """
-    if textures is None:
-        return interpolate(fragments, faces, vertex_albedo)
-    footprints = find_footprints(fragments, faces, clip_positions, uvs, uv_faces, texture_of_face, textures)
-    return sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
 
 
 # ---------------------------------------------------------------------------------------------------- export
