@@ -54,7 +54,7 @@ def test_finite_arrays_of_any_type_pass(device):
     numbers = wp.full(7, 1e30, dtype=wp.float32, device=device)
     check.finite_arrays({"points": vectors(device), "matrices": matrices, "normals": None, "nothing": nothing})
     check.finite_arrays({"numbers": numbers}, nonnegative=["numbers"])
-    check.finite_array("numbers", numbers)
+    check.finite_arrays({"numbers": numbers})
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -482,6 +482,7 @@ def parallel_step(rank: int, world_size: int, folder: str) -> None:
     model(share).square().mean().backward()
     optimizer.step()
     torch.save(model.module.state_dict(), f"{folder}/{world_size}_{rank}.pt")
+    torch.distributed.barrier()  # a process that leaves while another still talks to it takes that one down
     torch.distributed.destroy_process_group()
 
 

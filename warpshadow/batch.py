@@ -76,3 +76,8 @@ def expand(array: wp.array, instances: int) -> wp.array:
     if array.shape[0] != 1:
         raise ValueError(f"array: got a batch of {array.shape[0]}, expected 1 or {instances}")
     return concatenate([array], array.shape[1:], instances=instances)
+
+
+def rows(images: wp.array | None) -> wp.array | None:
+    """View images [batch, height, width] as [batch, sample]; None stays None."""
+    return None if images is None else images.reshape((images.shape[0], -1))

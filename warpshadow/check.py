@@ -57,11 +57,6 @@ def _count_outside(
         wp.atomic_add(faults, argument, 1)
 
 
-def finite_array(name: str, array: wp.array) -> None:
-    """Raise ValueError when one array on a device holds NaN or Inf: :func:`finite_arrays`."""
-    finite_arrays({name: array})
-
-
 def finite_arrays(
     arrays: Mapping[str, wp.array | None], *, most: float = _FLOAT32_MAX, nonnegative: Collection[str] = ()
 ) -> None:

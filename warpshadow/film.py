@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpshadow import check
-from warpshadow.batch import common_batch
+from warpshadow.batch import common_batch, rows
 from warpshadow.raster import Fragments
 from warpshadow.tape import launch, record_adjoint
 
@@ -110,12 +110,12 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
         device=shading.device,
         requires_grad=shading.requires_grad or albedo.requires_grad or fragments.barycentrics.requires_grad,
     )
-    factors = [_rows(fragments.face_ids), _rows(fragments.barycentrics), faces, shading, _rows(albedo)]
+    factors = [rows(fragments.face_ids), rows(fragments.barycentrics), faces, shading, rows(albedo)]
     wp.launch(
         _expose,
         dim=(samples.shape[0], height * width),
         inputs=factors,
-        outputs=[_rows(samples)],
+        outputs=[rows(samples)],
         device=shading.device,
         record_tape=False,
     )
@@ -125,8 +125,8 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
         wp.launch(
             _expose_adjoint,
             dim=height * width,
-            inputs=[*factors, _rows(samples.grad)],
-            outputs=[None if variable.grad is None else _rows(variable.grad) for variable in variables],
+            inputs=[*factors, rows(samples.grad)],
+            outputs=[rows(variable.grad) for variable in variables],
             device=shading.device,
             record_tape=False,
         )
@@ -178,8 +178,3 @@ def average(samples: wp.array, across: int) -> wp.array:
         device=samples.device,
     )
     return pixels
-
-
-def _rows(image: wp.array) -> wp.array:
-    """View an image as a row of samples for each instance."""
-    return image.reshape((image.shape[0], -1))

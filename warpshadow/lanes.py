@@ -11,6 +11,11 @@ from typing import NamedTuple
 
 import warp as wp
 
+from warpshadow.directions import CHUNK
+
+Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
+"""Coefficients of one receiver that reach the vector units together."""
+
 MODULE_OPTIONS = {"max_unroll": 1}
 """Options of modules whose kernels loop over lanes: unrolled, such loops take ten times as long to compile."""
 
@@ -155,3 +160,19 @@ def lane_functions(lanes: int) -> LaneFunctions:
     return LaneFunctions(
         load, load_products, add_vectors, add_to_sphere, load_rows, add_rows, store_rows, store_columns, sqrt
     )
+
+
+def as_chunks(rows: wp.array | None) -> wp.array | None:
+    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; what is left over is not in it."""
+    if rows is None:
+        return None
+    instances, row_count, count = rows.shape
+    chunks = wp.array(
+        ptr=rows.ptr,
+        dtype=Chunk,
+        shape=(instances, row_count, count // CHUNK),
+        strides=(*rows.strides[:2], CHUNK * rows.strides[2]),
+        device=rows.device,
+    )
+    chunks._ref = rows  # the memory stays while the view does
+    return chunks

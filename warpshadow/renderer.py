@@ -1,7 +1,7 @@
 """The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
 
-geometry, cameras → view → transfer → shading → image
-light ↗     ↖ albedo, textures
+Geometry and cameras make a view, which has transfer vectors; they and light make shading; shading, albedo and textures
+make the image.
 """
 
 import functools
@@ -239,14 +239,21 @@ class Renderer:
     def _shade_known(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
         if self._is_traced:
             return self._trace(view, light)
+        coefficients, directions = self._scene_light if light is self.scene.light else self._express(light)
+        return shade(self._own_transfer(view, directions), coefficients)
+
+    @functools.cached_property
+    def _scene_light(self) -> tuple[wp.array, np.ndarray | None]:
+        return self._express(self.scene.light)
+
+    def _express(self, light: EnvironmentMap | np.ndarray) -> tuple[wp.array, np.ndarray | None]:
+        """Known light in what the method computes in, vec3 of shape [1, coefficient], and where its cells look."""
         if isinstance(self._own_basis, CellBasis) and isinstance(light, EnvironmentMap):
             # a cell looks to where its light comes from: a sun is rarely in the middle
-            coefficients, aims, _ = light.cells(self._own_basis.directions)
-            transfer = self._own_transfer(view, aims)
+            coefficients, directions, _ = light.cells(self._own_basis.directions)
         else:
-            coefficients = self._own_basis.coefficients(light)
-            transfer = self._own_transfer(view)
-        return shade(transfer, self._array(coefficients[None], wp.vec3))
+            coefficients, directions = self._own_basis.coefficients(light), None
+        return self._array(coefficients[None], wp.vec3), directions
 
     def _trace(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
         points, normals, *_ = view.receivers

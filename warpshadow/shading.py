@@ -4,13 +4,12 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch
+from warpshadow.directions import CHUNK
+from warpshadow.lanes import Chunk, as_chunks
 from warpshadow.tape import record_adjoint
 
-_WIDTH = 16
 _SLAB = 256
 """Receivers whose gradients to light a thread sums before it adds them to the others'."""
-
-_Chunk = wp.types.vector(length=_WIDTH, dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)
@@ -38,9 +37,9 @@ def _join_channels(
 
 
 @wp.func
-def _sum(values: _Chunk):
+def _sum(values: Chunk):
     total = float(0.0)
-    for i in range(_WIDTH):
+    for i in range(CHUNK):
         total += values[i]
     return total
 
@@ -49,9 +48,9 @@ def _sum(values: _Chunk):
 def _shade(
     # in
     transfer: wp.array3d(dtype=wp.float32),
-    transfer_chunks: wp.array3d(dtype=_Chunk),
+    transfer_chunks: wp.array3d(dtype=Chunk),
     light: wp.array3d(dtype=wp.float32),
-    light_chunks: wp.array3d(dtype=_Chunk),
+    light_chunks: wp.array3d(dtype=Chunk),
     # out
     shading: wp.array2d(dtype=wp.vec3),
 ):
@@ -59,16 +58,16 @@ def _shade(
     batch, vertex = wp.tid()
     seen = wp.min(batch, transfer.shape[0] - 1)
     lit = wp.min(batch, light.shape[0] - 1)
-    red = _Chunk(0.0)
-    green = _Chunk(0.0)
-    blue = _Chunk(0.0)
+    red = Chunk(0.0)
+    green = Chunk(0.0)
+    blue = Chunk(0.0)
     for chunk in range(transfer_chunks.shape[2]):
         t = transfer_chunks[seen, vertex, chunk]
         red += wp.cw_mul(t, light_chunks[lit, 0, chunk])
         green += wp.cw_mul(t, light_chunks[lit, 1, chunk])
         blue += wp.cw_mul(t, light_chunks[lit, 2, chunk])
     total = wp.vec3(_sum(red), _sum(green), _sum(blue))
-    for k in range(_WIDTH * transfer_chunks.shape[2], transfer.shape[2]):
+    for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
         total += transfer[seen, vertex, k] * wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
     shading[batch, vertex] = total
 
@@ -77,11 +76,11 @@ def _shade(
 def _shade_adjoint_transfer(
     # in
     light: wp.array3d(dtype=wp.float32),
-    light_chunks: wp.array3d(dtype=_Chunk),
+    light_chunks: wp.array3d(dtype=Chunk),
     adj_shading: wp.array2d(dtype=wp.vec3),
     # out
     adj_transfer: wp.array3d(dtype=wp.float32),
-    adj_transfer_chunks: wp.array3d(dtype=_Chunk),
+    adj_transfer_chunks: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
     seen, vertex = wp.tid()
@@ -99,7 +98,7 @@ def _shade_adjoint_transfer(
                 + adj[1] * light_chunks[lit, 1, chunk]
                 + adj[2] * light_chunks[lit, 2, chunk]
             )
-        for k in range(_WIDTH * light_chunks.shape[2], light.shape[2]):
+        for k in range(CHUNK * light_chunks.shape[2], light.shape[2]):
             adj_transfer[seen, vertex, k] = adj_transfer[seen, vertex, k] + wp.dot(
                 adj, wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
             )
@@ -109,7 +108,7 @@ def _shade_adjoint_transfer(
 def _shade_adjoint_light(
     # in
     transfer: wp.array3d(dtype=wp.float32),
-    transfer_chunks: wp.array3d(dtype=_Chunk),
+    transfer_chunks: wp.array3d(dtype=Chunk),
     adj_shading: wp.array2d(dtype=wp.vec3),
     # out
     adj_light: wp.array3d(dtype=wp.float32),
@@ -120,18 +119,18 @@ def _shade_adjoint_light(
     lit = wp.min(batch, adj_light.shape[0] - 1)
     begin = slab * _SLAB
     end = wp.min(begin + _SLAB, transfer.shape[1])
-    first = chunk * _WIDTH
+    first = chunk * CHUNK
     if chunk < transfer_chunks.shape[2]:
-        red = _Chunk(0.0)
-        green = _Chunk(0.0)
-        blue = _Chunk(0.0)
+        red = Chunk(0.0)
+        green = Chunk(0.0)
+        blue = Chunk(0.0)
         for vertex in range(begin, end):
             adj = adj_shading[batch, vertex]
             t = transfer_chunks[seen, vertex, chunk]
             red += adj[0] * t
             green += adj[1] * t
             blue += adj[2] * t
-        for i in range(_WIDTH):
+        for i in range(CHUNK):
             wp.atomic_add(adj_light, lit, 0, first + i, red[i])
             wp.atomic_add(adj_light, lit, 1, first + i, green[i])
             wp.atomic_add(adj_light, lit, 2, first + i, blue[i])
@@ -176,7 +175,7 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
     )
     channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
     wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
-    factors = [transfer, _as_chunks(transfer), channels, _as_chunks(channels)]
+    factors = [transfer, as_chunks(transfer), channels, as_chunks(channels)]
     wp.launch(_shade, dim=shading.shape, inputs=factors, outputs=[shading], device=device, record_tape=False)
 
     def adjoint() -> None:
@@ -185,7 +184,7 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
                 _shade_adjoint_transfer,
                 dim=transfer.shape[:2],
                 inputs=[*factors[2:], shading.grad],
-                outputs=[transfer.grad, _as_chunks(transfer.grad)],
+                outputs=[transfer.grad, as_chunks(transfer.grad)],
                 device=device,
                 record_tape=False,
             )
@@ -194,7 +193,7 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
             slab_count = -(-transfer.shape[1] // _SLAB)
             wp.launch(
                 _shade_adjoint_light,
-                dim=(instances, slab_count, -(-count // _WIDTH)),
+                dim=(instances, slab_count, -(-count // CHUNK)),
                 inputs=[*factors[:2], shading.grad],
                 outputs=[adj_channels],
                 device=device,
@@ -211,17 +210,3 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
 
     record_adjoint(adjoint, [transfer, light, shading])
     return shading
-
-
-def _as_chunks(rows: wp.array) -> wp.array:
-    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; what is left over is not in it."""
-    instances, row_count, count = rows.shape
-    chunks = wp.array(
-        ptr=rows.ptr,
-        dtype=_Chunk,
-        shape=(instances, row_count, count // _WIDTH),
-        strides=(*rows.strides[:2], 4 * _WIDTH),
-        device=rows.device,
-    )
-    chunks._ref = rows  # the memory stays while the view does
-    return chunks

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.batch import common_batch
+from warpshadow.batch import common_batch, rows
 from warpshadow.raster import Fragments, _instance, _relative, _volumes
 from warpshadow.tape import launch, record_adjoint
 
@@ -256,9 +256,9 @@ def _add_to_image(adj_image: wp.array, adj_texels: wp.array, layout: _Layout, nu
 def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
     """An image [height · width] and the texels of its finest level, in each instance."""
     first, width, height = layout.levels[number, 0].tolist()
-    rows = image.reshape((image.shape[0], -1))
+    flat = rows(image)
     return [
-        (rows[min(batch, len(rows) - 1)], texels[batch, first : first + width * height])
+        (flat[min(batch, len(flat) - 1)], texels[batch, first : first + width * height])
         for batch in range(texels.shape[0])
     ]
 
@@ -429,8 +429,8 @@ def find_footprints(
         _find_footprints,
         dim=texture_ids.size,
         inputs=[
-            _rows(fragments.face_ids),
-            _rows(fragments.barycentrics),
+            rows(fragments.face_ids),
+            rows(fragments.barycentrics),
             faces,
             clip_positions,
             uv_faces,
@@ -445,11 +445,6 @@ def find_footprints(
         device=device,
     )
     return Footprints(texture_ids, sample_uvs, probes)
-
-
-def _rows(image: wp.array | None) -> wp.array | None:
-    """View an image [batch, height, width] as [batch, sample]; None stays None."""
-    return None if image is None else image.reshape((image.shape[0], -1))
 
 
 # ---------------------------------------------------------------------------------------------------- reflectance
@@ -754,7 +749,7 @@ def sample_albedo(
         device=vertex_albedo.device,
         requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
     )
-    face_ids, barycentrics = _rows(fragments.face_ids), _rows(fragments.barycentrics)
+    face_ids, barycentrics = rows(fragments.face_ids), rows(fragments.barycentrics)
     seen = [*_seen(textures, footprints), batch_count]
     _launch(_sample, albedo.size, [face_ids, barycentrics, faces, *reflecting, *seen], [albedo.flatten()])
 
@@ -765,7 +760,7 @@ def sample_albedo(
             _launch(_sample_adjoint_by_albedo, albedo.size, inputs, [array.grad for array in reflecting])
         if any(array.requires_grad for array in placed):
             inputs = [face_ids, faces, *reflecting, *seen, adj_albedo]
-            _launch(_sample_adjoint_by_place, albedo.size, inputs, [_rows(array.grad) for array in placed])
+            _launch(_sample_adjoint_by_place, albedo.size, inputs, [rows(array.grad) for array in placed])
 
     record_adjoint(adjoint, [*reflecting, *placed, albedo])
     return albedo
@@ -774,7 +769,7 @@ def sample_albedo(
 def _seen(textures: Textures, footprints: Footprints) -> list[wp.array]:
     """What kernels take of textures, but for the texels, and of footprints."""
     images = footprints.texture_ids, footprints.uvs, footprints.probes
-    return [textures.levels, textures.level_counts, *map(_rows, images)]
+    return [textures.levels, textures.level_counts, *map(rows, images)]
 
 
 # ---------------------------------------------------------------------------------------------------- export

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow import check, sh
 from warpshadow.directions import CHUNK, check_count
-from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
 
@@ -169,38 +169,35 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int) -
     return transfer
 
 
-_Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
-
-
 @wp.kernel(enable_backward=False)
 def _transfer_directions(
     # in
-    transmittance: wp.array3d(dtype=_Chunk),
+    transmittance: wp.array3d(dtype=Chunk),
     normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=_Chunk),
+    directions: wp.array2d(dtype=Chunk),
     weight: float,
     # out
-    transfer: wp.array3d(dtype=_Chunk),
+    transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
     batch, vertex = wp.tid()
     n = normals[batch, vertex]
     for chunk in range(directions.shape[1]):
         cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
-        cosine = weight * wp.max(cosine, _Chunk(0.0))
+        cosine = weight * wp.max(cosine, Chunk(0.0))
         transfer[batch, vertex, chunk] = wp.cw_mul(cosine, transmittance[batch, vertex, chunk])
 
 
 @wp.kernel(enable_backward=False)
 def _transfer_directions_adjoint(
     # in
-    transmittance: wp.array3d(dtype=_Chunk),
+    transmittance: wp.array3d(dtype=Chunk),
     normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=_Chunk),
+    directions: wp.array2d(dtype=Chunk),
     weight: float,
-    adj_transfer: wp.array3d(dtype=_Chunk),
+    adj_transfer: wp.array3d(dtype=Chunk),
     # out
-    adj_transmittance: wp.array3d(dtype=_Chunk),
+    adj_transmittance: wp.array3d(dtype=Chunk),
     adj_normals: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
@@ -212,9 +209,9 @@ def _transfer_directions_adjoint(
         adj = weight * adj_transfer[batch, vertex, chunk]
         if adj_transmittance:
             adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
-                adj, wp.max(cosine, _Chunk(0.0))
+                adj, wp.max(cosine, Chunk(0.0))
             )
-        is_up = wp.min(wp.max(cosine * 1.0e30, _Chunk(0.0)), _Chunk(1.0))
+        is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
         adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), is_up)
         total += wp.vec3(
             wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
@@ -240,12 +237,11 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
     check_count("directions", count)
     check.shape("transmittance", transmittance.shape, (*normals.shape, count))
     device = normals.device
-    shape = (*normals.shape, count // CHUNK)
     if transmittance.requires_grad and not transmittance.is_contiguous:
         raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
-    seen = _as_chunks(transmittance.contiguous(), shape)
+    seen = as_chunks(transmittance.contiguous())
     variables = [transmittance, normals]
-    towards = wp.array(directions.T.reshape(3, -1, CHUNK), dtype=_Chunk, device=device)
+    towards = wp.array(directions.T.reshape(3, -1, CHUNK), dtype=Chunk, device=device)
     transfer = wp.empty(
         transmittance.shape,
         dtype=wp.float32,
@@ -256,7 +252,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         _transfer_directions,
         dim=normals.shape,
         inputs=[seen, normals, towards, 4.0 / count],
-        outputs=[_as_chunks(transfer, shape)],
+        outputs=[as_chunks(transfer)],
         device=device,
         record_tape=False,
     )
@@ -265,20 +261,11 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         wp.launch(
             _transfer_directions_adjoint,
             dim=normals.shape,
-            inputs=[seen, normals, towards, 4.0 / count, _as_chunks(transfer.grad, shape)],
-            outputs=[_as_chunks(transmittance.grad, shape), normals.grad],
+            inputs=[seen, normals, towards, 4.0 / count, as_chunks(transfer.grad)],
+            outputs=[as_chunks(transmittance.grad), normals.grad],
             device=device,
             record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, transfer])
     return transfer
-
-
-def _as_chunks(values: wp.array | None, shape: tuple[int, ...]) -> wp.array | None:
-    """View rows of float32 as rows of chunks."""
-    if values is None:
-        return None
-    chunks = wp.array(ptr=values.ptr, dtype=_Chunk, shape=shape, device=values.device)
-    chunks._ref = values  # the memory stays while the view does
-    return chunks
