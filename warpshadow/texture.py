@@ -256,9 +256,9 @@ def _add_to_image(adj_image: wp.array, adj_texels: wp.array, layout: _Layout, nu
 def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
     """An image [height · width] and the texels of its finest level, in each instance."""
     first, width, height = layout.levels[number, 0].tolist()
-    flat = rows(image)
+    flat = image.reshape((image.shape[0], width * height))
     return [
-        (flat[min(batch, len(flat) - 1)], texels[batch, first : first + width * height])
+        (flat[min(batch, image.shape[0] - 1)], texels[batch, first : first + width * height])
         for batch in range(texels.shape[0])
     ]
 
