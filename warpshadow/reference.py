@@ -85,6 +85,7 @@ def trace_visibility(
         inputs=[mesh.id, points, normals, directions, float(offset)],
         outputs=[visibility],
         device=points.device,
+        record_tape=False,
     )
     return visibility
 
@@ -207,6 +208,7 @@ def trace_shading(
             inputs=[mesh.id, points[part], normals[part], offset, directions, radiance],
             outputs=[shading[part]],
             device=device,
+            record_tape=False,
         )
     return shading
 

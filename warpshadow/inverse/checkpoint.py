@@ -1,0 +1,80 @@
+"""Checkpoints: the state of a long computation in a file that is whole or not there.
+
+A file holds a mark, the SHA-256 of what follows, and torch's own format. It replaces the one before by a rename, and
+that one is kept beside it, so whenever a process is killed a whole file remains.
+"""
+
+import hashlib
+import io
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_MARK = b"warpshadow checkpoint 1\n"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; the message says why."""
+
+
+def save(path: str | Path, state: dict[str, Any]) -> None:
+    """Write a state, atomically; the checkpoint before it stays as FILE.previous.
+
+    Args:
+        path: The file; its folder must exist.
+        state: Tensors, numbers, strings, and lists and dictionaries of them.
+    """
+    path = Path(path)
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    payload = buffer.getvalue()
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with unfinished.open("wb") as file:
+            file.write(_MARK + hashlib.sha256(payload).digest() + payload)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            os.replace(path, previous_path(path))
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def load(path: str | Path) -> dict[str, Any] | None:
+    """Read the last whole state.
+
+    Args:
+        path: The file that :func:`save` was given.
+
+    Returns:
+        The state; that of FILE.previous, with a warning, where the file is damaged, and without one where it is missing
+        because a process ended between two renames; None where there is neither.
+
+    Raises:
+        CheckpointError: where files are there but none is whole.
+    """
+    path = Path(path)
+    faults: list[str] = []
+    for candidate in (path, previous_path(path)):
+        if not candidate.exists():
+            continue
+        content = candidate.read_bytes()
+        start = len(_MARK) + hashlib.sha256().digest_size
+        payload = content[start:]
+        if content[:start] == _MARK + hashlib.sha256(payload).digest():
+            if faults:
+                warnings.warn(f"{faults[0]}; going on from {candidate.name}", stacklevel=2)
+            return torch.load(io.BytesIO(payload), weights_only=True)
+        faults.append(f"{candidate}: not a whole checkpoint (truncated or damaged)")
+    if faults:
+        raise CheckpointError(f"{'; '.join(faults)}; remove what is damaged to start anew")
+    return None
+
+
+def previous_path(path: Path) -> Path:
+    """Where the checkpoint before the last is kept."""
+    return path.with_name(f"{path.name}.previous")

@@ -1,0 +1,138 @@
+"""Problems: a scene, what is seen of it, what of it is free, and what counts as alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from warpshadow.basis import Basis
+from warpshadow.blockers import scene_blockers
+from warpshadow.camera import Camera
+from warpshadow.inverse.free import Free, Light, Values
+from warpshadow.inverse.loss import Loss
+from warpshadow.inverse.target import Target
+from warpshadow.inverse.world import Found, Setting
+from warpshadow.scene import Scene, Visibility
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a fit solves.
+
+    Args:
+        scene: Where the fit starts: all that is not free stays as it is here, and what is free begins as it is here.
+        targets: The images to explain, of one size; one, or several views.
+        free: What the fit may change.
+        loss: What counts as alike.
+        still: How visibility is computed where no geometry and no camera moves: rays by default, since then they are
+            traced once and an iteration costs the same; None for the scene's own method.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    scene: Scene
+    targets: Sequence[Target]
+    free: Sequence[Free]
+    loss: Loss = field(default_factory=Loss)
+    still: Visibility | None = field(default_factory=lambda: Visibility(method="ray-traced"))
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name in ("targets", "free"):
+            items = getattr(self, name)
+            items = tuple(items) if isinstance(items, Sequence) else (items,)
+            if not items:
+                raise ValueError(f"{name}: got none, expected one or more")
+            object.__setattr__(self, name, items)
+        shapes = {target.image.shape for target in self.targets}
+        if len(shapes) > 1:
+            raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
+        names = [free.name for free in self.free]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"free: got {twice[0]} twice, expected it once")
+        if self.moves and self.scene.visibility.method == "ray-traced":
+            raise ValueError(
+                'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '
+                'expected "directional", "log-sh" or "none"'
+            )
+
+    @property
+    def moves(self) -> bool:
+        """Whether geometry or cameras are free."""
+        return any(free.moves for free in self.free)
+
+    @property
+    def basis(self) -> Basis | None:
+        """What free light is expressed in."""
+        return next((free.basis for free in self.free if isinstance(free, Light)), None)
+
+    def cameras(self) -> list[Camera]:
+        """Where each target was taken."""
+        height, width, _ = self.targets[0].image.shape
+        return [target.camera or _fitted(self.scene.camera, width, height) for target in self.targets]
+
+    def setting(self, device: torch.device, *, progress: bool = False) -> Setting:
+        """Fit the spheres and find the units."""
+        cameras, scene = self.cameras(), replace(self.scene, camera=self.cameras()[0])
+        if not self.moves and self.still is not None:
+            scene = replace(scene, visibility=self.still)
+        spheres = scene_blockers(scene, device=str(device), progress=progress)
+        bodies = (replace(body, blockers=own) for body, own in zip(scene.bodies, spheres, strict=True))
+        color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
+        weights = np.stack([target.weights() for target in self.targets])[..., None]
+        unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))
+        return Setting(replace(scene, bodies=tuple(bodies)), cameras, unit or 1.0, device)
+
+    def start(self, setting: Setting) -> dict[str, Values]:
+        """Values of what is free, by its name, where the scene has them."""
+        return {free.name: free.start(setting) for free in self.free}
+
+    def found(self, values: dict[str, Values], setting: Setting) -> Found:
+        """The scene with values in it, and its own visibility."""
+        found = Found(replace(setting.scene, visibility=self.scene.visibility), list(setting.cameras))
+        with torch.no_grad():
+            for free in self.free:
+                free.settle(values[free.name], setting, found)
+        return found
+
+    def fingerprint(self) -> str:
+        """A digest of all that the result depends on, in hexadecimal."""
+        digest = hashlib.sha256()
+        _digest(self, digest)
+        return digest.hexdigest()
+
+
+def _fitted(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with an image of another size."""
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    if camera.width * height != camera.height * width:
+        raise ValueError(
+            f"targets: got an image of {width} × {height} pixels, expected the proportions of the scene's camera, "
+            f"{camera.width} × {camera.height}, or a camera of its own"
+        )
+    return camera.resized(width / camera.width)
+
+
+def _digest(value: object, digest: hashlib._Hash) -> None:
+    """Add numbers, strings, arrays, and sequences and dataclasses of them."""
+    if dataclasses.is_dataclass(value):
+        digest.update(type(value).__name__.encode())
+        for each in dataclasses.fields(value):
+            digest.update(each.name.encode())
+            _digest(getattr(value, each.name), digest)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, (tuple, list)):
+        digest.update(f"{len(value)} items".encode())
+        for item in value:
+            _digest(item, digest)
+    else:
+        digest.update(repr(value).encode())

@@ -1,0 +1,165 @@
+"""The world that a fit renders: its scene, in which free parameters have put their own tensors."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from warpshadow.assembly import Assembly, Geometry
+from warpshadow.basis import Basis
+from warpshadow.camera import Camera
+from warpshadow.deform import DeformationGraph
+from warpshadow.scene import Scene
+from warpshadow.spheres import Spheres
+from warpshadow.torch import TorchRenderer
+
+
+class Setting:
+    """What all stages of a fit have in common: the scene at the start and the units of its parameters.
+
+    Args:
+        scene: The scene, its blockers fitted.
+        cameras: One for each target, of one size.
+        unit: Radiance that counts as 1: the root mean square of the targets.
+        device: Where tensors and arrays live.
+    """
+
+    def __init__(self, scene: Scene, cameras: Sequence[Camera], unit: float, device: torch.device):
+        self.scene = scene
+        self.cameras = tuple(cameras)
+        self.unit = unit
+        self.device = device
+        self._graphs: dict[tuple[int, int], DeformationGraph] = {}
+
+    @functools.cached_property
+    def assembly(self) -> Assembly:
+        """The bodies at rest."""
+        return Assembly(self.scene, device=str(self.device))
+
+    def graph(self, body: int, count: int) -> DeformationGraph:
+        """The deformation graph of a body, made once."""
+        if (body, count) not in self._graphs:
+            self._graphs[body, count] = self.assembly.graph(body, count=count)
+        return self._graphs[body, count]
+
+    def spheres(self, body: int) -> Spheres:
+        """Spheres of a body in its own space."""
+        return _spheres(self.scene, body)
+
+    def middle(self, body: int) -> np.ndarray:
+        """Middle of a body's bounding box in its own space, shape [3]."""
+        low, high = self.scene.bodies[body].mesh.bounds
+        return (low.astype(np.float64) + high) / 2
+
+    def diagonal(self, body: int) -> float:
+        """Length of a body's bounding box from corner to corner, in its own space: the unit of its shifts."""
+        low, high = self.scene.bodies[body].mesh.bounds
+        return float(np.linalg.norm(high.astype(np.float64) - low))
+
+    def tensor(self, values: np.ndarray | Sequence | float) -> torch.Tensor:
+        """Numbers as a float32 tensor on the device."""
+        return torch.tensor(np.asarray(values, np.float32), device=self.device)
+
+
+class World:
+    """A scene on its way to an image; each free parameter puts its tensors in place of what the scene has.
+
+    Args:
+        renderer: Of the scene, at a stage's size and softness.
+        cameras: One for each view, at that size.
+
+    Attributes:
+        light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
+        rotations, translations, scales: Of each body.
+        rest: The bodies in their own spaces, None for the scene's.
+        clip_matrices: Of the views, [view, 4, 4], None for the scene's.
+        exposures: Factors of the views' colors, [view], None for 1.
+    """
+
+    def __init__(self, renderer: TorchRenderer, cameras: Sequence[Camera]):
+        self.renderer = renderer
+        self.cameras = tuple(cameras)
+        count = len(renderer.renderer.scene.bodies)
+        self.light: torch.Tensor | None = None
+        self.albedo: list[torch.Tensor | None] = [None] * count
+        self.textures: list[torch.Tensor | None] = [None] * count
+        poses = renderer.renderer.assembly.poses
+        arrays = poses.rotations, poses.translations, poses.scales
+        self.rotations, self.translations, self.scales = (list(wp.to_torch(array)[0].unbind()) for array in arrays)
+        self.rest: Geometry | None = None
+        self.moves = False
+        self.clip_matrices: torch.Tensor | None = None
+        self.exposures: torch.Tensor | None = None
+
+    def images(self) -> torch.Tensor:
+        """Render the views: premultiplied linear RGB and coverage, [view, height, width, 4]."""
+        geometry = None
+        if self.moves:
+            poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
+            geometry = self.renderer.placed(*poses, rest=self.rest)
+        images = self.renderer(
+            self.light,
+            albedo=self.albedo,
+            textures=self.textures,
+            geometry=geometry,
+            clip_matrices=self.clip_matrices,
+        )
+        images = images if images.ndim == 4 else images[None]
+        if self.exposures is not None:
+            color = images[..., :3] * self.exposures[:, None, None, None]
+            images = torch.cat([color, images[..., 3:]], dim=-1)
+        return images
+
+
+@dataclass
+class Found:
+    """What a fit found: the scene, and what is not the scene's.
+
+    Args:
+        scene: The scene; its camera is that of the first view.
+        cameras: Of the views.
+        exposures: Factors of the views' colors.
+    """
+
+    scene: Scene
+    cameras: list[Camera]
+    exposures: list[float] = field(default_factory=list)
+
+    def spheres(self, body: int) -> Spheres:
+        """Spheres of a body in its own space."""
+        return _spheres(self.scene, body)
+
+    def change_body(self, number: int, **changes: Any) -> None:
+        """Replace fields of a body."""
+        bodies = list(self.scene.bodies)
+        bodies[number] = replace(bodies[number], **changes)
+        self.scene = replace(self.scene, bodies=tuple(bodies))
+
+
+def _spheres(scene: Scene, body: int) -> Spheres:
+    spheres = scene.bodies[body].blockers
+    assert isinstance(spheres, Spheres)  # a setting has them fitted
+    return spheres
+
+
+def make_renderer(
+    setting: Setting, scale: float, softness: float | None, directions: int | None, basis: Basis | None, progress: bool
+) -> tuple[TorchRenderer, tuple[Camera, ...]]:
+    """A renderer of the setting's scene at a size and softness, and the cameras of its views."""
+    scene, cameras = setting.scene, tuple(camera.resized(scale) for camera in setting.cameras)
+    visibility = scene.visibility
+    visibility = replace(
+        visibility,
+        softness=visibility.softness if softness is None else softness,
+        directions=visibility.directions if directions is None else directions,
+    )
+    staged = replace(scene, camera=cameras[0], visibility=visibility)
+    several = {"cameras": cameras} if len(cameras) > 1 else {}
+    renderer = TorchRenderer(staged, device=setting.device, basis=basis, progress=progress, **several)
+    return renderer, cameras
