@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
+from warpshadow import film, texture
 from warpshadow import renderer as renderer_module
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
 
@@ -283,8 +284,86 @@ def test_colors_in_a_batch_make_a_batch_of_images_without_any_texture():
         torch.testing.assert_close(alone.grad, colors.grad[instance])
 
 
+def test_it_does_not_matter_whether_a_thread_owns_a_row_of_samples_or_one(monkeypatch):
+    """Rows are for CPUs; GPUs start a thread for every sample."""
+    results = []
+    for modules in ((), (film, texture)):
+        for module in modules:
+            monkeypatch.setattr(module, "run_length", lambda device, width: 1)
+        renderer = TorchRenderer(scene_of("none", ON_BOTH))
+        values = {name: value.requires_grad_() for name, value in random_batch(renderer, 2).items()}
+        images = image_of_batch(renderer, values)
+        weights = torch.randn(images.shape, generator=torch.Generator().manual_seed(6))
+        (images * weights).sum().backward()
+        results.append([images.detach(), *(value.grad for value in values.values())])
+    for of_rows, of_samples in zip(*results, strict=True):
+        assert torch.equal(of_rows, of_samples)
+
+
 def test_geometry_that_does_not_move_gives_the_scenes_image():
     for method in METHODS:
         renderer = TorchRenderer(scene_of(method, ON_BOTH))
         geometry = renderer.placed(*renderer.scene_poses())
         assert torch.equal(renderer(geometry=geometry), renderer())
+
+
+# ---------------------------------------------------------------------------------------------- what is not seen
+
+
+@pytest.mark.usefixtures("poisoned_outputs")
+@pytest.mark.parametrize(("size", "coarsest"), [(16, 0), (300, 1), (700, 3)])
+def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, coarsest):
+    """The first image finds out which levels it takes, the second one computes no others."""
+    renderer = TorchRenderer(scene_of("none", ON_BOTH))
+    image = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(7), requires_grad=True)
+    results = []
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
+        results.append((renderer(textures=[None, image]).detach(), gradient))
+    ((_, level),) = renderer.renderer._kept_footprints.values()
+    assert level == coarsest
+    for first, second in zip(*results, strict=True):
+        assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+@pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
+def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, monkeypatch):
+    """A body lies behind the camera; then light is evaluated at every vertex, and nothing changes."""
+    scene = scene_of(method, ON_BOTH, directions=32, order=4)
+    behind = dataclasses.replace(scene.bodies[0], translation=(0.5, 2.2, 8.0))
+    ground = dataclasses.replace(scene.bodies[1], receivers=receivers)
+    scene = dataclasses.replace(scene, bodies=(scene.bodies[0], ground, behind))
+    results, counts = {}, {}
+    for name in ("seen", "every"):
+        if name == "every":
+            monkeypatch.setattr(renderer_module, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
+        renderer = TorchRenderer(scene)
+        counts[name] = renderer.renderer.scene_view.receivers.points.shape[1]
+        rotations, translations, scales = renderer.scene_poses()
+        shifts = torch.zeros(3, 3, 3)
+        shifts[1, :, 0], shifts[2] = 0.1, 50.0  # the last instance sees nothing
+        variables = [(translations + shift).requires_grad_() for shift in (shifts[0], shifts)]
+        images = [renderer(geometry=renderer.placed(rotations, variable, scales)) for variable in variables]
+        weights = torch.randn(images[1].shape, generator=torch.Generator().manual_seed(5))
+        (images[0] * weights[0]).sum().backward()
+        (images[1] * weights).sum().backward()
+        results[name] = [renderer(), *images, *(variable.grad for variable in variables)]
+    assert counts["seen"] < counts["every"] - 642  # the vertices of the body behind, and others
+    for got, expected in zip(results["seen"], results["every"], strict=True):
+        assert (got - expected).abs().max() <= 2e-6 * expected.abs().max()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_image_of_nothing_has_no_gradient(method):
+    renderer = TorchRenderer(scene_of(method, ws.Camera.look_at((0, 5, 0), (0, 10, 0.1), size=(16, 16))))
+    rotations, translations, scales = renderer.scene_poses()
+    translations.requires_grad_()
+    light = torch.ones(renderer.renderer.basis.size, 3, requires_grad=True)
+    geometry = renderer.placed(rotations, translations, scales)
+    images = [renderer(light), renderer(light, geometry=geometry)]
+    assert not images[0].any() and not images[1].any()
+    assert renderer.renderer.scene_view.receivers.points.shape == (1, 0)
+    for image in images:
+        image.sum().backward()
+    assert not light.grad.any() and not translations.grad.any()

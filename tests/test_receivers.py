@@ -7,8 +7,9 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.camera import to_clip
 from warpshadow.mesh import vertex_normals
-from warpshadow.raster import interpolate, rasterize
-from warpshadow.receivers import find_receivers
+from warpshadow.raster import Fragments, interpolate, rasterize
+from warpshadow.receivers import find_receivers, seen_vertices
+from warpshadow.silhouette import Silhouettes, find_silhouettes
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 2e-6
@@ -54,6 +55,37 @@ def test_vertices_that_only_samples_stand_for_are_not_receivers(device):
     np.testing.assert_array_equal(found.points.numpy()[0, :3], positions.numpy()[0, 3:])
     all_vertices, _ = receivers_of(positions, faces, matrices, (False, False))
     assert all_vertices.points is positions
+
+
+def test_views_of_one_geometry_share_the_vertices_that_any_of_them_sees(device):
+    positions, faces, matrices = two_triangles(device, 3)
+    normals = vertex_normals(positions, faces)
+    fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
+    keeps_vertex = np.array([False, False, False, True, True, True])
+    found = find_receivers(positions, normals, faces, fragments, keeps_vertex, np.zeros(2, bool))
+    np.testing.assert_array_equal(found.points.numpy(), positions.numpy()[:, 3:])
+    np.testing.assert_array_equal(found.normals.numpy(), normals.numpy()[:, 3:])
+    np.testing.assert_array_equal(found.of_vertices.numpy(), [-1, -1, -1, 0, 1, 2])
+    np.testing.assert_array_equal(found.faces.numpy()[1], [0, 1, 2])
+    assert found.fragments is fragments
+
+
+def test_vertices_of_seen_faces_and_of_edges_at_silhouettes_have_a_part_in_the_image(device):
+    faces = wp.array([(0, 1, 2), (2, 3, 4), (5, 6, 7)], dtype=wp.vec3i, device=device)
+    face_ids = wp.array([[[-1, 1, 1]], [[-1, -1, -1]]], dtype=wp.int32, device=device)
+    edges = wp.array([[(-1, -1), (-2, -2), (7, 0), (-1, -1)]], dtype=wp.vec2i, device=device)
+    fragments = Fragments(face_ids, None)
+    seen = seen_vertices(fragments, Silhouettes(None, edges, None, fragments, faces), 9)
+    np.testing.assert_array_equal(np.flatnonzero(seen), [0, 2, 3, 4, 7])
+
+
+def test_no_vertex_has_a_part_in_an_image_of_nothing(device):
+    positions, faces, matrices = two_triangles(device, 1)
+    away = wp.array(positions.numpy() + [100, 0, 0], dtype=wp.vec3, device=device)
+    clip = to_clip(away, matrices)
+    fragments = rasterize(clip, faces, 12, 12)
+    edges = wp.array(np.full((2, 3), -1), dtype=wp.vec3i, device=device)
+    assert not seen_vertices(fragments, find_silhouettes(fragments, faces, edges, clip), 6).any()
 
 
 def test_gradients_through_receivers_are_central_differences(device, verified_tape):

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpshadow as ws
 from warpshadow import sh
@@ -330,10 +331,13 @@ def test_no_light_is_lost_between_cells_of_different_size(device, count):
     """One cell of light after the other gives all that the method's own 128 cells give."""
     scene = scene_of("directional", directions=128)
     own = Renderer(scene, device=device).transfer.numpy()[0]
-    transfer = Renderer(scene, device=device, basis=CellBasis(fibonacci(count))).transfer.numpy()[0]
+    renderer = Renderer(scene, device=device, basis=CellBasis(fibonacci(count)))
+    transfer = renderer.transfer.numpy()[0]
     assert np.abs(transfer.sum(axis=1) - own.sum(axis=1)).max() < FLOAT32
     upward = fibonacci(count)[:, 1] > 0.3
-    on_ground = slice(-(49**2), None)  # it sees every cell above it somewhere
+    body_of_vertex = np.repeat([0, 1], np.diff(renderer.assembly.first_vertex))
+    on_ground = renderer.scene_view.receivers.of_vertices.numpy()[body_of_vertex == 1]
+    on_ground = on_ground[on_ground >= 0]  # the ground sees every cell above it somewhere
     assert (transfer[on_ground].max(axis=0)[upward] > 0).all()
     if count == 128:
         assert np.abs(transfer - own).max() < FLOAT32
@@ -350,3 +354,68 @@ def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ws.render(dataclasses.replace(scene, bodies=(dataclasses.replace(floor, receivers="pixel"),)))
+
+
+# ---------------------------------------------------------------------------------------------- several cameras
+
+EYES = [(0, 2.5, 5), (4, 1.5, -2)]
+
+
+def cameras() -> list[ws.Camera]:
+    return [ws.Camera.look_at(eye, (0, 0.6, 0), size=(24, 16)) for eye in EYES]
+
+
+def textured_scene(method: str, receivers: str) -> ws.Scene:
+    texture = np.random.default_rng(4).uniform(0.1, 0.9, (8, 8, 3)).astype(np.float32)
+    bodies = ball(), ground(12, texture=texture, receivers=receivers)
+    return scene_of(method, *bodies, samples=64, directions=32, order=4)
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+@pytest.mark.parametrize("method", METHODS)
+def test_images_of_several_cameras_are_those_of_each_alone(device, method, receivers):
+    scene = textured_scene(method, receivers)
+    together = Renderer(scene, cameras=cameras(), device=device)
+    light = wp.array(np.random.default_rng(5).uniform(size=(1, together.basis.size, 3)), dtype=wp.vec3, device=device)
+    images, lit = together.render(), together.draw(light).numpy()
+    assert images.shape == lit.shape == (2, 16, 24, 4)
+    for number, camera in enumerate(cameras()):
+        alone = Renderer(dataclasses.replace(scene, camera=camera), device=device)
+        assert np.abs(images[number] - alone.render()).max() < FLOAT32 * images.max()
+        assert np.abs(lit[number] - alone.draw(light).numpy()[0]).max() < FLOAT32 * lit.max()
+
+
+def test_one_camera_that_is_given_makes_a_batch_of_one(device):
+    scene = textured_scene("none", "vertex")
+    images = Renderer(scene, cameras=cameras()[:1], device=device).render()
+    expected = ws.render(dataclasses.replace(scene, camera=cameras()[0]), device=device)
+    np.testing.assert_array_equal(images, expected[None])
+
+
+def test_cameras_share_the_visibility_of_moving_geometry(device):
+    renderer = Renderer(textured_scene("directional", "vertex"), cameras=cameras(), device=device)
+    view = renderer.view(renderer.assembly.placed())
+    assert view.fragments.face_ids.shape[0] == 2 and view.receivers.points.shape[0] == 1
+    np.testing.assert_array_equal(renderer.draw(view=view).numpy(), renderer.render())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([], "cameras: got none, expected at least one"),
+        ([CAMERA, FROM_ABOVE], r"cameras\[1\]: got 16 × 16 pixels and near = .*, expected 32 × 32 and .* as the first"),
+        ([CAMERA, dataclasses.replace(CAMERA, near=0.5)], r"cameras\[1\]: got 32 × 32 pixels and near = 0.5, expected"),
+    ],
+)
+def test_cameras_of_another_size_or_near_plane_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        Renderer(scene_of("none"), cameras=given)
+
+
+def test_a_coarse_face_in_one_view_of_two_is_as_coarse_as_in_one_alone():
+    floor = ws.Body(ws.plane(4.0, 1), blockers=0)
+    camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(28, 28))
+    scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a face covers 330 pixels of either image
+        Renderer(scene, cameras=[camera, camera]).render()

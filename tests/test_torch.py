@@ -498,3 +498,42 @@ def test_two_processes_train_as_one(tmp_path):
         torch.testing.assert_close(states[1][name], alone)
         assert torch.equal(states[1][name], states[2][name])
         assert not torch.equal(alone, start[name.removeprefix("layer.")])
+
+
+# ---------------------------------------------------------------------------------------------- several cameras
+
+
+def test_several_cameras_make_a_batch_of_images_and_add_up_their_gradients():
+    scene = small_scene()
+    cameras = [ws.Camera.look_at(eye, (0, 0.6, 0), size=(12, 12)) for eye in [(0, 2.5, 5), (3, 2, -3)]]
+    together = TorchRenderer(scene, cameras=cameras)
+    light, texture = random(together.renderer.basis.size, 3, seed=1), random(5, 7, 3, seed=2)
+    shifts = together.scene_poses()[1].requires_grad_()
+    weights = random(2, 12, 12, 4, seed=3).detach()
+
+    def image_of(renderer: TorchRenderer) -> torch.Tensor:
+        rotations, _, scales = renderer.scene_poses()
+        moved = renderer(light, textures=[None, texture], geometry=renderer.placed(rotations, shifts, scales))
+        return renderer(light, textures=[None, texture]) + moved
+
+    images = image_of(together)
+    assert images.shape == (2, 12, 12, 4)
+    gradients = torch.autograd.grad((images * weights).sum(), (light, texture, shifts))
+    sums = [torch.zeros_like(gradient) for gradient in gradients]
+    for number, camera in enumerate(cameras):
+        image = image_of(TorchRenderer(dataclasses.replace(scene, camera=camera)))
+        assert (image - images[number]).abs().max() < FLOAT32 * images.max()
+        for total, part in zip(
+            sums, torch.autograd.grad((image * weights[number]).sum(), (light, texture, shifts)), strict=True
+        ):
+            total += part
+    for gradient, expected in zip(gradients, sums, strict=True):
+        assert (gradient - expected).abs().max() < 5 * FLOAT32 * expected.abs().max()
+
+
+def test_a_camera_that_a_call_is_given_replaces_several():
+    scene = small_scene("none")
+    camera = dataclasses.replace(scene.camera)
+    renderer = TorchRenderer(scene, cameras=[camera, camera])
+    matrix = torch.tensor(camera.clip_matrix(), dtype=torch.float32)
+    assert torch.equal(renderer(clip_matrices=matrix), renderer()[1])

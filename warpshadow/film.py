@@ -8,6 +8,11 @@ from warpshadow.raster import Fragments
 from warpshadow.tape import launch, record_adjoint
 
 
+def run_length(device: wp.Device, width: int) -> int:
+    """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
+    return 1 if device.is_cuda else width
+
+
 @wp.func
 def _received(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
     """Shading at a point of a face."""
@@ -25,17 +30,21 @@ def _expose(
     faces: wp.array(dtype=wp.vec3i),
     shading: wp.array2d(dtype=wp.vec3),
     albedo: wp.array2d(dtype=wp.vec3),
+    run: int,
     # out
     samples: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a sample; samples are zero before."""
-    batch, sample = wp.tid()
+    """A thread owns a run of samples; they are zero before."""
+    batch, thread = wp.tid()
     view = wp.min(batch, face_ids.shape[0] - 1)
-    face = face_ids[view, sample]
-    if face >= 0:
-        received = _received(faces[face], barycentrics[view, sample], wp.min(batch, shading.shape[0] - 1), shading)
-        color = wp.cw_mul(received, albedo[wp.min(batch, albedo.shape[0] - 1), sample])
-        samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
+    lit = wp.min(batch, shading.shape[0] - 1)
+    reflected = wp.min(batch, albedo.shape[0] - 1)
+    for sample in range(thread * run, (thread + 1) * run):
+        face = face_ids[view, sample]
+        if face >= 0:
+            received = _received(faces[face], barycentrics[view, sample], lit, shading)
+            color = wp.cw_mul(received, albedo[reflected, sample])
+            samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -46,41 +55,43 @@ def _expose_adjoint(
     faces: wp.array(dtype=wp.vec3i),
     shading: wp.array2d(dtype=wp.vec3),
     albedo: wp.array2d(dtype=wp.vec3),
+    run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
     adj_shading: wp.array2d(dtype=wp.vec3),
     adj_albedo: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a sample of all instances.
+    """A thread owns a run of samples of all instances.
 
     With received r = Σ_k w_k s_k and color c = r a:  r̄ = c̄ a,  ā = c̄ r,  s̄_k = w_k r̄,  w̄_k = r̄ · s_k.
     """
-    sample = wp.tid()
+    thread = wp.tid()
     for batch in range(adj_samples.shape[0]):
         view = wp.min(batch, face_ids.shape[0] - 1)
-        face = face_ids[view, sample]
-        if face >= 0:
-            lit = wp.min(batch, shading.shape[0] - 1)
-            reflected = wp.min(batch, albedo.shape[0] - 1)
-            corners = faces[face]
-            weights = barycentrics[view, sample]
-            adj_sample = adj_samples[batch, sample]
-            adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
-            adj_received = wp.cw_mul(adj_color, albedo[reflected, sample])
-            if adj_shading:
-                wp.atomic_add(adj_shading, lit, corners[0], weights[0] * adj_received)
-                wp.atomic_add(adj_shading, lit, corners[1], weights[1] * adj_received)
-                wp.atomic_add(adj_shading, lit, corners[2], weights[2] * adj_received)
-            if adj_albedo:
-                received = _received(corners, weights, lit, shading)
-                adj_albedo[reflected, sample] = adj_albedo[reflected, sample] + wp.cw_mul(adj_color, received)
-            if adj_barycentrics:
-                adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + wp.vec3(
-                    wp.dot(adj_received, shading[lit, corners[0]]),
-                    wp.dot(adj_received, shading[lit, corners[1]]),
-                    wp.dot(adj_received, shading[lit, corners[2]]),
-                )
+        lit = wp.min(batch, shading.shape[0] - 1)
+        reflected = wp.min(batch, albedo.shape[0] - 1)
+        for sample in range(thread * run, (thread + 1) * run):
+            face = face_ids[view, sample]
+            if face >= 0:
+                corners = faces[face]
+                weights = barycentrics[view, sample]
+                adj_sample = adj_samples[batch, sample]
+                adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
+                adj_received = wp.cw_mul(adj_color, albedo[reflected, sample])
+                if adj_shading:
+                    wp.atomic_add(adj_shading, lit, corners[0], weights[0] * adj_received)
+                    wp.atomic_add(adj_shading, lit, corners[1], weights[1] * adj_received)
+                    wp.atomic_add(adj_shading, lit, corners[2], weights[2] * adj_received)
+                if adj_albedo:
+                    received = _received(corners, weights, lit, shading)
+                    adj_albedo[reflected, sample] = adj_albedo[reflected, sample] + wp.cw_mul(adj_color, received)
+                if adj_barycentrics:
+                    adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + wp.vec3(
+                        wp.dot(adj_received, shading[lit, corners[0]]),
+                        wp.dot(adj_received, shading[lit, corners[1]]),
+                        wp.dot(adj_received, shading[lit, corners[2]]),
+                    )
 
 
 def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
@@ -110,10 +121,12 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
         device=shading.device,
         requires_grad=shading.requires_grad or albedo.requires_grad or fragments.barycentrics.requires_grad,
     )
-    factors = [rows(fragments.face_ids), rows(fragments.barycentrics), faces, shading, rows(albedo)]
+    run = run_length(shading.device, width)
+    run_count = height * width // run
+    factors = [rows(fragments.face_ids), rows(fragments.barycentrics), faces, shading, rows(albedo), run]
     wp.launch(
         _expose,
-        dim=(samples.shape[0], height * width),
+        dim=(samples.shape[0], run_count),
         inputs=factors,
         outputs=[rows(samples)],
         device=shading.device,
@@ -124,7 +137,7 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
     def adjoint() -> None:
         wp.launch(
             _expose_adjoint,
-            dim=height * width,
+            dim=run_count,
             inputs=[*factors, rows(samples.grad)],
             outputs=[rows(variable.grad) for variable in variables],
             device=shading.device,

@@ -1,15 +1,17 @@
 """Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
 
-They are the vertices, and for bodies that want it the points that the samples see.
+They are the vertices of what is seen, and for bodies that want it the points that the samples see.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
-from warpshadow.batch import common_batch
+from warpshadow.batch import common_batch, rows
 from warpshadow.raster import Fragments
+from warpshadow.silhouette import Silhouettes
 from warpshadow.tape import launch
 
 
@@ -41,23 +43,28 @@ def _gather(
     batch, receiver = wp.tid()
     instance = wp.min(batch, positions.shape[0] - 1)
     own = receiver - vertices.shape[0]
-    corners = faces[0]
-    weights = wp.vec3(1.0, 0.0, 0.0)
     if own < 0:
-        vertex = vertices[receiver]
-        corners = wp.vec3i(vertex, vertex, vertex)
-    elif samples[batch, own] >= 0:
-        corners = faces[face_ids[batch, samples[batch, own]]]
-        weights = barycentrics[batch, samples[batch, own]]
-    i = corners[0]
-    j = corners[1]
-    k = corners[2]
-    points[batch, receiver] = (
-        weights[0] * positions[instance, i] + weights[1] * positions[instance, j] + weights[2] * positions[instance, k]
-    )
-    point_normals[batch, receiver] = wp.normalize(
-        weights[0] * normals[instance, i] + weights[1] * normals[instance, j] + weights[2] * normals[instance, k]
-    )
+        points[batch, receiver] = positions[instance, vertices[receiver]]
+        point_normals[batch, receiver] = normals[instance, vertices[receiver]]
+    else:
+        corners = faces[0]
+        weights = wp.vec3(1.0, 0.0, 0.0)
+        view = wp.min(batch, face_ids.shape[0] - 1)
+        sample = samples[view, own]
+        if sample >= 0:
+            corners = faces[face_ids[view, sample]]
+            weights = barycentrics[view, sample]
+        i = corners[0]
+        j = corners[1]
+        k = corners[2]
+        points[batch, receiver] = (
+            weights[0] * positions[instance, i]
+            + weights[1] * positions[instance, j]
+            + weights[2] * positions[instance, k]
+        )
+        point_normals[batch, receiver] = wp.normalize(
+            weights[0] * normals[instance, i] + weights[1] * normals[instance, j] + weights[2] * normals[instance, k]
+        )
 
 
 @wp.kernel
@@ -91,39 +98,38 @@ def find_receivers(
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
         fragments: What each sample sees, one batch for all or one each.
-        keeps_vertex: Which vertices are receivers, bool of shape [vertex].
+        keeps_vertex: Which vertices are receivers, bool of shape [vertex]: all of those of a face that a sample sees,
+            unless the face wants samples; see :func:`seen_vertices`.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
+
+    Returns:
+        Receivers; where no face wants samples, many views of one geometry share them.
 
     Differentiable: positions, normals, barycentrics of the fragments.
     """
-    if not wants_samples.any():
-        every = wp.array(np.arange(len(keeps_vertex)), dtype=wp.int32, device=positions.device)
-        return Receivers(positions, normals, faces, every, fragments)
     device = positions.device
-    face_ids = fragments.face_ids.numpy()
-    is_own = (face_ids >= 0) & wants_samples[face_ids]
-    samples, own_counts = _ragged(is_own.reshape(len(is_own), -1))
+    has_own = wants_samples.any()
+    if not has_own and keeps_vertex.all():
+        return Receivers(positions, normals, faces, _every(len(keeps_vertex), str(device)), fragments)
     vertices = np.flatnonzero(keeps_vertex)
-    own_faces = np.repeat(np.arange(len(vertices), len(vertices) + samples.shape[1])[:, None], 3, axis=1)
-    receiver_of_vertex = np.maximum(np.cumsum(keeps_vertex) - 1, 0)
-    own_face_ids = face_ids.copy()
-    own_face_ids[is_own] = len(wants_samples) + np.concatenate([np.arange(count) for count in own_counts])
-
-    batch_count = common_batch({"positions": positions, "fragments": fragments.face_ids})
-    samples = np.repeat(samples, batch_count // len(samples), axis=0)
-    shape = batch_count, len(vertices) + samples.shape[1]
-    variables = [positions, normals, fragments.barycentrics]
+    samples = np.empty((len(fragments.face_ids), 0), int)
+    batch_count = len(positions)
+    receiver_of_vertex = np.cumsum(keeps_vertex, dtype=np.int32) - 1
+    receiver_of_vertex[~keeps_vertex] = -1
+    receiver_faces = receiver_of_vertex[faces.numpy()]
+    receiver_fragments = fragments
+    if has_own:
+        batch_count = common_batch({"positions": positions, "fragments": fragments.face_ids})
+        samples, receiver_fragments = _own_samples(fragments, wants_samples)
+        first = len(vertices)
+        own_faces = np.repeat(np.arange(first, first + samples.shape[1])[:, None], 3, axis=1)
+        receiver_faces = np.concatenate([receiver_faces, own_faces])
+    variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
     requires_grad = any(array.requires_grad for array in variables)
+    shape = batch_count, len(vertices) + samples.shape[1]
     points, point_normals = (
         wp.empty(shape, dtype=wp.vec3, device=device, requires_grad=requires_grad) for _ in range(2)
     )
-    weights = wp.empty(
-        fragments.barycentrics.shape,
-        dtype=wp.vec3,
-        device=device,
-        requires_grad=fragments.barycentrics.requires_grad,
-    )
-    flat = len(face_ids), is_own[0].size
     launch(
         _gather,
         dim=shape,
@@ -131,13 +137,62 @@ def find_receivers(
             positions,
             normals,
             faces,
-            fragments.face_ids.reshape(flat),
-            fragments.barycentrics.reshape(flat),
+            rows(fragments.face_ids),
+            rows(fragments.barycentrics) if has_own else None,
             wp.array(vertices, dtype=wp.int32, device=device),
             wp.array(samples, dtype=wp.int32, device=device),
         ],
         outputs=[points, point_normals],
         device=device,
+    )
+    return Receivers(
+        points,
+        point_normals,
+        wp.array(receiver_faces, dtype=wp.vec3i, device=device),
+        wp.array(receiver_of_vertex, dtype=wp.int32, device=device),
+        receiver_fragments,
+    )
+
+
+def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
+    """Find the vertices that have a part in an image: those of faces that samples see, and of edges at silhouettes.
+
+    Args:
+        fragments: What each sample sees, of any number of instances.
+        silhouettes: Of :func:`warpshadow.silhouette.find_silhouettes`, whose edges have colors of their own.
+        vertex_count: Number of vertices.
+
+    Returns:
+        bool of shape [vertex]: what any instance sees, so that all have as many receivers.
+    """
+    faces, edges = silhouettes.faces.numpy(), silhouettes.edges.numpy()
+    is_seen = np.zeros(len(faces) + 1, bool)
+    is_seen[fragments.face_ids.numpy()] = True  # the last item is for samples that see none
+    takes_part = np.zeros(vertex_count, bool)
+    takes_part[faces[is_seen[:-1]]] = True
+    takes_part[edges[edges >= 0]] = True
+    return takes_part
+
+
+@functools.lru_cache(maxsize=8)
+def _every(count: int, device: str) -> wp.array:
+    """Numbers of as many receivers as there are vertices."""
+    return wp.array(np.arange(count), dtype=wp.int32, device=device)
+
+
+def _own_samples(fragments: Fragments, wants_samples: np.ndarray) -> tuple[np.ndarray, Fragments]:
+    """Samples of each view that have receivers of their own, −1 after the last, and fragments that see those."""
+    device = fragments.face_ids.device
+    face_ids = fragments.face_ids.numpy()
+    is_own = (face_ids >= 0) & wants_samples[face_ids]
+    samples, own_counts = _ragged(is_own.reshape(len(is_own), -1))
+    own_face_ids = face_ids.copy()
+    own_face_ids[is_own] = len(wants_samples) + np.concatenate([np.arange(count) for count in own_counts])
+    weights = wp.empty(
+        fragments.barycentrics.shape,
+        dtype=wp.vec3,
+        device=device,
+        requires_grad=fragments.barycentrics.requires_grad,
     )
     launch(
         _weigh_own,
@@ -146,14 +201,7 @@ def find_receivers(
         outputs=[weights.flatten()],
         device=device,
     )
-    all_faces = np.concatenate([receiver_of_vertex[faces.numpy()], own_faces])
-    return Receivers(
-        points,
-        point_normals,
-        wp.array(all_faces, dtype=wp.vec3i, device=device),
-        wp.array(np.where(keeps_vertex, receiver_of_vertex, -1), dtype=wp.int32, device=device),
-        Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights),
-    )
+    return samples, Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights)
 
 
 def _ragged(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,12 +16,12 @@ from warpshadow import check, film, sh
 from warpshadow.assembly import Assembly, Geometry
 from warpshadow.basis import Basis, CellBasis, HarmonicBasis, conversion
 from warpshadow.batch import common_batch, concatenate, expand
-from warpshadow.camera import to_clip
+from warpshadow.camera import Camera, to_clip
 from warpshadow.directions import fibonacci
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.raster import Fragments, interpolate, rasterize
-from warpshadow.receivers import Receivers, find_receivers
+from warpshadow.receivers import Receivers, find_receivers, seen_vertices
 from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
 from warpshadow.shading import shade
@@ -50,26 +50,38 @@ class View(NamedTuple):
 class Renderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
-    Geometry and camera of the scene itself stand still, so that their image costs a dot product and a gather. All
+    Geometry and cameras of the scene itself stand still, so that their image costs a dot product and a gather. All
     methods are differentiable under Warp's tape in the arrays they are given, as far as those require gradients.
 
     Args:
         scene: The scene.
+        cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
+            batch.
         device: Warp device, "cpu" by default.
         basis: What free light is expressed in; None for what the method computes in: cells of directions
             ("directional") or spherical harmonics.
         progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        cameras: Those that see the scene.
+        has_camera_batch: Whether they were given as a batch.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
     """
 
     def __init__(
         self,
         scene: Scene,
         *,
+        cameras: Sequence[Camera] | None = None,
         device: wp.DeviceLike = "cpu",
         basis: Basis | None = None,
         progress: bool = False,
     ):
         self.scene = scene
+        self.has_camera_batch = cameras is not None
+        self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
         self.device = wp.get_device(device)
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
@@ -79,7 +91,7 @@ class Renderer:
             CellBasis(fibonacci(visibility.directions)) if is_cellular else HarmonicBasis(visibility.order)
         )
         self.basis = self._own_basis if basis is None else basis
-        self._kept_footprints: dict[tuple, Footprints] = {}
+        self._kept_footprints: dict[tuple, tuple[Footprints, int]] = {}  # with their coarsest level
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
@@ -90,15 +102,15 @@ class Renderer:
 
     @functools.cached_property
     def clip_matrices(self) -> wp.array:
-        """The scene's camera, mat44 of shape [1]."""
-        return self._array(self.scene.camera.clip_matrix()[None], wp.mat44)
+        """The cameras, mat44 of shape [camera]."""
+        return self._array(np.stack([camera.clip_matrix() for camera in self.cameras]), wp.mat44)
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras.
 
         Args:
             geometry: Instances of vertices and spheres, by default the scene's own.
-            clip_matrices: Cameras, mat44 of shape [batch], by default the scene's; see
+            clip_matrices: Cameras, mat44 of shape [batch], by default :attr:`clip_matrices`; see
                 :func:`warpshadow.camera.compose_clip_matrices`.
 
         Raises:
@@ -109,23 +121,35 @@ class Renderer:
         assembly, across = self.assembly, self.scene.supersampling
         geometry = self.geometry if geometry is None else geometry
         clip_positions = to_clip(geometry.positions, self.clip_matrices if clip_matrices is None else clip_matrices)
-        camera = self.scene.camera
+        camera = self.cameras[0]
         fragments = rasterize(clip_positions, assembly.faces, across * camera.width, across * camera.height)
-        wants_samples = np.array([self._is_traced or body.receivers == "pixel" for body in self.scene.bodies])
+        silhouettes = find_silhouettes(fragments, assembly.faces, assembly.edges, clip_positions, assembly.surfaces)
+        keeps_vertex = self._vertices_receive
+        if self.device.is_cpu:  # a GPU would have to wait until the host knows what is seen, which no graph captures
+            keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(keeps_vertex))
         receivers = find_receivers(
             geometry.positions,
             vertex_normals(geometry.positions, assembly.faces),
             assembly.faces,
             fragments,
-            np.repeat(~wants_samples, np.diff(assembly.first_vertex)),
-            wants_samples[assembly.body_of_face],
+            keeps_vertex,
+            self._samples_receive[assembly.body_of_face],
         )
-        silhouettes = find_silhouettes(fragments, assembly.faces, assembly.edges, clip_positions, assembly.surfaces)
         return View(geometry, receivers, clip_positions, fragments, silhouettes)
 
     @functools.cached_property
+    def _samples_receive(self) -> np.ndarray:
+        """Bodies on which every sample is a receiver."""
+        return np.array([self._is_traced or body.receivers == "pixel" for body in self.scene.bodies])
+
+    @functools.cached_property
+    def _vertices_receive(self) -> np.ndarray:
+        """Vertices of the other bodies."""
+        return np.repeat(~self._samples_receive, np.diff(self.assembly.first_vertex))
+
+    @functools.cached_property
     def scene_view(self) -> View:
-        """What the scene's camera sees of the scene."""
+        """What the cameras see of the scene."""
         view = self.view()
         self._warn_of_coarse_faces(view.fragments)
         return view
@@ -139,12 +163,13 @@ class Renderer:
     def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
         bodies = self.scene.bodies
-        face_ids = fragments.face_ids.numpy()
-        seen = face_ids[face_ids >= 0]
         body_of_face = self.assembly.body_of_face
-        face_counts = np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
-        pixel_counts = np.bincount(body_of_face[seen], minlength=len(bodies)) / self.scene.supersampling**2
-        pixels_per_face = pixel_counts / np.maximum(face_counts, 1)
+        sample_counts, face_counts = np.zeros((2, len(bodies)))
+        for face_ids in fragments.face_ids.numpy():
+            seen = face_ids[face_ids >= 0]
+            sample_counts += np.bincount(body_of_face[seen], minlength=len(bodies))
+            face_counts += np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
+        pixels_per_face = sample_counts / self.scene.supersampling**2 / np.maximum(face_counts, 1)
         for number, body in enumerate(bodies):
             if body.receivers == "vertex" and not self._is_traced and pixels_per_face[number] > COARSE_FACE:
                 warnings.warn(
@@ -158,16 +183,13 @@ class Renderer:
 
     @functools.cached_property
     def transfer(self) -> wp.array:
-        """Transfer vectors of the scene's receivers to :attr:`basis`, float32 of shape [1, receiver, coefficient]."""
+        """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
+
+        Cameras share the receivers at vertices, for which there is one view.
+        """
         view = self.scene_view
         if self._is_traced:
-            points, normals, *_ = view.receivers
-            count = self.scene.visibility.samples
-            mesh = self._ray_mesh(view, 0)
-            traced = trace_transfer(
-                mesh, points.flatten(), normals.flatten(), self.basis, count, progress=self.progress
-            )
-            return traced.reshape((1, *traced.shape))
+            return self._trace_transfer(view)
         own = self._own_transfer(view)
         matrix = self._own_from_basis
         return own if matrix is None else self._array(own.numpy() @ matrix, wp.float32)
@@ -202,7 +224,7 @@ class Renderer:
 
     @functools.cached_property
     def scene_shading(self) -> wp.array:
-        """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [1, receiver]."""
+        """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [view, receiver]."""
         return self._shade_known(self.scene_view, self.scene.light)
 
     def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
@@ -255,6 +277,18 @@ class Renderer:
             coefficients, directions = self._own_basis.coefficients(light), None
         return self._array(coefficients[None], wp.vec3), directions
 
+    def _trace_transfer(self, view: View) -> wp.array:
+        """Transfer vectors of what a view of the scene's geometry shows."""
+        points, normals, *_ = view.receivers
+        mesh, count = self._ray_mesh(view, 0), self.scene.visibility.samples
+        transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=self.device)
+        for instance in range(points.shape[0] if points.size else 0):
+            traced = trace_transfer(
+                mesh, points[instance], normals[instance], self.basis, count, progress=self.progress
+            )
+            wp.copy(transfer[instance], traced)
+        return transfer
+
     def _trace(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
         points, normals, *_ = view.receivers
         if points.requires_grad:
@@ -266,14 +300,14 @@ class Renderer:
         samples = sample_map(radiance, count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=self.device)
         for instance in range(points.shape[0] if points.size else 0):
-            mesh = self._ray_mesh(view, instance)
+            if instance < view.geometry.positions.shape[0]:
+                mesh = self._ray_mesh(view, instance)
             lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
             wp.copy(traced[instance], lit)
         return traced
 
     def _ray_mesh(self, view: View, instance: int) -> wp.Mesh:
-        positions = view.geometry.positions
-        points = wp.clone(positions[min(instance, positions.shape[0] - 1)], requires_grad=False)
+        points = wp.clone(view.geometry.positions[instance], requires_grad=False)
         return wp.Mesh(points=points, indices=self.assembly.faces.view(wp.int32).flatten())
 
     @property
@@ -284,7 +318,7 @@ class Renderer:
 
     @functools.cached_property
     def albedo(self) -> wp.array:
-        """Reflectance that the scene's samples see, vec3 of shape [1, height, width]."""
+        """Reflectance that the scene's samples see, vec3 of shape [camera, height, width]."""
         return self._reflect(self.scene_view, self._body_albedo, self._body_textures)
 
     @functools.cached_property
@@ -297,6 +331,10 @@ class Renderer:
         """Texture of each body in the scene, vec3 of shape [1, height, width]."""
         images = (body.texture for body in self.scene.bodies)
         return [None if image is None else self._array(image[None], wp.vec3) for image in images]
+
+    @functools.cached_property
+    def _scene_vertex_albedo(self) -> wp.array:
+        return self._join(self._body_albedo)
 
     @functools.cached_property
     def _scene_pyramids(self) -> Textures:
@@ -350,24 +388,31 @@ class Renderer:
 
     def _reflect(self, view: View, colors: list[wp.array], images: list[wp.array | None]) -> wp.array:
         faces = self.assembly.faces
-        vertex_albedo = concatenate(colors, np.diff(self.assembly.first_vertex).tolist())
+        vertex_albedo = self._scene_vertex_albedo if _same(colors, self._body_albedo) else self._join(colors)
         present = [image for image in images if image is not None]
         if not present:
             return interpolate(view.fragments, faces, vertex_albedo)
-        is_kept = all(image is kept for image, kept in zip(images, self._body_textures, strict=True))
-        pyramids = self._scene_pyramids if is_kept else mip_pyramids(present)
-        footprints = self._footprints(view, pyramids, tuple(image is not None for image in images))
+        sizes = tuple(None if image is None else image.shape[1:] for image in images)
+        is_static = view is self.scene_view
+        footprints, coarsest = self._kept_footprints.get(sizes, (None, None)) if is_static else (None, None)
+        is_kept = _same(images, self._body_textures)
+        pyramids = self._scene_pyramids if is_kept else mip_pyramids(present, coarsest=coarsest)
+        if footprints is None:
+            footprints = self._find_footprints(view, pyramids, sizes)
+            if is_static:
+                self._kept_footprints = {sizes: (footprints, footprints.coarsest_level())}
         return sample_albedo(view.fragments, faces, vertex_albedo, pyramids, footprints)
 
-    def _footprints(self, view: View, pyramids: Textures, has_texture: tuple[bool, ...]) -> Footprints:
-        """What each sample covers of its texture, kept for the scene's own view while sizes stay as they are."""
-        key = pyramids.sizes, has_texture
-        is_static = view is self.scene_view
-        if is_static and key in self._kept_footprints:
-            return self._kept_footprints[key]
+    def _join(self, colors: list[wp.array]) -> wp.array:
+        """Reflectance of all vertices."""
+        return concatenate(colors, np.diff(self.assembly.first_vertex).tolist())
+
+    def _find_footprints(self, view: View, pyramids: Textures, sizes: tuple) -> Footprints:
+        """What each sample covers of its texture; sizes are those of the bodies' textures, None without one."""
         assembly = self.assembly
+        has_texture = np.array([size is not None for size in sizes])
         texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
-        footprints = find_footprints(
+        return find_footprints(
             view.fragments,
             assembly.faces,
             view.clip_positions,
@@ -376,9 +421,6 @@ class Renderer:
             self._array(texture_of_body[assembly.body_of_face], wp.int32),
             pyramids,
         )
-        if is_static:
-            self._kept_footprints = {key: footprints}
-        return footprints
 
     # ------------------------------------------------------------------------------------------ image
 
@@ -425,12 +467,33 @@ class Renderer:
             light: Environment map or SH coefficients [order², 3] in place of the scene's.
 
         Returns:
-            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
+            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or
+            [camera, height, width, 4] where cameras were given; the background is 0.
         """
-        return self.draw(light).numpy()[0].copy()
+        images = self.draw(light).numpy().copy()
+        return images if self.has_camera_batch else images[0]
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _same(arrays: Sequence[wp.array | None], others: Sequence[wp.array | None]) -> bool:
+    """Whether arrays are the same objects."""
+    return all(array is other for array, other in zip(arrays, others, strict=True))
+
+
+def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Cameras whose images are a batch, checked."""
+    if not cameras:
+        raise ValueError("cameras: got none, expected at least one, or None for the scene's")
+    first = cameras[0]
+    for number, camera in enumerate(cameras):
+        if (camera.width, camera.height, camera.near) != (first.width, first.height, first.near):
+            raise ValueError(
+                f"cameras[{number}]: got {camera.width} × {camera.height} pixels and near = {camera.near}, "
+                f"expected {first.width} × {first.height} and {first.near}, as the first has"
+            )
+    return tuple(cameras)
 
 
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:

@@ -13,6 +13,7 @@ bilinear interpolation.
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
+from warpshadow.film import run_length
 from warpshadow.raster import Fragments, _instance, _relative, _volumes
 from warpshadow.tape import launch, record_adjoint
 
@@ -68,6 +70,11 @@ class Footprints:
     uvs: wp.array
     probes: wp.array
 
+    def coarsest_level(self) -> int:
+        """Coarsest level that a probe takes, if textures have that many; it waits for the device."""
+        width = self.probes.numpy()[..., 2].max(initial=1.0)
+        return math.ceil(math.log2(width))
+
 
 # ---------------------------------------------------------------------------------------------------- mip levels
 
@@ -96,9 +103,12 @@ class _Layout:
         self.device_levels = wp.array(self.levels, dtype=wp.vec3i, device=device)
         self.device_level_counts = wp.array(self.level_counts, dtype=wp.int32, device=device)
 
-    def steps(self, texture: int) -> list[tuple[wp.vec3i, wp.vec3i]]:
-        """Each level of a texture with the next, coarser one, from the finest."""
-        levels = [wp.vec3i(*level) for level in self.levels[texture, : self.level_counts[texture]].tolist()]
+    def steps(self, texture: int, coarsest: int | None) -> list[tuple[wp.vec3i, wp.vec3i]]:
+        """Each level of a texture with the next, coarser one, from the finest to the coarsest that is wanted."""
+        level_count = self.level_counts[texture]
+        if coarsest is not None:
+            level_count = min(level_count, coarsest + 1)
+        levels = [wp.vec3i(*level) for level in self.levels[texture, :level_count].tolist()]
         return list(zip(levels[:-1], levels[1:], strict=True))
 
 
@@ -150,18 +160,19 @@ def _halve(
     # in
     fine: wp.vec3i,
     coarse: wp.vec3i,
+    run: int,
     # out
     texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a texel of the coarse level, in every instance: the mean of what it covers of the fine one."""
-    texel = wp.tid()
-    row = texel // coarse[1]
-    column = texel - row * coarse[1]
-    across = _shares(column, fine[1], coarse[1])
-    down = _shares(row, fine[2], coarse[2])
-    start = fine[0] + 2 * row * fine[1] + 2 * column
-    for batch in range(texels.shape[0]):
-        of_instance = texels[batch]
+    """A thread owns a run of texels of the coarse level: the means of what they cover of the fine one."""
+    batch, thread = wp.tid()
+    of_instance = texels[batch]
+    for texel in range(thread * run, (thread + 1) * run):
+        row = texel // coarse[1]
+        column = texel - row * coarse[1]
+        across = _shares(column, fine[1], coarse[1])
+        down = _shares(row, fine[2], coarse[2])
+        start = fine[0] + 2 * row * fine[1] + 2 * column
         mean = wp.vec3()
         for i in range(3):
             if down[i] > 0.0:
@@ -176,18 +187,19 @@ def _halve_adjoint(
     # in
     fine: wp.vec3i,
     coarse: wp.vec3i,
+    run: int,
     # out
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a texel of the coarse level, in every instance."""
-    texel = wp.tid()
-    row = texel // coarse[1]
-    column = texel - row * coarse[1]
-    across = _shares(column, fine[1], coarse[1])
-    down = _shares(row, fine[2], coarse[2])
-    start = fine[0] + 2 * row * fine[1] + 2 * column
-    for batch in range(adj_texels.shape[0]):
-        of_instance = adj_texels[batch]
+    """A thread owns a run of texels of the coarse level."""
+    batch, thread = wp.tid()
+    of_instance = adj_texels[batch]
+    for texel in range(thread * run, (thread + 1) * run):
+        row = texel // coarse[1]
+        column = texel - row * coarse[1]
+        across = _shares(column, fine[1], coarse[1])
+        down = _shares(row, fine[2], coarse[2])
+        start = fine[0] + 2 * row * fine[1] + 2 * column
         adj_mean = of_instance[coarse[0] + texel]
         for i in range(3):
             if down[i] > 0.0:
@@ -196,7 +208,7 @@ def _halve_adjoint(
                         wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * across[j]) * adj_mean)
 
 
-def mip_pyramids(images: Sequence[wp.array]) -> Textures:
+def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> Textures:
     """Compute the mip levels of textures, down to a single texel.
 
     A level has half the width and the height of the one before, rounded down; its texels have the same size and cover
@@ -205,9 +217,11 @@ def mip_pyramids(images: Sequence[wp.array]) -> Textures:
     Args:
         images: Linear RGB, row 0 at v = 1, vec3 of shape [batch, height, width], each of its own size; a batch may be
             1 and then serves every instance.
+        coarsest: Coarsest level that is wanted, 0 for the image itself, if footprints are known and take none beyond;
+            by default all.
 
     Returns:
-        All levels.
+        All levels, those beyond the coarsest unwritten.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -233,22 +247,24 @@ def mip_pyramids(images: Sequence[wp.array]) -> Textures:
     for number, image in enumerate(images):
         for from_image, to_texels in _finest(image, texels, layout, number):
             _launch(_copy, to_texels.size, [from_image], [to_texels])
-        for fine, coarse in layout.steps(number):
-            _launch(_halve, coarse[1] * coarse[2], [fine, coarse], [texels])
+        for fine, coarse in layout.steps(number, coarsest):
+            _launch_on_level(_halve, fine, coarse, texels)
 
     def adjoint() -> None:
         for number, image in enumerate(images):
             if image.requires_grad:
-                _add_to_image(image.grad, texels.grad, layout, number)
+                _add_to_image(image.grad, texels.grad, layout, number, coarsest)
 
     record_adjoint(adjoint, [*images, texels])
     return Textures(texels, layout.device_levels, layout.device_level_counts, sizes)
 
 
-def _add_to_image(adj_image: wp.array, adj_texels: wp.array, layout: _Layout, number: int) -> None:
+def _add_to_image(
+    adj_image: wp.array, adj_texels: wp.array, layout: _Layout, number: int, coarsest: int | None
+) -> None:
     """Gather the gradients of all levels of a texture, the coarsest first, in its image."""
-    for fine, coarse in reversed(layout.steps(number)):
-        _launch(_halve_adjoint, coarse[1] * coarse[2], [fine, coarse], [adj_texels])
+    for fine, coarse in reversed(layout.steps(number, coarsest)):
+        _launch_on_level(_halve_adjoint, fine, coarse, adj_texels)
     for to_image, from_texels in _finest(adj_image, adj_texels, layout, number):
         _launch(_add, to_image.size, [from_texels], [to_image])
 
@@ -263,10 +279,16 @@ def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> 
     ]
 
 
-def _launch(kernel: wp.Kernel, thread_count: int, inputs: list, outputs: list) -> None:
+def _launch_on_level(kernel: wp.Kernel, fine: wp.vec3i, coarse: wp.vec3i, texels: wp.array) -> None:
+    """Launch for a coarse level of every instance."""
+    run = run_length(texels.device, coarse[1])
+    _launch(kernel, (texels.shape[0], coarse[1] * coarse[2] // run), [fine, coarse, run], [texels])
+
+
+def _launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
     """Launch off the tape, on the device of the first array."""
     device = next(value.device for value in [*inputs, *outputs] if isinstance(value, wp.array))
-    wp.launch(kernel, dim=thread_count, inputs=inputs, outputs=outputs, device=device, record_tape=False)
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)
 
 
 # ---------------------------------------------------------------------------------------------------- footprints
@@ -532,42 +554,40 @@ def _sample(
     texture_ids: wp.array2d(dtype=wp.int32),
     uvs: wp.array2d(dtype=wp.vec2),
     probes: wp.array2d(dtype=wp.vec4),
-    batch_count: int,
+    run: int,
     # out
-    albedo: wp.array(dtype=wp.vec3),
+    albedo: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a sample."""
-    thread = wp.tid()
-    sample_count = texture_ids.shape[1]
-    instance = _instance(thread, sample_count, batch_count)
-    sample = thread - instance * sample_count
+    """A thread owns a run of samples."""
+    instance, thread = wp.tid()
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    texture = texture_ids[footprint, sample]
-    color = wp.vec3()
-    if texture >= 0:
-        of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-        line = probes[footprint, sample]
-        level, coarse_part = _level_of(line[2], level_counts[texture])
-        reach = _reach(line[3])
-        for probe in range(-reach, reach + 1):
-            u = uvs[footprint, sample][0] + float(probe) * line[0]
-            v = uvs[footprint, sample][1] + float(probe) * line[1]
-            value = (1.0 - coarse_part) * _bilinear(of_instance, _cell(levels[texture, level], u, v))
-            if coarse_part > 0.0:
-                value += coarse_part * _bilinear(of_instance, _cell(levels[texture, level + 1], u, v))
-            color += _weight(probe, line[3]) * value
-    else:
-        fragment = wp.min(instance, face_ids.shape[0] - 1)
-        face = face_ids[fragment, sample]
-        if face >= 0:
-            of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
-            weights = barycentrics[fragment, sample]
-            color = (
-                weights[0] * of_vertices[faces[face][0]]
-                + weights[1] * of_vertices[faces[face][1]]
-                + weights[2] * of_vertices[faces[face][2]]
-            )
-    albedo[thread] = color
+    for sample in range(thread * run, (thread + 1) * run):
+        texture = texture_ids[footprint, sample]
+        color = wp.vec3()
+        if texture >= 0:
+            of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
+            line = probes[footprint, sample]
+            level, coarse_part = _level_of(line[2], level_counts[texture])
+            reach = _reach(line[3])
+            for probe in range(-reach, reach + 1):
+                u = uvs[footprint, sample][0] + float(probe) * line[0]
+                v = uvs[footprint, sample][1] + float(probe) * line[1]
+                value = (1.0 - coarse_part) * _bilinear(of_instance, _cell(levels[texture, level], u, v))
+                if coarse_part > 0.0:
+                    value += coarse_part * _bilinear(of_instance, _cell(levels[texture, level + 1], u, v))
+                color += _weight(probe, line[3]) * value
+        else:
+            fragment = wp.min(instance, face_ids.shape[0] - 1)
+            face = face_ids[fragment, sample]
+            if face >= 0:
+                of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
+                weights = barycentrics[fragment, sample]
+                color = (
+                    weights[0] * of_vertices[faces[face][0]]
+                    + weights[1] * of_vertices[faces[face][1]]
+                    + weights[2] * of_vertices[faces[face][2]]
+                )
+        albedo[instance, sample] = color
 
 
 @wp.func
@@ -592,41 +612,39 @@ def _sample_adjoint_by_albedo(
     texture_ids: wp.array2d(dtype=wp.int32),
     uvs: wp.array2d(dtype=wp.vec2),
     probes: wp.array2d(dtype=wp.vec4),
-    batch_count: int,
-    adj_albedo: wp.array(dtype=wp.vec3),
+    run: int,
+    adj_albedo: wp.array2d(dtype=wp.vec3),
     # out
     adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a sample: the adjoint of `_sample` by what reflects."""
-    thread = wp.tid()
-    sample_count = texture_ids.shape[1]
-    instance = _instance(thread, sample_count, batch_count)
-    sample = thread - instance * sample_count
+    """A thread owns a run of samples: the adjoint of `_sample` by what reflects."""
+    instance, thread = wp.tid()
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    texture = texture_ids[footprint, sample]
-    adj_color = adj_albedo[thread]
-    if texture >= 0:
-        if adj_texels:
-            adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
-            line = probes[footprint, sample]
-            level, coarse_part = _level_of(line[2], level_counts[texture])
-            reach = _reach(line[3])
-            for probe in range(-reach, reach + 1):
-                u = uvs[footprint, sample][0] + float(probe) * line[0]
-                v = uvs[footprint, sample][1] + float(probe) * line[1]
-                share = _weight(probe, line[3]) * adj_color
-                _scatter(adj_of_instance, _cell(levels[texture, level], u, v), (1.0 - coarse_part) * share)
-                if coarse_part > 0.0:
-                    _scatter(adj_of_instance, _cell(levels[texture, level + 1], u, v), coarse_part * share)
-    elif adj_vertex_albedo:
-        fragment = wp.min(instance, face_ids.shape[0] - 1)
-        face = face_ids[fragment, sample]
-        if face >= 0:
-            row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
-            weights = barycentrics[fragment, sample]
-            for corner in range(3):
-                wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
+    for sample in range(thread * run, (thread + 1) * run):
+        texture = texture_ids[footprint, sample]
+        adj_color = adj_albedo[instance, sample]
+        if texture >= 0:
+            if adj_texels:
+                adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
+                line = probes[footprint, sample]
+                level, coarse_part = _level_of(line[2], level_counts[texture])
+                reach = _reach(line[3])
+                for probe in range(-reach, reach + 1):
+                    u = uvs[footprint, sample][0] + float(probe) * line[0]
+                    v = uvs[footprint, sample][1] + float(probe) * line[1]
+                    share = _weight(probe, line[3]) * adj_color
+                    _scatter(adj_of_instance, _cell(levels[texture, level], u, v), (1.0 - coarse_part) * share)
+                    if coarse_part > 0.0:
+                        _scatter(adj_of_instance, _cell(levels[texture, level + 1], u, v), coarse_part * share)
+        elif adj_vertex_albedo:
+            fragment = wp.min(instance, face_ids.shape[0] - 1)
+            face = face_ids[fragment, sample]
+            if face >= 0:
+                row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
+                weights = barycentrics[fragment, sample]
+                for corner in range(3):
+                    wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
 
 
 @wp.func
@@ -655,63 +673,61 @@ def _sample_adjoint_by_place(
     texture_ids: wp.array2d(dtype=wp.int32),
     uvs: wp.array2d(dtype=wp.vec2),
     probes: wp.array2d(dtype=wp.vec4),
-    batch_count: int,
-    adj_albedo: wp.array(dtype=wp.vec3),
+    run: int,
+    adj_albedo: wp.array2d(dtype=wp.vec3),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
     adj_uvs: wp.array2d(dtype=wp.vec2),
     adj_probes: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a sample: the adjoint of `_sample` by where on its face, and how wide, the sample is."""
-    thread = wp.tid()
-    sample_count = texture_ids.shape[1]
-    instance = _instance(thread, sample_count, batch_count)
-    sample = thread - instance * sample_count
+    """A thread owns a run of samples: the adjoint of `_sample` by where on their faces, and how wide, they are."""
+    instance, thread = wp.tid()
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    texture = texture_ids[footprint, sample]
-    adj_color = adj_albedo[thread]
-    if texture >= 0:
-        of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-        line = probes[footprint, sample]
-        count = line[3]
-        level, coarse_part = _level_of(line[2], level_counts[texture])
-        reach = _reach(count)
-        adj_u = float(0.0)
-        adj_v = float(0.0)
-        adj_line = wp.vec4()
-        for probe in range(-reach, reach + 1):
-            u = uvs[footprint, sample][0] + float(probe) * line[0]
-            v = uvs[footprint, sample][1] + float(probe) * line[1]
-            weight = _weight(probe, count)
-            slopes = _slopes(of_instance, levels[texture, level], u, v, adj_color)
-            adj_width = float(0.0)
-            if coarse_part > 0.0:
-                coarse = _slopes(of_instance, levels[texture, level + 1], u, v, adj_color)
-                adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
-                slopes += coarse_part * (coarse - slopes)
-            # as the line grows, the outermost probes gain half a width each, and all share a longer line
-            adj_count = -weight * slopes[2] / count
-            if wp.abs(probe) == reach:
-                adj_count += 0.5 * slopes[2] / count
-            adj_u += weight * slopes[0]
-            adj_v += weight * slopes[1]
-            along = float(probe) * weight
-            adj_line += wp.vec4(along * slopes[0], along * slopes[1], adj_width, adj_count)
-        if adj_uvs:
-            wp.atomic_add(adj_uvs, footprint, sample, wp.vec2(adj_u, adj_v))
-        if adj_probes:
-            if reach == 0:
-                adj_line[3] = 0.0
-            wp.atomic_add(adj_probes, footprint, sample, adj_line)
-    elif adj_barycentrics:
-        fragment = wp.min(instance, face_ids.shape[0] - 1)
-        face = face_ids[fragment, sample]
-        if face >= 0:
-            row = wp.min(instance, vertex_albedo.shape[0] - 1)
-            adj_weights = wp.vec3()
-            for corner in range(3):
-                adj_weights[corner] = wp.dot(vertex_albedo[row, faces[face][corner]], adj_color)
-            wp.atomic_add(adj_barycentrics, fragment, sample, adj_weights)
+    for sample in range(thread * run, (thread + 1) * run):
+        texture = texture_ids[footprint, sample]
+        adj_color = adj_albedo[instance, sample]
+        if texture >= 0:
+            of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
+            line = probes[footprint, sample]
+            count = line[3]
+            level, coarse_part = _level_of(line[2], level_counts[texture])
+            reach = _reach(count)
+            adj_u = float(0.0)
+            adj_v = float(0.0)
+            adj_line = wp.vec4()
+            for probe in range(-reach, reach + 1):
+                u = uvs[footprint, sample][0] + float(probe) * line[0]
+                v = uvs[footprint, sample][1] + float(probe) * line[1]
+                weight = _weight(probe, count)
+                slopes = _slopes(of_instance, levels[texture, level], u, v, adj_color)
+                adj_width = float(0.0)
+                if coarse_part > 0.0:
+                    coarse = _slopes(of_instance, levels[texture, level + 1], u, v, adj_color)
+                    adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
+                    slopes += coarse_part * (coarse - slopes)
+                # as the line grows, the outermost probes gain half a width each, and all share a longer line
+                adj_count = -weight * slopes[2] / count
+                if wp.abs(probe) == reach:
+                    adj_count += 0.5 * slopes[2] / count
+                adj_u += weight * slopes[0]
+                adj_v += weight * slopes[1]
+                along = float(probe) * weight
+                adj_line += wp.vec4(along * slopes[0], along * slopes[1], adj_width, adj_count)
+            if adj_uvs:
+                wp.atomic_add(adj_uvs, footprint, sample, wp.vec2(adj_u, adj_v))
+            if adj_probes:
+                if reach == 0:
+                    adj_line[3] = 0.0
+                wp.atomic_add(adj_probes, footprint, sample, adj_line)
+        elif adj_barycentrics:
+            fragment = wp.min(instance, face_ids.shape[0] - 1)
+            face = face_ids[fragment, sample]
+            if face >= 0:
+                row = wp.min(instance, vertex_albedo.shape[0] - 1)
+                adj_weights = wp.vec3()
+                for corner in range(3):
+                    adj_weights[corner] = wp.dot(vertex_albedo[row, faces[face][corner]], adj_color)
+                wp.atomic_add(adj_barycentrics, fragment, sample, adj_weights)
 
 
 def sample_albedo(
@@ -750,17 +766,20 @@ def sample_albedo(
         requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
     )
     face_ids, barycentrics = rows(fragments.face_ids), rows(fragments.barycentrics)
-    seen = [*_seen(textures, footprints), batch_count]
-    _launch(_sample, albedo.size, [face_ids, barycentrics, faces, *reflecting, *seen], [albedo.flatten()])
+    _, height, width = albedo.shape
+    run = run_length(albedo.device, width)
+    dim = batch_count, height * width // run
+    seen = [*_seen(textures, footprints), run]
+    _launch(_sample, dim, [face_ids, barycentrics, faces, *reflecting, *seen], [rows(albedo)])
 
     def adjoint() -> None:
-        adj_albedo = albedo.grad.flatten()
+        adj_albedo = rows(albedo.grad)
         if any(array.requires_grad for array in reflecting):
             inputs = [face_ids, barycentrics, faces, *seen, adj_albedo]
-            _launch(_sample_adjoint_by_albedo, albedo.size, inputs, [array.grad for array in reflecting])
+            _launch(_sample_adjoint_by_albedo, dim, inputs, [array.grad for array in reflecting])
         if any(array.requires_grad for array in placed):
             inputs = [face_ids, faces, *reflecting, *seen, adj_albedo]
-            _launch(_sample_adjoint_by_place, albedo.size, inputs, [rows(array.grad) for array in placed])
+            _launch(_sample_adjoint_by_place, dim, inputs, [rows(array.grad) for array in placed])
 
     record_adjoint(adjoint, [*reflecting, *placed, albedo])
     return albedo
@@ -793,12 +812,14 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     layout = _layout(textures.sizes, str(device))
     batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
     weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
-    ones = wp.ones(batch_count * footprints.uvs.size // footprints.uvs.shape[0], dtype=wp.vec3, device=device)
-    inputs = [None, None, None, *_seen(textures, footprints), batch_count, ones]
-    _launch(_sample_adjoint_by_albedo, ones.size, inputs, [None, weights])
+    _, height, width = footprints.uvs.shape
+    run = run_length(footprints.uvs.device, width)
+    ones = wp.ones((batch_count, height * width), dtype=wp.vec3, device=device)
+    inputs = [None, None, None, *_seen(textures, footprints), run, ones]
+    _launch(_sample_adjoint_by_albedo, (batch_count, height * width // run), inputs, [None, weights])
     images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
     for number, image in enumerate(images):
-        _add_to_image(image, weights, layout, number)
+        _add_to_image(image, weights, layout, number, footprints.coarsest_level())
     return [image.numpy()[..., 0].copy() for image in images]
 
 

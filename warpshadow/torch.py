@@ -15,7 +15,7 @@ from warpshadow import check, deform
 from warpshadow.assembly import Geometry
 from warpshadow.basis import Basis
 from warpshadow.batch import common_batch
-from warpshadow.camera import compose_clip_matrices
+from warpshadow.camera import Camera, compose_clip_matrices
 from warpshadow.deform import Poses, Vec6
 from warpshadow.light import EnvironmentMap
 from warpshadow.renderer import Renderer
@@ -32,6 +32,8 @@ class TorchRenderer(torch.nn.Module):
 
     Args:
         scene: The scene; what a call is not given is taken from it.
+        cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
+            batch.
         device: Device of the tensors and the kernels.
         basis: What free light is expressed in: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for what the
             scene's method computes in.
@@ -45,12 +47,13 @@ class TorchRenderer(torch.nn.Module):
         self,
         scene: Scene,
         *,
+        cameras: Sequence[Camera] | None = None,
         device: str | torch.device = "cpu",
         basis: Basis | None = None,
         progress: bool = False,
     ):
         super().__init__()
-        self.renderer = Renderer(scene, device=str(device), basis=basis, progress=progress)
+        self.renderer = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
         self.device = torch.device(wp.device_to_torch(self.renderer.device))
 
     def forward(
@@ -74,11 +77,11 @@ class TorchRenderer(torch.nn.Module):
                 needs uvs; None for what the scene has.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
                 still.
-            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices`; by default the scene's.
+            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices`; by default the renderer's own.
 
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
-            where an argument has a batch dimension; the background is 0.
+            where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
@@ -86,7 +89,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: light, albedo, textures, geometry, clip_matrices; the README's table says how exactly.
         """
         renderer, bodies = self.renderer, self.renderer.scene.bodies
-        arguments = _Arguments(self.device)
+        arguments = _Arguments(self.device, has_batch=renderer.has_camera_batch and clip_matrices is None)
         if isinstance(light, torch.Tensor):
             arguments.add("light", light, wp.vec3, (renderer.basis.size,))
         for name, tensor, dtype in zip(Geometry._fields, geometry or (), _GEOMETRY_DTYPES, strict=False):
@@ -211,7 +214,7 @@ class TorchRenderer(torch.nn.Module):
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:
-        """Compose cameras for :meth:`forward`, which have the size and the near plane of the scene's.
+        """Compose cameras for :meth:`forward`, which have the size and the near plane of the renderer's own.
 
         Args:
             rotations: R, world to camera, [3, 3] or [batch, 3, 3].
@@ -223,7 +226,7 @@ class TorchRenderer(torch.nn.Module):
 
         Differentiable: all, so focal lengths and the principal point, too.
         """
-        camera = self.renderer.scene.camera
+        camera = self.renderer.cameras[0]
         arguments = _Arguments(self.device)
         arguments.add("intrinsics", intrinsics, wp.mat33, ())
         arguments.add("rotations", rotations, wp.mat33, ())
@@ -260,12 +263,12 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
 class _Arguments:
     """Tensors that become arguments of a function of Warp arrays, checked and with a leading batch dimension."""
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: torch.device, *, has_batch: bool = False):
         self.device = device
+        self._has_batch = has_batch  # of results
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
-        self._has_batch = False
 
     def add(self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...]) -> None:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
@@ -283,7 +286,7 @@ class _Arguments:
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
     def apply(self, function: Callable) -> Any:
-        """Apply a function of arrays to them; the results have a batch dimension if one of the tensors had."""
+        """Apply a function of arrays to them; results lose a batch dimension that no tensor had."""
         results = apply(function, *self.tensors, dtypes=self.dtypes, device=self.device)
         if self._has_batch:
             return results
