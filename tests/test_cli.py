@@ -2,8 +2,10 @@
 
 import functools
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from warpshadow.image import auto_exposure
 
 # Half a step of 8-bit sRGB where it is steepest.
 EIGHT_BITS = 0.006
-COMMANDS = ("render", "spheres", "envmap", "warmup")
+COMMANDS = ("render", "fit", "spheres", "envmap", "warmup")
 
 SCENE = """
 [camera]
@@ -162,9 +164,9 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", ""])
-@pytest.mark.parametrize("command", ["render", "warmup"])
+@pytest.mark.parametrize("command", ["render", "fit", "warmup"])
 def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
-    arguments = (scene, "-o", tmp_path / "out.exr") if command == "render" else ()
+    arguments = () if command == "warmup" else (scene, "-o", tmp_path / "out.exr")
     fails(command, *arguments, "--device", name, parts=(f"device: got '{name}'", "expected one of", "cpu"))
 
 
@@ -183,6 +185,206 @@ def test_a_wrong_option_is_status_2_with_its_name(arguments, part):
     result = run(*arguments)
     assert result.exit_code == 2
     assert part in re.sub(r"\x1b\[[0-9;]*m", "", result.output)
+
+
+# ---------------------------------------------------------------------------------------------- fit
+
+COLOR = (0.7, 0.4, 0.2)
+FIT = """
+scene = "scene.toml"
+tolerance = 0
+[[target]]
+image = "photo.exr"
+[[free.albedo]]
+body = 0
+[still]
+method = "directional"
+directions = 32
+[[stage]]
+iterations = 60
+learning_rate = 0.05
+"""
+# From an image without noise; and from one of 8 bits, whose brightest hundredth saturates.
+RECOVERED = 2e-3
+RECOVERED_FROM_8_BITS = 0.02
+
+
+@pytest.fixture
+def fit_file(scene, tmp_path):
+    """A fit that looks for the color of a ball, of which there is a rendered EXR and a PNG."""
+    colored = f"blockers = 0\nalbedo = {list(COLOR)}"
+    (tmp_path / "true.toml").write_text(SCENE.replace("blockers = 0", colored))
+    image = ws.render(ws.load_scene(tmp_path / "true.toml"))
+    ws.write_image(tmp_path / "photo.exr", image)
+    ws.write_image(tmp_path / "photo.png", image[..., :3] / np.percentile(image[..., :3], 99))
+    ws.write_image(tmp_path / "mask.png", image[..., 3:])
+    path = tmp_path / "fit.toml"
+    path.write_text(FIT)
+    return path
+
+
+def found(folder):
+    return ws.load_scene(folder / "scene.toml")
+
+
+def parameters(folder):
+    with np.load(folder / "parameters.npz") as values:
+        return {name: values[name] for name in values}
+
+
+def assert_same(got, expected):
+    assert got.keys() == expected.keys()
+    for name, values in got.items():
+        np.testing.assert_array_equal(values, expected[name])
+
+
+def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_file, tmp_path):
+    folder = tmp_path / "out"
+    result = run("fit", fit_file, "-o", folder)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"^(finished|converged) after \d+ iterations, [\d.]+ ms each$", result.stdout, re.M)
+    assert re.search(r"^loss \d\S+ before, \d\S+ after$", result.stdout, re.M)
+    assert "60/60" in result.stderr  # the progress bar
+    (files,) = re.findall(rf"^{folder}: (.*)$", result.stdout, re.M)
+    written = {path.name for path in folder.iterdir()}
+    assert set(files.split(", ")) == written - {"checkpoint", "checkpoint.previous", "preview.png"}
+    np.testing.assert_allclose(found(folder).bodies[0].albedo, COLOR, atol=RECOVERED)
+
+
+def test_what_a_fit_writes_can_be_rendered(fit_file, tmp_path):
+    run("fit", fit_file, "-o", tmp_path / "out")
+    result = run("render", tmp_path / "out" / "scene.toml", "-o", tmp_path / "again.exr")
+    assert result.exit_code == 0, result.output
+    again, target = (ws.read_image(tmp_path / name) for name in ("again.exr", "photo.exr"))
+    assert np.abs(again - target).max() < 2 * RECOVERED * target.max()
+
+
+def test_fit_recovers_a_color_and_the_exposure_from_a_picture_of_8_bits_under_a_mask(fit_file, tmp_path):
+    """Only what stands still in known light has a known color: the ground is known."""
+    lines = 'image = "photo.png"\nmask = "mask.png"'
+    text = FIT.replace('image = "photo.exr"', lines).replace("[[free", "[free]\nexposure = true\n[[free")
+    fit_file.write_text(text.replace("iterations = 60", "iterations = 200"))
+    result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    np.testing.assert_allclose(found(tmp_path / "out").bodies[0].albedo, COLOR, atol=RECOVERED_FROM_8_BITS)
+
+
+def test_a_fit_that_is_done_is_not_done_again(fit_file, tmp_path):
+    first = run("fit", fit_file, "-o", tmp_path / "out")
+    values = parameters(tmp_path / "out")
+    second = run("fit", fit_file, "-o", tmp_path / "out")
+    assert "going on from" not in first.stdout
+    assert f"going on from {tmp_path / 'out' / 'checkpoint'}" in second.stdout
+    assert second.exit_code == 0 and " after 60 iterations\n" in second.stdout
+    assert_same(parameters(tmp_path / "out"), values)
+
+
+def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_file, tmp_path, monkeypatch):
+    from warpshadow.inverse import checkpoint
+
+    save, saved = checkpoint.save, []
+
+    def save_twice_and_interrupt(path, state):
+        save(path, state)
+        saved.append(path)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+
+    run("fit", fit_file, "-o", tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "save", save_twice_and_interrupt)
+        result = run("fit", fit_file, "-o", tmp_path / "out", "--checkpoint-seconds", 0, "--no-preview")
+    assert result.exit_code == 130
+    last = result.stderr.strip().splitlines()[-1]
+    assert last == f"interrupted; the same command goes on from {tmp_path / 'out' / 'checkpoint'}"
+    assert not (tmp_path / "out" / "scene.toml").exists()
+    assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
+    assert_same(parameters(tmp_path / "out"), parameters(tmp_path / "whole"))
+
+
+def test_a_fit_that_is_interrupted_as_it_writes_its_results_writes_them_the_next_time(fit_file, tmp_path, monkeypatch):
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("warpshadow.inverse.report.write_scene", interrupt)
+        result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 130 and "the same command goes on" in result.stderr
+    assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
+    np.testing.assert_allclose(found(tmp_path / "out").bodies[0].albedo, COLOR, atol=RECOVERED)
+
+
+def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_path, monkeypatch):
+    def interrupt(*args, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("warpshadow.fit_file.fit", interrupt)
+        result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 130 and "interrupted before a checkpoint" in result.stderr
+    assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
+
+
+def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_path):
+    fit_file.write_text(FIT.replace("iterations = 60", "iterations = 400"))
+    folder = tmp_path / "out"
+    command = [sys.executable, "-m", "warpshadow", "fit", str(fit_file), "-o", str(folder), "--checkpoint-seconds", "0"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120
+        while not (folder / "checkpoint.previous").exists() and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL, "the fit was over before it could be killed"
+    assert not (folder / "scene.toml").exists()
+    assert "going on" in run("fit", fit_file, "-o", folder).stdout
+    run("fit", fit_file, "-o", tmp_path / "whole")
+    assert_same(parameters(folder), parameters(tmp_path / "whole"))
+
+
+def test_a_fit_that_diverges_is_status_3_and_keeps_what_it_had(fit_file, tmp_path):
+    """Light so strong, after one step, that nothing can be computed with it."""
+    text = FIT.replace("[[free.albedo]]\nbody = 0", "[free]\nlight = {order = 2}").replace("0.05", "1e30")
+    fit_file.write_text(text + '[optimizer]\nname = "sgd"\n')
+    for _ in range(2):  # when it is run again, too
+        result = run("fit", fit_file, "-o", tmp_path / "out")
+        assert result.exit_code == 3, result.output
+        assert "Traceback" not in result.output and "diverged after " in result.stdout
+        last = result.stderr.strip().splitlines()[-1]
+        assert last.startswith("error: ") and last.endswith(f"{tmp_path / 'out'} has the best values before that")
+    assert np.isfinite(found(tmp_path / "out").light).all()
+    assert (tmp_path / "out" / "after.png").exists()
+
+
+def test_a_fit_writes_only_into_a_folder_of_its_own(fit_file, tmp_path):
+    """Least of all over the scene that it starts from."""
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    fails("fit", fit_file, "-o", tmp_path, parts=(str(tmp_path), "expected a new one or that of this fit"))
+    fails("fit", fit_file, "-o", tmp_path / "no" / "out", parts=("no: no such folder",))
+    fails("fit", fit_file, "-o", tmp_path / "sky.exr", parts=("sky.exr: got a file, expected a folder",))
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_another_fit_is_not_gone_on_with(fit_file, tmp_path):
+    run("fit", fit_file, "-o", tmp_path / "out")
+    fit_file.write_text(FIT.replace("0.05", "0.04"))
+    result = run("fit", fit_file, "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "checkpoint: got one of another problem" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (("iterations", "iteration"), ["fit.toml: [[stage]] number 1", "did you mean 'iterations'"]),
+        (("photo.exr", "no.exr"), ["fit.toml: [[target]] number 1", "no.exr"]),
+        (("body = 0", "body = 5"), ["fit.toml: [[free.albedo]] number 1", "body: got 5"]),
+    ],
+)
+def test_a_mistake_in_a_fit_file_is_one_line_and_leaves_no_folder(fit_file, tmp_path, change, parts):
+    fit_file.write_text(FIT.replace(*change))
+    fails("fit", fit_file, "-o", tmp_path / "out", parts=parts)
+    assert not (tmp_path / "out").exists()
 
 
 # ---------------------------------------------------------------------------------------------- the others

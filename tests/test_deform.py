@@ -214,8 +214,9 @@ def test_gradients_of_a_deformation_are_those_of_the_twin(graph, device, verifie
     def twin(matrices, translations):
         offset = rest[:, None] - centers[nodes]
         moved = np.einsum("bpkij,pkj->bpki", matrices[:, nodes], offset) + centers[nodes] + translations[:, nodes]
-        edge = centers[neighbors] - centers[:, None]
-        gap = np.einsum("bnij,nkj->bnki", matrices, edge) - edge + translations[:, :, None] - translations[:, neighbors]
+        node, other = neighbors.T
+        edge = centers[other] - centers[node]
+        gap = np.einsum("bkij,kj->bki", matrices[:, node], edge) - edge + translations[:, node] - translations[:, other]
         shear = np.einsum("bnji,bnjk->bnik", matrices, matrices) - np.eye(3)
         points = np.sum(weights * np.einsum("pk,bpki->bpi", shares, moved))
         return points + np.sum(gap**2) + 0.5 * np.sum(shear**2) + np.sum((centers + translations) ** 2)
@@ -232,6 +233,16 @@ def test_gradients_of_a_deformation_are_those_of_the_twin(graph, device, verifie
     for k, array in enumerate(arrays):
         expected = differences(lambda v, k=k: twin(*values[:k], v, *values[k + 1 :]), values[k])
         assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+def test_neighbors_are_pairs_both_ways_of_the_nearest_and_of_those_that_carry_the_same_points():
+    line = np.linspace(0, 1, 9)[:, None] * [[1.0, 0, 0]]
+    near = {tuple(pair) for pair in deform.DeformationGraph.bind(line[:1], line, count=1).neighbors.numpy()}
+    assert near == {(other, node) for node, other in near} and {(0, 1), (1, 2), (7, 8)} <= near
+    assert all(abs(node - other) == 1 for node, other in near)
+    far = np.array([[-5.0, 0, 0], [-4.9, 0, 0], [5.0, 0, 0], [5.1, 0, 0]])  # two pairs, joined by what lies between
+    between = deform.DeformationGraph.bind(np.zeros((20, 3)) + [0.05, 0, 0], far, count=2).neighbors.numpy()
+    assert [1, 2] in between.tolist()
 
 
 def test_too_few_nodes_are_refused():

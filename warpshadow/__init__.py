@@ -9,7 +9,7 @@ from warpshadow.light import EnvironmentMap, synthetic_sky
 from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane
 from warpshadow.renderer import Renderer, render
 from warpshadow.scene import Body, Scene, Visibility
-from warpshadow.scene_file import SceneError, load_scene
+from warpshadow.scene_file import SceneError, load_scene, write_scene
 from warpshadow.spheres import Spheres, fit_spheres
 
 __version__ = "0.1.0"
@@ -38,6 +38,7 @@ __all__ = [
     "render",
     "synthetic_sky",
     "write_image",
+    "write_scene",
 ]
 
 

@@ -163,7 +163,7 @@ class Camera:
         """The same view on an image ``factor`` times as wide and high (supersampling: 2, 3, ...)."""
         factor = _positive("factor", factor)
         width, height = self.width * factor, self.height * factor
-        if width != round(width) or height != round(height):
+        if max(abs(width - round(width)), abs(height - round(height))) > 1e-6:  # a third of 384, in floating point
             raise ValueError(
                 f"factor: got {factor}, which makes {self.width} x {self.height} pixels {width} x {height}; "
                 "expected whole numbers"

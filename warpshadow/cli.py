@@ -1,7 +1,8 @@
-"""The command line: render a scene, fit spheres to a mesh, look into an environment map, compile ahead."""
+"""The command line: render a scene, explain images, fit spheres to a mesh, look into a light, compile ahead."""
 
 import contextlib
 import dataclasses
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -20,6 +21,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Soft shadows on meshes under environment light, differentiable, on CPU and CUDA.",
 )
+
+# Exit statuses beside 0, 1 (a mistake in what was given) and 2 (in how).
+DIVERGED = 3
+INTERRUPTED = 130
+
+# Files in the folder of a fit, beside its results.
+_CHECKPOINT = "checkpoint"
+_PREVIEW = "preview.png"
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
@@ -102,6 +111,83 @@ def _device(name: str) -> wp.Device:
         wp.init()
         known = ", ".join(device.alias for device in wp.get_devices())
         raise ValueError(f"device: got {name!r}, expected one of {known}") from error
+
+
+@app.command()
+def fit(
+    file: Annotated[Path, typer.Argument(help="Fit file, TOML; the README lists its keys.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Folder for the results, and for the checkpoint that a fit goes on from."),
+    ],
+    preview: Annotated[
+        bool, typer.Option(help="Show target, image and difference in FOLDER/preview.png while the fit runs.")
+    ] = True,
+    checkpoint_seconds: Annotated[float, typer.Option(help="Time between checkpoints.", min=0.0)] = 10.0,
+    device: Device = "cpu",
+) -> None:
+    """Explain images by what a scene leaves free; run again, it goes on where it was interrupted.
+
+    The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
+    became NaN or Inf, and the folder has the best values before that.
+    """
+    from warpshadow.fit_file import load_fit
+    from warpshadow.inverse.report import Report
+
+    with _clear_errors(), _resumable(output):
+        where = _device(device)
+        has_begun = _check_folder(output)
+        loaded = load_fit(file)
+        output.mkdir(exist_ok=True)
+        if has_begun:
+            typer.echo(f"going on from {output / _CHECKPOINT}")
+        result = loaded.run(
+            device=str(where),
+            checkpoint=output / _CHECKPOINT,
+            checkpoint_seconds=checkpoint_seconds,
+            preview=output / _PREVIEW if preview else None,
+            progress=True,
+        )
+        report = Report(result)
+        has_diverged = result.reason not in ("converged", "finished")
+        ending = "diverged" if has_diverged else result.reason
+        pace = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
+        typer.echo(f"{ending} after {sum(map(len, result.losses))} iterations{pace}")
+        typer.echo(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after")
+        typer.echo(f"{output}: {', '.join(path.name for path in report.write(output))}")
+    if has_diverged:
+        typer.secho(f"error: {result.reason}; {output} has the best values before that", fg="red", err=True)
+        raise typer.Exit(DIVERGED)
+
+
+@contextlib.contextmanager
+def _resumable(folder: Path) -> Iterator[None]:
+    """Say how a fit goes on when the user interrupts it."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        is_kept = _has_checkpoint(folder)
+        kept = f"; the same command goes on from {folder / _CHECKPOINT}" if is_kept else " before a checkpoint"
+        typer.secho(f"interrupted{kept}", fg="yellow", err=True)
+        raise typer.Exit(INTERRUPTED) from error
+
+
+def _check_folder(path: Path) -> bool:
+    """Find out before the work whether a folder may be written into; whether it has a fit to go on with."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: no such folder")
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"{path}: got a file, expected a folder")
+    if not path.is_dir() or _has_checkpoint(path):
+        return path.is_dir()
+    others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != _PREVIEW)
+    if others:
+        raise FileExistsError(f"{path}: got a folder with {others[0]} in it, expected a new one or that of this fit")
+    return False
+
+
+def _has_checkpoint(folder: Path) -> bool:
+    return any(folder.glob(f"{_CHECKPOINT}*"))
 
 
 @app.command()

@@ -3,6 +3,7 @@
 Arrays at rest have no batch dimension; what moves has one: an instance for every pose.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ PARALLEL = 1.0e-6
 """Columns at a smaller angle [radians] are parallel: what is between them is rounding."""
 
 _LARGEST_POSE = 1.0e12  # a product of scale, rotation and position is a float32
+_SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
 _LARGEST_NODE = 1.0e9  # so is the fourth power of a matrix, in the energies
 
 # ---------------------------------------------------------------------------------------------- rotations
@@ -288,15 +290,16 @@ def _move_nodes(
 def _sum_rigidity(
     # in
     node_positions: wp.array(dtype=wp.vec3),
-    neighbors: wp.array2d(dtype=wp.int32),
+    neighbors: wp.array(dtype=wp.vec2i),
     matrices: wp.array2d(dtype=wp.mat33),
     translations: wp.array2d(dtype=wp.vec3),
     # out
     energy: wp.array(dtype=wp.float32),
 ):
     """A thread owns a node and one of its neighbors: where the node would take it, against where it goes."""
-    batch, node, k = wp.tid()
-    other = neighbors[node, k]
+    batch, pair = wp.tid()
+    node = neighbors[pair][0]
+    other = neighbors[pair][1]
     edge = node_positions[other] - node_positions[node]
     gap = matrices[batch, node] * edge - edge + translations[batch, node] - translations[batch, other]
     wp.atomic_add(energy, batch, wp.dot(gap, gap))
@@ -322,7 +325,7 @@ class DeformationGraph:
 
     Args:
         node_positions: Nodes at rest [scene units], vec3 of shape [node].
-        neighbors: The nodes next to each node, int32 of shape [node, neighbor].
+        neighbors: Pairs of nodes next to each other, each pair both ways, vec2i of shape [pair].
         rest: Points at rest [scene units], vec3 of shape [point].
         nodes: The nodes that carry each point, int32 of shape [point, k].
         weights: Their shares, positive with sum 1, float32 of shape [point, k].
@@ -343,7 +346,8 @@ class DeformationGraph:
         Args:
             points: Vertices at rest [scene units], shape [point, 3].
             nodes: Node positions, such as the centers of spheres, shape [node, 3].
-            count: Nodes that carry a point, and neighbors of a node; d_max is the distance of the next one.
+            count: Nodes that carry a point; d_max is the distance of the next one. Nodes are neighbors where one is
+                among the ``count`` nearest to the other, or where they carry the same points.
             device: Where the graph lives.
 
         Raises:
@@ -362,13 +366,20 @@ class DeformationGraph:
         reach = np.maximum(distances[:, -1:], 1e-30)
         weights = (1 - distances[:, :-1] / reach) ** 2 + 1e-9  # a point as far from all of them is carried by all
         weights /= weights.sum(axis=1, keepdims=True)
-        _, neighbors = tree.query(nodes, k=count + 1)
-        others = np.stack([row[row != node][:count] for node, row in enumerate(neighbors)])
+        nearest = nearest[:, :-1]
+        shared = np.zeros((len(nodes), len(nodes)))
+        for i, j in itertools.product(range(count), repeat=2):
+            np.add.at(shared, (nearest[:, i], nearest[:, j]), np.sqrt(weights[:, i] * weights[:, j]))
+        are_neighbors = shared > _SHARED * len(points) / len(nodes)
+        _, others = tree.query(nodes, k=count + 1)
+        are_neighbors[np.arange(len(nodes))[:, None], others] = True
+        are_neighbors |= are_neighbors.T
+        np.fill_diagonal(are_neighbors, False)
         return DeformationGraph(
             wp.array(nodes, dtype=wp.vec3, device=device),
-            wp.array(others.astype(np.int32), device=device),
+            wp.array(np.argwhere(are_neighbors), dtype=wp.vec2i, device=device),
             wp.array(points, dtype=wp.vec3, device=device),
-            wp.array(nearest[:, :-1].astype(np.int32), device=device),
+            wp.array(nearest.astype(np.int32), device=device),
             wp.array(weights.astype(np.float32), device=device),
         )
 
@@ -404,7 +415,7 @@ class DeformationGraph:
         """
         self._check(matrices, translations)
         inputs = [self.node_positions, self.neighbors, matrices, translations]
-        return _launch(_sum_rigidity, (matrices.shape[0], *self.neighbors.shape), wp.float32, inputs, is_sum=True)
+        return _launch(_sum_rigidity, (matrices.shape[0], self.neighbors.shape[0]), wp.float32, inputs, is_sum=True)
 
     def shear(self, matrices: wp.array) -> wp.array:
         """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].

@@ -26,7 +26,7 @@ from warpshadow.reference import sample_map, trace_shading, trace_transfer
 from warpshadow.scene import Scene
 from warpshadow.shading import shade
 from warpshadow.silhouette import Silhouettes, find_contrasts, find_silhouettes, smooth_silhouettes
-from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo
+from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo, seen_texels
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
@@ -402,6 +402,25 @@ class Renderer:
             if is_static:
                 self._kept_footprints = {sizes: (footprints, footprints.coarsest_level())}
         return sample_albedo(view.fragments, faces, vertex_albedo, pyramids, footprints)
+
+    def seen_texels(self, number: int) -> np.ndarray:
+        """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
+
+        Args:
+            number: The body, from 0; it needs a texture.
+
+        Returns:
+            Float32 of shape [height, width]: 0 where no sample sees the texel; see
+            :func:`warpshadow.texture.seen_texels`.
+
+        Raises:
+            ValueError: for a body without a texture.
+        """
+        has_texture = [image is not None for image in self._body_textures]
+        check.choice("number", number, [body for body, has in enumerate(has_texture) if has])
+        sizes = tuple(None if image is None else image.shape[1:] for image in self._body_textures)
+        footprints = self._find_footprints(self.scene_view, self._scene_pyramids, sizes)
+        return seen_texels(self._scene_pyramids, footprints)[sum(has_texture[:number])].sum(axis=0)
 
     def _join(self, colors: list[wp.array]) -> wp.array:
         """Reflectance of all vertices."""

@@ -1,24 +1,27 @@
-"""Scene files: TOML, checked key by key (README.md lists the keys)."""
+"""Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
-import functools
-import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from warpshadow import check, sh
+from warpshadow import check, sh, tables
 from warpshadow.camera import Camera
-from warpshadow.image import read_image
+from warpshadow.image import read_image, write_image
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import Mesh, icosphere, load_mesh, plane
 from warpshadow.scene import Body, Scene, Visibility
+from warpshadow.spheres import Spheres
+from warpshadow.tables import Table
 
-_CAMERA_KEYS = ("eye", "target", "up", "fov_y", "size", "near", "supersampling")
+_VIEW_KEYS = ("eye", "target", "up", "fov_y")
+_PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
+_CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale")
 _VISIBILITY_KEYS = ("method", "directions", "softness", "order", "log", "base", "samples")
-_PLACE_KEYS = ("albedo", "texture", "blockers", "rotation", "translation", "scale", "receivers")
+_PLACE_KEYS = ("albedo", "texture", "blockers", "spheres", "rotation", "translation", "scale", "receivers")
 _PRIMITIVES: dict[str, tuple[Callable[..., Mesh], tuple[str, ...]]] = {
     "plane": (plane, ("size", "segments")),
     "icosphere": (icosphere, ("radius", "subdivisions")),
@@ -39,154 +42,263 @@ def load_scene(path: str | Path) -> Scene:
         SceneError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
         FileNotFoundError: for a file that is not there.
     """
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
-
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such scene file")
-    try:
-        with path.open("rb") as file:
-            tables = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not valid TOML: {error}") from error
+    with tables.located(str(path), SceneError):
+        return _scene(tables.read(path, "scene file"), path.parent)
 
-    def build(where: str, make: Callable[[], Any]) -> Any:
-        try:
-            return make()
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"{path}: {where}: {error}") from error
-        except (ValueError, TypeError) as error:
-            raise SceneError(f"{path}: {where}: {error}") from error
 
-    build("the scene", lambda: check.known_keys("table", tables, ("camera", "light", "visibility", "body")))
+def _scene(scene: Table, folder: Path) -> Scene:
+    with tables.located("the scene"):
+        check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
     for name in ("camera", "light", "body"):
-        if name not in tables:
-            raise SceneError(f"{path}: [{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
-    if not isinstance(tables["body"], list):
-        raise SceneError(f"{path}: [body]: expected [[body]], since a scene may have several")
-    for name in ("camera", "light", "visibility"):
-        build(f"[{name}]", functools.partial(_check_table, tables.get(name, {})))
-    bodies = tuple(
-        build(f"[[body]] number {number}", functools.partial(_body, table, path.parent))
-        for number, table in enumerate(tables["body"], start=1)
-    )
-    light = build("[light]", lambda: _light(tables["light"], path.parent))
-    camera = build("[camera]", lambda: _camera(tables["camera"]))
-    visibility = build("[visibility]", lambda: _visibility(tables.get("visibility", {})))
-    supersampling = tables["camera"].get("supersampling", Scene.supersampling)
-    return build("the scene", lambda: Scene(bodies, light, camera, visibility, supersampling))
+        if name not in scene:
+            raise ValueError(f"[{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
+    bodies = []
+    for where, table in tables.numbered(scene, "body"):
+        with tables.located(where):
+            bodies.append(_body(table, folder))
+    with tables.located("[light]"):
+        light = _light(scene["light"], folder)
+    with tables.located("[camera]"):
+        camera, supersampling = _camera(scene["camera"])
+    with tables.located("[visibility]"):
+        visibility = parse_visibility(scene.get("visibility", {}))
+    with tables.located("the scene"):
+        return Scene(tuple(bodies), light, camera, visibility, supersampling)
 
 
-def _camera(table: dict[str, Any]) -> Camera:
+def _camera(table: Table) -> tuple[Camera, int]:
+    tables.check_table(table)
+    check.known_keys("key", table, (*_CAMERA_KEYS, "supersampling"))
+    tables.check_integer(table, "supersampling")
+    camera = parse_camera({key: value for key, value in table.items() if key != "supersampling"})
+    return camera, table.get("supersampling", Scene.supersampling)
+
+
+def parse_camera(table: Table) -> Camera:
+    """A camera from its table: from where it looks at what, or by intrinsics and world-to-camera [R | t].
+
+    Raises:
+        ValueError: naming the key, what it got and what it accepts.
+    """
+    tables.check_table(table)
     check.known_keys("key", table, _CAMERA_KEYS)
+    tables.number(table, "near", 1.0)
+    tables.check_vector(table, "size", 2)
+    if any(key in table for key in _PINHOLE_KEYS):
+        return _pinhole(table)
     for key in ("eye", "target"):
         if key not in table:
             raise ValueError(f"{key}: missing, expected three numbers")
     for key in ("eye", "target", "up"):
-        _vector(table, key)
-    for key in ("fov_y", "near"):
-        _number(table, key, 1.0)
-    _integer(table, "supersampling")
-    _vector(table, "size", 2)
-    return Camera.look_at(**{key: value for key, value in table.items() if key != "supersampling"})
+        tables.check_vector(table, key)
+    tables.number(table, "fov_y", 1.0)
+    return Camera.look_at(**table)
 
 
-def _light(table: dict[str, Any], folder: Path) -> EnvironmentMap | np.ndarray:
+def _pinhole(table: Table) -> Camera:
+    mixed = next((key for key in _VIEW_KEYS if key in table), None)
+    if mixed is not None:
+        raise ValueError(
+            f"{mixed}: got it beside intrinsics, rotation or translation; "
+            f"expected either {', '.join(_VIEW_KEYS)} or {', '.join(_PINHOLE_KEYS)}"
+        )
+    accepted = dict(zip(_PINHOLE_KEYS, ("3 rows of 3 numbers", "3 rows of 3 numbers", "three numbers"), strict=True))
+    for key, expected in {**accepted, "size": "width and height"}.items():
+        if key not in table:
+            raise ValueError(f"{key}: missing, expected {expected}")
+    for key in ("intrinsics", "rotation"):
+        tables.rows(table, key, 3)
+    tables.check_vector(table, "translation")
+    width, height = table["size"]
+    placed = {key: value for key, value in table.items() if key != "size"}
+    return Camera(**placed, width=width, height=height)
+
+
+def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
+    tables.check_table(table)
     check.known_keys("key", table, _LIGHT_KEYS)
     if ("envmap" in table) == ("sh" in table):
         raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
-    rotation, scale = _number(table, "rotation", 0.0), _number(table, "scale", 1.0)
+    rotation, scale = tables.number(table, "rotation", 0.0), tables.number(table, "scale", 1.0)
     if scale < 0:
         raise ValueError(f"scale: got {scale!r}, expected a factor of 0 or more")
     if "envmap" in table:
-        light = EnvironmentMap.read(_file(table, "envmap", folder))
+        light = EnvironmentMap.read(tables.file(table, "envmap", folder))
         light = light.rotated(rotation) if rotation else light
         return light.scaled(scale) if scale != 1 else light
-    if not isinstance(table["sh"], list):
-        raise ValueError(f"sh: got {table['sh']!r}, expected [[r, g, b], …]")
-    coefficients = np.array([_vector({"sh": row}, "sh") for row in table["sh"]], np.float64).reshape(-1, 3)
-    angle = np.radians(rotation)
-    about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    return scale * sh.rotation_matrix(sh.order_of("sh", coefficients), about_y) @ coefficients
+    coefficients = np.array(tables.rows(table, "sh"), np.float64).reshape(-1, 3)
+    order = sh.order_of("sh", coefficients)
+    if rotation:
+        angle = np.radians(rotation)
+        about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        coefficients = sh.rotation_matrix(order, about_y) @ coefficients
+    return scale * coefficients
 
 
-def _visibility(table: dict[str, Any]) -> Visibility:
+def parse_visibility(table: Table) -> Visibility:
+    """How visibility is computed, from its table.
+
+    Raises:
+        ValueError: naming the key, what it got and what it accepts.
+    """
+    tables.check_table(table)
     check.known_keys("key", table, _VISIBILITY_KEYS)
     for key in ("directions", "order", "samples"):
-        _integer(table, key)
-    _number(table, "softness", 1.0)
+        tables.check_integer(table, key)
+    tables.number(table, "softness", 1.0)
     return Visibility(**table)
 
 
-def _body(table: dict[str, Any], folder: Path) -> Body:
-    _check_table(table)
+def _body(table: Table, folder: Path) -> Body:
+    tables.check_table(table)
     if ("mesh" in table) == ("primitive" in table):
         raise ValueError(f'expected either mesh = "FILE" or primitive = one of {", ".join(map(repr, _PRIMITIVES))}')
-    if "albedo" in table and "texture" in table:
-        raise ValueError("expected either albedo or texture")
-    if "primitive" in table:
-        check.choice("primitive", table["primitive"], _PRIMITIVES)
-        make, shape_keys = _PRIMITIVES[table["primitive"]]
-        check.known_keys("key", table, ("primitive", *shape_keys, *_PLACE_KEYS))
-        _number(table, "radius", 1.0)
-        for key in ("subdivisions", "segments"):
-            _integer(table, key, pair=key == "segments")
-        if isinstance(table.get("size"), list):
-            _vector(table, "size", 2)
-        else:
-            _number(table, "size", 1.0)
-        mesh = make(**{key: table[key] for key in shape_keys if key in table})
-    else:
-        check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
-        mesh = load_mesh(_file(table, "mesh", folder))
+    for one, other in (("albedo", "texture"), ("blockers", "spheres")):
+        if one in table and other in table:
+            raise ValueError(f"expected either {one} or {other}")
+    mesh = _primitive(table) if "primitive" in table else _mesh(table, folder)
     place = {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
-        pixels = read_image(_file(table, "texture", folder))
+        pixels = read_image(tables.file(table, "texture", folder))
         place["texture"] = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
-    for key in ("albedo", "rotation", "translation"):
-        _vector(table, key)
-    _integer(table, "blockers")
-    _number(table, "scale", 1.0)
+    if isinstance(place.get("albedo"), str):
+        place["albedo"] = _colors(table, folder)
+    else:
+        tables.check_vector(table, "albedo")
+    if "spheres" in place:
+        del place["spheres"]
+        place["blockers"] = _spheres(table, folder)
+    for key in ("rotation", "translation"):
+        tables.check_vector(table, key)
+    tables.check_integer(table, "blockers")
+    tables.number(table, "scale", 1.0)
     return Body(mesh, **place)
 
 
-def _check_table(table: object) -> None:
-    if not isinstance(table, dict):
-        raise ValueError(f"got {table!r}, expected a table of keys")
+def _primitive(table: Table) -> Mesh:
+    check.choice("primitive", table["primitive"], _PRIMITIVES)
+    make, shape_keys = _PRIMITIVES[table["primitive"]]
+    check.known_keys("key", table, ("primitive", *shape_keys, *_PLACE_KEYS))
+    tables.number(table, "radius", 1.0)
+    for key in ("subdivisions", "segments"):
+        tables.check_integer(table, key, pair=key == "segments")
+    if isinstance(table.get("size"), list):
+        tables.check_vector(table, "size", 2)
+    else:
+        tables.number(table, "size", 1.0)
+    return make(**{key: table[key] for key in shape_keys if key in table})
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+def _mesh(table: Table, folder: Path) -> Mesh:
+    check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
+    return load_mesh(tables.file(table, "mesh", folder))
 
 
-def _number(table: dict[str, Any], key: str, default: float) -> float:
-    value = table.get(key, default)
-    if not _is_number(value):
-        raise ValueError(f"{key}: got {value!r}, expected a finite number")
-    return value
+def _colors(table: Table, folder: Path) -> np.ndarray:
+    if not table["albedo"].endswith(".npy"):
+        raise ValueError(f"albedo: got {table['albedo']!r}, expected 3 finite numbers, or an .npy file of [vertex, 3]")
+    path = tables.file(table, "albedo", folder)
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"albedo: got {path} ({error}), expected an .npy file of [vertex, 3]") from error
 
 
-def _integer(table: dict[str, Any], key: str, *, pair: bool = False) -> None:
-    value = table.get(key, 1)
-    values = value if pair and isinstance(value, list) and len(value) == 2 else [value]
-    if any(isinstance(each, bool) or not isinstance(each, int) for each in values):
-        raise ValueError(f"{key}: got {value!r}, expected a whole number{' or two' if pair else ''}")
+def _spheres(table: Table, folder: Path) -> Spheres:
+    path = tables.file(table, "spheres", folder)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            centers, radii = arrays["centers"], arrays["radii"]
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"spheres: got {path} ({error}), expected an .npz file of centers and radii") from error
+    return Spheres(centers, radii)
 
 
-def _vector(table: dict[str, Any], key: str, count: int = 3) -> list[float]:
-    value = table.get(key, [0.0] * count)
-    if not (isinstance(value, list) and len(value) == count and all(map(_is_number, value))):
-        raise ValueError(f"{key}: got {value!r}, expected {count} finite numbers")
-    return value
+# ---------------------------------------------------------------------------------------------- writing
 
 
-def _file(table: dict[str, Any], key: str, folder: Path) -> Path:
-    if not isinstance(table[key], str):
-        raise ValueError(f"{key}: got {table[key]!r}, expected a file name")
-    path = folder / table[key]
-    if not path.is_file():
-        raise FileNotFoundError(f"{key}: no such file: {path}")
-    return path
+def write_scene(scene: Scene, folder: str | Path) -> list[Path]:
+    """Write a scene file and all that it names; :func:`load_scene` reads back the same scene, bit for bit.
+
+    Args:
+        scene: The scene.
+        folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
+            body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex, and
+            where it has a texture body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.
+
+    Returns:
+        The files.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    bodies = []
+    for number, body in enumerate(scene.bodies):
+        table, files = _write_body(body, folder / f"body_{number}")
+        bodies.append(table)
+        written += files
+    if isinstance(scene.light, EnvironmentMap):
+        scene.light.write(folder / "light.exr")
+        written.append(folder / "light.exr")
+        light: Table = {"envmap": "light.exr"}
+    else:
+        light = {"sh": [_numbers(row) for row in scene.light]}
+    visibility = {key: getattr(scene.visibility, key) for key in _VISIBILITY_KEYS}
+    camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
+    path = folder / "scene.toml"
+    tables.write(path, {"camera": camera, "light": light, "visibility": visibility, "body": bodies})
+    return [path, *written]
+
+
+def camera_table(camera: Camera) -> Table:
+    """What a scene file says of a camera, without loss."""
+    return {
+        "intrinsics": camera.intrinsics.tolist(),
+        "rotation": camera.rotation.tolist(),
+        "translation": camera.translation.tolist(),
+        "size": [camera.width, camera.height],
+        "near": float(camera.near),
+    }
+
+
+def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
+    """Write what a body's table names, and make the table."""
+    mesh, arrays, colors, texture = (stem.with_suffix(suffix) for suffix in (".obj", ".npz", ".npy", ".exr"))
+    body.mesh.write(mesh)
+    table: Table = {"mesh": mesh.name}
+    written = [mesh]
+    if body.texture is not None:
+        write_image(texture, body.texture)
+        table["texture"] = texture.name
+        written += [texture, *_write_material(mesh, body.texture)]
+    elif np.ndim(body.albedo) == 1:
+        table["albedo"] = _numbers(body.albedo)
+    else:
+        np.save(colors, body.albedo)
+        table["albedo"] = colors.name
+        written.append(colors)
+    if not isinstance(body.blockers, Spheres):
+        table["blockers"] = body.blockers
+    elif not len(body.blockers):
+        table["blockers"] = 0
+    else:
+        np.savez(arrays, centers=body.blockers.centers, radii=body.blockers.radii)
+        table["spheres"] = arrays.name
+        written.append(arrays)
+    place = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
+    return table | place | {"receivers": body.receivers}, written
+
+
+def _write_material(mesh: Path, texture: np.ndarray) -> list[Path]:
+    """Let an OBJ file name its texture, as a PNG, which is what other programs draw."""
+    picture, material = mesh.with_suffix(".png"), mesh.with_suffix(".mtl")
+    write_image(picture, texture)
+    material.write_text(f"newmtl textured\nKd 1 1 1\nmap_Kd {picture.name}\n")
+    mesh.write_text(f"mtllib {material.name}\nusemtl textured\n{mesh.read_text()}")
+    return [picture, material]
+
+
+def _numbers(values: npt.ArrayLike) -> list[float]:
+    """The shortest numbers that read back as the same float32."""
+    return [float(str(value)) for value in np.asarray(values, np.float32)]

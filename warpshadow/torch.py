@@ -328,6 +328,7 @@ def apply(
 
     Differentiable: as the function is, once.
     """
+    wp.init()
     wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
     results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)
     return results if len(results) > 1 else results[0]

@@ -5,10 +5,12 @@ to a :class:`Result`, whose scene can be rendered, relit and written. Needs torc
 """
 
 from warpshadow.inverse.checkpoint import CheckpointError
-from warpshadow.inverse.descent import FitWarning, Result, Stage, fit
+from warpshadow.inverse.descent import FitWarning, Result, fit, short_adam
 from warpshadow.inverse.free import Albedo, CameraPose, Deformation, Exposure, Free, Light, Pose, Radii, Texture
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.report import write_result
+from warpshadow.inverse.stages import Stage, deformation_stages, pose_stages
 from warpshadow.inverse.target import Target
 
 __all__ = [
@@ -28,5 +30,9 @@ __all__ = [
     "Stage",
     "Target",
     "Texture",
+    "deformation_stages",
     "fit",
+    "pose_stages",
+    "short_adam",
+    "write_result",
 ]

@@ -37,7 +37,7 @@ def save(path: str | Path, state: dict[str, Any]) -> None:
             file.write(_MARK + hashlib.sha256(payload).digest() + payload)
             file.flush()
             os.fsync(file.fileno())
-        if path.exists():
+        if _payload(path) is not None:  # a damaged one does not take the place of the whole one before it
             os.replace(path, previous_path(path))
         os.replace(unfinished, path)
     finally:
@@ -51,8 +51,8 @@ def load(path: str | Path) -> dict[str, Any] | None:
         path: The file that :func:`save` was given.
 
     Returns:
-        The state; that of FILE.previous, with a warning, where the file is damaged, and without one where it is missing
-        because a process ended between two renames; None where there is neither.
+        The state, its tensors on the CPU; that of FILE.previous, with a warning, where the file is damaged, and without
+        one where it is missing because a process ended between two renames; None where there is neither.
 
     Raises:
         CheckpointError: where files are there but none is whole.
@@ -62,17 +62,25 @@ def load(path: str | Path) -> dict[str, Any] | None:
     for candidate in (path, previous_path(path)):
         if not candidate.exists():
             continue
-        content = candidate.read_bytes()
-        start = len(_MARK) + hashlib.sha256().digest_size
-        payload = content[start:]
-        if content[:start] == _MARK + hashlib.sha256(payload).digest():
+        payload = _payload(candidate)
+        if payload is not None:
             if faults:
                 warnings.warn(f"{faults[0]}; going on from {candidate.name}", stacklevel=2)
-            return torch.load(io.BytesIO(payload), weights_only=True)
+            return torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
         faults.append(f"{candidate}: not a whole checkpoint (truncated or damaged)")
     if faults:
         raise CheckpointError(f"{'; '.join(faults)}; remove what is damaged to start anew")
     return None
+
+
+def _payload(path: Path) -> bytes | None:
+    """What a file holds behind its mark and digest; None where it is not there or not whole."""
+    if not path.exists():
+        return None
+    content = path.read_bytes()
+    start = len(_MARK) + hashlib.sha256().digest_size
+    payload = content[start:]
+    return payload if content[:start] == _MARK + hashlib.sha256(payload).digest() else None
 
 
 def previous_path(path: Path) -> Path:

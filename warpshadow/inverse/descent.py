@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,57 +17,19 @@ import torch
 from warpshadow.camera import Camera
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.free import Values
+from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.target import stacked
-from warpshadow.inverse.world import Found, Setting, World, make_renderer
+from warpshadow.inverse.stages import Stage, check_stages
+from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene import Scene
 
 WINDOW = 25
 """Iterations over which a loss must fall for its stage to go on."""
 
-LAST_RATE = 0.05
-"""Share of its learning rate that a stage ends with."""
-
 
 class FitWarning(UserWarning):
     """A fit that ended before its time."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A part of a descent; coarse ones first.
-
-    Args:
-        iterations: At most so many.
-        learning_rate: At the start; it falls along a cosine to a twentieth.
-        scale: Size of the images as a part of the targets'.
-        softness: κ of directional visibility; by default the scene's. Softer shadows reach farther.
-        directions: Number of cells of directional visibility; by default the scene's.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-    """
-
-    iterations: int = 200
-    learning_rate: float = 0.02
-    scale: float = 1.0
-    softness: float | None = None
-    directions: int | None = None
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
-            raise ValueError(f"iterations: got {self.iterations!r}, expected a whole number from 1 on")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
-            raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
-        if not 0 < self.scale <= 1:
-            raise ValueError(f"scale: got {self.scale!r}, expected a part of the image, above 0 and up to 1")
-
-    def rate(self, iteration: int) -> float:
-        """Learning rate of an iteration."""
-        fall = 0.5 * (1 + math.cos(math.pi * iteration / self.iterations))
-        return self.learning_rate * (LAST_RATE + (1 - LAST_RATE) * fall)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +39,8 @@ class Result:
     Args:
         problem: What was to be solved.
         setting: Its scene at the start and its units.
-        values: Of what is free, by its name: those of the least loss in the last stage that had one.
-        losses: Loss of each iteration before its step, a list for each stage begun.
+        values: Of what is free, by its name: those of the least loss in the last stage.
+        losses: Loss of each iteration before its step, a list for each candidate of each stage.
         reason: Why the fit ended: "converged", "finished" (all iterations done), or what became non-finite.
         seconds: Median time of an iteration of the last stage [s].
     """
@@ -107,7 +69,7 @@ class Result:
 
     def images(self, values: Mapping[str, Values] | None = None) -> np.ndarray:
         """Images of the views, [view, height, width, 4], of the result or of other values."""
-        model = _Model(self.problem, self.setting, Stage())
+        model = Model(self.problem, self.setting, Stage())
         with torch.no_grad():
             return model.images(self.values if values is None else values).cpu().numpy()
 
@@ -116,56 +78,69 @@ class Result:
         return self.images(self.problem.start(self.setting))
 
 
-class _Model:
-    """Images of a problem as a function of its values, at a stage's size."""
-
-    def __init__(self, problem: Problem, setting: Setting, stage: Stage, progress: bool = False):
-        self.problem, self.setting = problem, setting
-        self.renderer, self.cameras = make_renderer(
-            setting, stage.scale, stage.softness, stage.directions, problem.basis, progress
-        )
-        self.targets, self.weights = stacked(problem.targets, stage.scale, setting.device)
-
-    def images(self, values: Mapping[str, Values]) -> torch.Tensor:
-        world = World(self.renderer, self.cameras)
-        for free in self.problem.free:
-            free.place(values[free.name], self.setting, world)
-        return world.images()
-
-    def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Loss with its regularizers, and the images."""
-        images = self.images(values)
-        total = self.problem.loss(images, self.targets, self.weights, self.setting.unit)
-        for free in self.problem.free:
-            energy = free.energy(values[free.name], self.setting)
-            total = total if energy is None else total + energy
-        return total, images
-
-
 class _Diverged(Exception):
     """Something became non-finite; the message names it."""
 
 
+class _Run(NamedTuple):
+    """A candidate's descent that has ended."""
+
+    loss: float
+    best: dict[str, Values]
+    failure: str | None  # what became non-finite
+
+
 class _Descent:
-    """A fit under way: all of its state is in ``state()``."""
+    """A fit under way: all of its state is in ``state()``.
 
-    def __init__(self, problem: Problem, stages: tuple[Stage, ...], optimizer: Callable, device: torch.device):
-        self.problem, self.stages, self.make_optimizer = problem, stages, optimizer
-        self.setting = problem.setting(device)
-        self.values = problem.start(self.setting)
-        self.best = _copied(self.values)
-        self.stage, self.iteration = 0, 0
-        self.losses: list[list[float]] = [[]]
+    A stage has candidates, and each of them a run: the descent itself.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        stages: tuple[Stage, ...],
+        optimizer: Callable[..., torch.optim.Optimizer],
+        tolerance: float,
+        seed: int,
+        device: torch.device,
+        progress: bool,
+    ):
+        self.problem, self.stages, self.make_optimizer, self.tolerance = problem, stages, optimizer, tolerance
+        self.seed = seed
+        self.setting = problem.setting(device, progress=progress)
+        self.stage = 0
+        self.candidates = self._widened([problem.start(self.setting)])
+        self.ended: list[_Run] = []
+        self.losses: list[list[float]] = []
         self.reason: str | None = None
-        self.is_new_stage = True
-        self._begin()
+        self._begin_stage()
+        # The optimizer is known by what it makes: a partial or a lambda has no name that says all of it.
+        made = f"{type(self.optimizer).__qualname__} {self.optimizer.state_dict()!r}"
+        self.fingerprint = f"{problem.fingerprint()} {stages!r} {tolerance!r} {seed} {made}"
 
-    def _begin(self) -> None:
-        """Set up the model and the optimizer of a stage."""
+    def _widened(self, best: list[dict[str, Values]]) -> list[dict[str, Values]]:
+        """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
+        count = self.stages[self.stage].candidates
+        generator = torch.Generator().manual_seed(self.seed)
+        scattered = [
+            {free.name: free.scattered(best[0][free.name], number, generator) for free in self.problem.free}
+            for number in range(count - len(best))
+        ]
+        return [*best[:count], *scattered]
+
+    def _begin_stage(self) -> None:
+        self.model = make_model(self.problem, self.setting, self.stages[self.stage])
+        self._begin_run(self.candidates[0])
+        self.losses.append([])
+
+    def _begin_run(self, values: Mapping[str, Values]) -> None:
+        """Set up the optimizer for a candidate."""
+        self.values, self.best = _copied(values), _copied(values)
+        self.failure: str | None = None
         self.tensors = {f"{name}.{key}": t for name, own in self.values.items() for key, t in own.items()}
         for tensor in self.tensors.values():
             tensor.requires_grad_()
-        self.model = _Model(self.problem, self.setting, self.stages[self.stage])
         self.optimizer = self.make_optimizer(list(self.tensors.values()), lr=self.stages[self.stage].learning_rate)
 
     # ---------------------------------------------------------------------------------------- state
@@ -173,11 +148,13 @@ class _Descent:
     def state(self) -> dict[str, Any]:
         """What a descent is continued from."""
         return {
-            "fingerprint": self.fingerprint(),
+            "fingerprint": self.fingerprint,
+            "stage": self.stage,
+            "candidates": self.candidates,
+            "ended": [tuple(run) for run in self.ended],
             "values": _copied(self.values),
             "best": self.best,
-            "stage": self.stage,
-            "iteration": self.iteration,
+            "failure": self.failure,
             "losses": self.losses,
             "reason": self.reason,
             "optimizer": self.optimizer.state_dict(),
@@ -185,60 +162,85 @@ class _Descent:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
-        if state["fingerprint"] != self.fingerprint():
+        if state.get("fingerprint") != self.fingerprint:
             raise checkpoints.CheckpointError(
-                "checkpoint: got one of another problem, other stages or another optimizer, expected one of this fit; "
-                "name another file or remove it"
+                "checkpoint: got one of another problem, other stages, another optimizer, tolerance or seed, "
+                "expected one of this fit; name another file or remove it"
             )
-        self.values, self.best = _copied(state["values"]), state["best"]
-        self.stage, self.iteration = state["stage"], state["iteration"]
-        self.losses, self.reason = state["losses"], state["reason"]
-        self._begin()
+        device = self.setting.device
+        self.stage = state["stage"]
+        self.candidates = [_copied(values, device) for values in state["candidates"]]
+        self._begin_stage()
+        self._begin_run(_copied(state["values"], device))
         self.optimizer.load_state_dict(state["optimizer"])
-
-    def fingerprint(self) -> str:
-        """Of all that the result depends on."""
-        name = getattr(self.make_optimizer, "__qualname__", repr(self.make_optimizer))
-        return f"{self.problem.fingerprint()} {self.stages!r} {name}"
+        self.ended = [_Run(loss, _copied(best, device), failure) for loss, best, failure in state["ended"]]
+        self.best, self.failure = _copied(state["best"], device), state["failure"]
+        self.losses, self.reason = state["losses"], state["reason"]
 
     # ---------------------------------------------------------------------------------------- steps
 
-    def run(self, tolerance: float) -> Iterator[torch.Tensor]:
-        """Descend; yields the images of each iteration, after its step."""
-        while self.reason is None:
+    def run(self) -> Iterator[None]:
+        """Descend, step by step."""
+        while self._goes_on():
             try:
-                images = self._step()
+                self._step()
             except _Diverged as error:
-                self.reason = str(error)
-                warnings.warn(
-                    f"the fit stopped in iteration {self.iteration + 1} of stage {self.stage + 1}: {error}; "
-                    "the best values before it are kept",
-                    FitWarning,
-                    stacklevel=3,
-                )
-                return
-            yield images
-            self._advance(tolerance)
+                self.failure = str(error)
+            else:
+                yield
 
-    def _step(self) -> torch.Tensor:
+    def _goes_on(self) -> bool:
+        """Whether there is a step to take; begins the next run or stage where one has ended.
+
+        It asks the state alone, so that a state saved after any step goes on as the descent itself does.
+        """
+        if self.reason is not None:
+            return False
+        losses = self.losses[-1]
+        # means, as the least loss may be the luck of a passing iterate
+        last, before = losses[-WINDOW:], losses[-2 * WINDOW : -WINDOW]
+        has_converged = len(before) == WINDOW and sum(last) >= (1 - self.tolerance) * sum(before)
+        is_over = has_converged or self.failure is not None or len(losses) == self.stages[self.stage].iterations
+        if not is_over:
+            return True
+        self.ended.append(_Run(min(losses, default=math.inf), self.best, self.failure))
+        if len(self.ended) < len(self.candidates):
+            self._begin_run(self.candidates[len(self.ended)])
+            self.losses.append([])
+            return True
+        ranked = [run.best for run in sorted(self.ended, key=lambda run: run.loss)]
+        is_last = self.stage + 1 == len(self.stages)
+        if all(run.failure for run in self.ended):
+            self.reason = self.ended[0].failure
+        elif is_last:
+            self.reason = "converged" if has_converged else "finished"
+        if self.reason is not None:
+            self.best = ranked[0]
+            return False
+        self.stage += 1
+        self.candidates, self.ended = self._widened(ranked), []
+        self._begin_stage()
+        return True
+
+    def _step(self) -> None:
         """Evaluate the loss and take a step."""
         stage = self.stages[self.stage]
         for group in self.optimizer.param_groups:
-            group["lr"] = stage.rate(self.iteration)
-        evaluated: list[tuple[torch.Tensor, torch.Tensor]] = []
+            group["lr"] = stage.rate(len(self.losses[-1]))
+        evaluated: list[float] = []
 
-        def closure() -> torch.Tensor:
+        def closure() -> Any:
             self.optimizer.zero_grad()
             try:
                 loss, images = self.model.loss(self.values)
             except ValueError as error:
-                if not self.losses[0]:
+                if not self.losses[0] and not evaluated:
                     raise  # what was wrong from the beginning
                 raise _Diverged(str(error)) from error
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
             _check_finite({f"the gradient of {name}": tensor.grad for name, tensor in self.tensors.items()})
-            evaluated.append((loss.detach(), images.detach()))
+            evaluated.append(float(loss.detach()))
             return loss
 
         before = _copied(self.values)
@@ -246,32 +248,19 @@ class _Descent:
         with torch.no_grad():
             for free in self.problem.free:
                 free.project(self.values[free.name])
-        loss, images = evaluated[0]
         losses = self.losses[-1]
-        losses.append(float(loss))
+        losses.append(evaluated[0])
         if losses[-1] == min(losses):
             self.best = before
         _check_finite(self.tensors)
-        return images
-
-    def _advance(self, tolerance: float) -> None:
-        """Count the iteration, and begin the next stage where one ends."""
-        self.iteration += 1
-        losses = self.losses[-1]
-        has_converged = len(losses) > WINDOW and min(losses[-WINDOW:]) > (1 - tolerance) * min(losses[:-WINDOW])
-        if not has_converged and self.iteration < self.stages[self.stage].iterations:
-            return
-        if self.stage + 1 == len(self.stages):
-            self.reason = "converged" if has_converged else "finished"
-            return
-        self.stage, self.iteration = self.stage + 1, 0
-        self.values = _copied(self.best)
-        self.losses.append([])
-        self._begin()
 
 
-def _copied(values: Mapping[str, Values]) -> dict[str, Values]:
-    return {name: {key: tensor.detach().clone() for key, tensor in own.items()} for name, own in values.items()}
+def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:
+    """A copy, on another device if one is given."""
+    return {
+        name: {key: tensor.detach().to(device, copy=True) for key, tensor in own.items()}
+        for name, own in values.items()
+    }
 
 
 def _check_finite(tensors: Mapping[str, torch.Tensor | None]) -> None:
@@ -280,12 +269,18 @@ def _check_finite(tensors: Mapping[str, torch.Tensor | None]) -> None:
             raise _Diverged(f"{name} became NaN or Inf")
 
 
+def short_adam(parameters: list[torch.Tensor], lr: float) -> torch.optim.Optimizer:
+    """Adam with a memory for descents of tens of iterations."""
+    return torch.optim.Adam(parameters, lr=lr, betas=(0.8, 0.99))
+
+
 def fit(
     problem: Problem,
     stages: Sequence[Stage] = (Stage(),),
     *,
-    optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam,
+    optimizer: Callable[..., torch.optim.Optimizer] = short_adam,
     tolerance: float = 1e-4,
+    seed: int = 0,
     device: str | torch.device = "cpu",
     checkpoint: str | Path | None = None,
     checkpoint_seconds: float = 10.0,
@@ -297,9 +292,10 @@ def fit(
 
     Args:
         problem: The problem.
-        stages: What to do in which order. The paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with
-            ``optimizer=torch.optim.SGD``.
+        stages: What to do in which order; :func:`pose_stages` and :func:`deformation_stages` are ways that work. The
+            paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with ``optimizer=torch.optim.SGD``.
         optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``.
+        seed: Of candidates that are drawn at random.
         tolerance: A stage has converged when over 25 iterations its loss fell by less than this part.
         device: Where to compute.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
@@ -307,7 +303,7 @@ def fit(
         checkpoint_seconds: Time between checkpoints [s].
         preview: PNG that shows targets, images and their difference while the fit runs.
         preview_seconds: Time between previews [s].
-        progress: Show a progress bar.
+        progress: Show progress, that of sphere fits included.
 
     Returns:
         The result. Where something became NaN or Inf it has the best values before that, and a :class:`FitWarning`
@@ -320,9 +316,13 @@ def fit(
     from tqdm import tqdm
 
     stages = tuple(stages)
-    if not stages:
-        raise ValueError("stages: got none, expected one or more")
-    descent = _Descent(problem, stages, optimizer, torch.device(device))
+    check_stages(stages, problem)
+    if not 0 <= tolerance < 1:
+        raise ValueError(f"tolerance: got {tolerance!r}, expected a part of the loss, 0 or more and below 1")
+    for name, file in (("checkpoint", checkpoint), ("preview", preview)):
+        if file is not None and not Path(file).parent.is_dir():
+            raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
+    descent = _Descent(problem, stages, optimizer, tolerance, seed, torch.device(device), progress)
     state = None if checkpoint is None else checkpoints.load(checkpoint)
     if state is not None:
         descent.restore(state)
@@ -333,21 +333,30 @@ def fit(
 
     saved = previewed = time.perf_counter()
     durations: list[float] = []
-    with tqdm(total=sum(stage.iterations for stage in stages), unit="it", disable=not progress) as bar:
+    with tqdm(
+        total=sum(stage.candidates * stage.iterations for stage in stages), unit="it", disable=not progress
+    ) as bar:
         bar.update(sum(map(len, descent.losses)))
         start = time.perf_counter()
-        for images in descent.run(tolerance):
+        for _ in descent.run():
             now = time.perf_counter()
             durations = [*durations[-99:], now - start]
             if now - saved >= checkpoint_seconds:
                 save()
                 saved = time.perf_counter()
             if preview is not None and now - previewed >= preview_seconds:
-                write_preview(preview, descent.model.targets, images)
+                with torch.no_grad():
+                    write_preview(preview, descent.model.targets, descent.model.images(descent.values))
                 previewed = time.perf_counter()
             bar.set_postfix_str(f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}", refresh=False)
             bar.update()
             start = time.perf_counter()
     save()
+    if all(run.failure for run in descent.ended):
+        warnings.warn(
+            f"the fit stopped in stage {descent.stage + 1}: {descent.reason}; the best values before it are kept",
+            FitWarning,
+            stacklevel=2,
+        )
     seconds = statistics.median(durations) if durations else math.nan
     return Result(problem, descent.setting, descent.best, descent.losses, descent.reason or "", seconds)

@@ -1,6 +1,6 @@
 """What a fit may leave free: light, reflectance, poses, shapes, cameras, exposure.
 
-Each starts where the scene has it. Values are in natural units (radians, diagonals of bodies, reflectances, the
+Each starts where the scene has it. Values are in natural units (radians, half diagonals of bodies, reflectances, the
 targets' own radiance), so that one learning rate serves all.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import itertools
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -18,11 +19,14 @@ import warp as wp
 from warpshadow import check
 from warpshadow.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.camera import Camera
-from warpshadow.directions import fibonacci
+from warpshadow.directions import check_count, fibonacci
 from warpshadow.inverse.world import Found, Setting, World
 from warpshadow.light import EnvironmentMap
-from warpshadow.sh import equirectangular_directions
+from warpshadow.renderer import Renderer
+from warpshadow.scene import Visibility
+from warpshadow.sh import check_order, equirectangular_directions
 from warpshadow.spheres import Spheres
+from warpshadow.texture import fill_unseen
 from warpshadow.torch import apply, rotation_matrices
 
 Values = dict[str, torch.Tensor]
@@ -32,6 +36,10 @@ _NO_TURN = {
     "quaternion": (0.0, 0.0, 0.0, 1.0),
     "6d": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0),
 }
+_TURNS = np.array(
+    [sign * axis for axis in np.eye(3) for sign in (-1, 1)] + list(itertools.product((-1.0, 1.0), repeat=3))
+)
+_STRETCH = 0.4  # a unit of stretch: nodes stretch less than they turn
 _DARKEST = 1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
 
 
@@ -58,6 +66,16 @@ class Free(abc.ABC):
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Put values into the world. Differentiable: values."""
 
+    def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
+        """Other values around these, for a descent that starts at several places; the same where one will do.
+
+        Args:
+            values: The first place.
+            number: Of the other place, from 0.
+            generator: Of random numbers.
+        """
+        return {key: tensor.detach().clone() for key, tensor in values.items()}
+
     @abc.abstractmethod
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Put final values into what is found."""
@@ -78,6 +96,8 @@ def _check_weight(name: str, value: float) -> None:
 
 def _check_body(body: int, setting: Setting) -> None:
     check.choice("body", body, range(len(setting.scene.bodies)))
+    if isinstance(body, bool) or not isinstance(body, (int, np.integer)):
+        raise ValueError(f"body: got {body!r}, expected a whole number")
 
 
 # ---------------------------------------------------------------------------------------------- light
@@ -92,17 +112,24 @@ class Light(Free):
         directions: In place of ``order`` the number of cells, whose radiance is the exponential of a value and so never
             negative: sharper light, and a longer way to it.
         nonnegativity: Weight of the mean square of what is negative in spherical harmonics [targets' radiance].
+        smoothness: Weight of the mean square of differences between neighboring cells [targets' radiance].
     """
 
     order: int | None = 5
     directions: int | None = None
     nonnegativity: float = 0.0
+    smoothness: float = 1e-4
 
     def __post_init__(self) -> None:
         """Validate."""
         if (self.order is None) == (self.directions is None):
             raise ValueError(f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them")
-        _check_weight("nonnegativity", self.nonnegativity)
+        if self.directions is not None:
+            check_count("directions", self.directions)
+        if self.order is not None:
+            check_order(self.order)
+        for name in ("nonnegativity", "smoothness"):
+            _check_weight(name, getattr(self, name))
 
     @property
     def name(self) -> str:
@@ -132,15 +159,16 @@ class Light(Free):
         world.light = self.coefficients(values, setting)
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """What is negative."""
-        if isinstance(self.basis, CellBasis) or not self.nonnegativity:
+        """What is negative, and how neighboring cells differ."""
+        if isinstance(self.basis, CellBasis):
+            first, second = _neighbors(self.basis.size)
+            radiance = values["log_radiance"].exp()
+            return self.smoothness * (radiance[first] - radiance[second]).square().mean() if self.smoothness else None
+        if not self.nonnegativity:
             return None
-        radiance = self._sampling(setting) @ values["coefficients"]
+        towards = np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512))
+        radiance = setting.tensor(towards) @ values["coefficients"]
         return self.nonnegativity * torch.relu(-radiance).square().mean()
-
-    def _sampling(self, setting: Setting) -> torch.Tensor:
-        """Takes values to radiance in many directions, [direction, coefficient]."""
-        return setting.tensor(np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512)))
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Spherical harmonics stay what they are; cells become a map."""
@@ -150,6 +178,18 @@ class Light(Free):
             towards = equirectangular_directions(64)
             light = EnvironmentMap((self.basis.functions(towards.reshape(-1, 3)) @ coefficients).reshape(64, 128, 3))
         found.scene = replace(found.scene, light=light)
+
+
+@functools.cache
+def _neighbors(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pairs of cells that lie side by side: each and the six nearest to it."""
+    from scipy.spatial import cKDTree
+
+    directions = fibonacci(count)
+    _, nearest = cKDTree(directions).query(directions, k=7)
+    pairs = np.stack([np.repeat(np.arange(count), 6), nearest[:, 1:].ravel()])
+    pairs = np.unique(np.sort(pairs, axis=0), axis=1)
+    return torch.from_numpy(pairs[0]), torch.from_numpy(pairs[1])
 
 
 @dataclass(frozen=True)
@@ -237,6 +277,10 @@ class Texture(Free):
 
     def __post_init__(self) -> None:
         """Validate."""
+        if self.size is not None:
+            check.shape("size", np.shape(self.size), (2,))
+            if not all(isinstance(count, (int, np.integer)) and count > 0 for count in self.size):
+                raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels")
         _check_weight("smoothness", self.smoothness)
 
     @property
@@ -267,15 +311,20 @@ class Texture(Free):
         if not self.smoothness:
             return None
         texels = values["texels"]
-        return self.smoothness * (texels.diff(dim=0).square().mean() + texels.diff(dim=1).square().mean())
+        down, across = (texels.diff(dim=dim).square().sum() for dim in (0, 1))  # sums: a single row has no mean down
+        return self.smoothness * (down + across) / texels.numel()
 
     def project(self, values: Values) -> None:
         """Reflectances are in [0, 1]."""
         values["texels"].clamp_(0, 1)
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
-        """Cover the body."""
-        found.change_body(self.body, texture=values["texels"].cpu().numpy())
+        """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
+        texels = values["texels"].cpu().numpy()
+        found.change_body(self.body, texture=texels)
+        unshadowed = replace(found.scene, visibility=Visibility(method="none"))
+        renderer = Renderer(unshadowed, cameras=found.cameras, device=str(setting.device))
+        found.change_body(self.body, texture=fill_unseen(texels, renderer.seen_texels(self.body)))
 
 
 # ---------------------------------------------------------------------------------------------- motion
@@ -289,6 +338,8 @@ class Pose(Free):
         body: The body, from 0.
         rotation: Parameters: "axis-angle" [radians], "quaternion" or "6d" (two columns).
         scale: Whether the size is free, too.
+        spread: By what angle candidates are turned [radians]: about each axis, either way, then about the eight
+            directions in their midst, then about any.
     """
 
     moves: ClassVar[bool] = True
@@ -296,10 +347,13 @@ class Pose(Free):
     body: int
     rotation: str = "axis-angle"
     scale: bool = False
+    spread: float = 0.55
 
     def __post_init__(self) -> None:
         """Validate."""
         check.choice("rotation", self.rotation, _NO_TURN)
+        if not (np.isfinite(self.spread) and 0 <= self.spread <= np.pi):
+            raise ValueError(f"spread: got {self.spread!r}, expected an angle from 0 to π")
 
     @property
     def name(self) -> str:
@@ -312,6 +366,23 @@ class Pose(Free):
         values = {"turn": setting.tensor(_NO_TURN[self.rotation]), "shift": setting.tensor(np.zeros(3))}
         return values | ({"log_scale": setting.tensor(0.0)} if self.scale else {})
 
+    def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
+        """The pose, turned."""
+        from scipy.spatial.transform import Rotation
+
+        known = number < len(_TURNS)
+        axis = _TURNS[number] if known else torch.randn(3, generator=generator).numpy().astype(np.float64)
+        turn = Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis))
+        start = values["turn"].cpu().numpy()
+        if self.rotation == "axis-angle":
+            turned = (turn * Rotation.from_rotvec(start)).as_rotvec()
+        elif self.rotation == "quaternion":
+            turned = (turn * Rotation.from_quat(start)).as_quat()
+        else:
+            turned = turn.apply(start.reshape(2, 3)).ravel()
+        copies = super().scattered(values, number, generator)
+        return copies | {"turn": torch.tensor(turned, dtype=torch.float32, device=values["turn"].device)}
+
     def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
         body = setting.scene.bodies[self.body]
@@ -319,7 +390,7 @@ class Pose(Free):
         rotation = rotation_matrices(values["turn"]) @ at_start
         scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
         moved = body.scale * at_start @ middle + setting.tensor(body.translation)
-        moved = moved + body.scale * setting.diagonal(self.body) * values["shift"]
+        moved = moved + body.scale * setting.extent(self.body) * values["shift"]
         return rotation, moved - scale * rotation @ middle, scale
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
@@ -343,22 +414,33 @@ class Pose(Free):
 class Deformation(Free):
     """The shape of a body, by embedded deformation (Sumner et al. 2007); its spheres are the nodes (the paper, sec. 4).
 
+    A node's matrix is a rotation times a symmetric stretch. Values are those of the nodes before they are smoothed over
+    the graph, T = (I + λ L)⁻¹ u, L the graph's Laplacian over the mean number of neighbors: so that a step of the
+    descent moves parts of the body, and not nodes one by one (Nicolet et al. 2021, section 3.2).
+
     Args:
         body: The body, from 0; it needs more spheres than ``count``.
         rigidity: Weight of the as-rigid-as-possible energy, the mean over pairs of neighboring nodes
-            [squares of the diagonal].
-        count: Nodes that carry a vertex, and neighbors of a node.
+            [squares of half the diagonal].
+        firmness: Weight of the mean square of the nodes' stretches.
+        smoothness: λ.
+        count: Nodes that carry a vertex.
     """
 
     moves: ClassVar[bool] = True
 
     body: int
-    rigidity: float = 100.0
+    rigidity: float = 1.25
+    firmness: float = 0.01
+    smoothness: float = 6.0
     count: int = 4
 
     def __post_init__(self) -> None:
         """Validate."""
-        _check_weight("rigidity", self.rigidity)
+        for name in ("rigidity", "firmness", "smoothness"):
+            _check_weight(name, getattr(self, name))
+        if isinstance(self.count, bool) or not isinstance(self.count, (int, np.integer)) or self.count < 1:
+            raise ValueError(f"count: got {self.count!r}, expected a whole number of nodes from 1 on")
 
     @property
     def name(self) -> str:
@@ -369,42 +451,46 @@ class Deformation(Free):
         """The shape as it is."""
         _check_body(self.body, setting)
         nodes = setting.graph(self.body, self.count).node_positions.shape[0]
-        return {"turns": setting.tensor(np.zeros((nodes, 3))), "shifts": setting.tensor(np.zeros((nodes, 3)))}
+        sizes = {"turns": 3, "shifts": 3, "stretches": 6}
+        return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
 
-    def _moved_nodes(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rotations [1, node, 3, 3] and translations [1, node, 3] in the body's own space."""
-        return rotation_matrices(values["turns"])[None], (setting.diagonal(self.body) * values["shifts"])[None]
+    def _moved_nodes(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Matrices [node, 3, 3] and translations [node, 3] in the body's own space, and stretches [node, 3, 3]."""
+        smoothing = setting.smoothing(self.body, self.count, self.smoothness)
+        turns, shifts, entries = (smoothing @ values[key] for key in ("turns", "shifts", "stretches"))
+        stretches = (_STRETCH * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
+        rotations = rotation_matrices(turns)
+        return rotations + rotations @ stretches, setting.extent(self.body) * shifts, stretches
 
     def _deformed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
         """Vertices and centers in the body's own space, with a batch of 1."""
         graph = setting.graph(self.body, self.count)
-        rotations, shifts = self._moved_nodes(values, setting)
-        points = apply(graph.points, rotations, shifts, dtypes=(wp.mat33, wp.vec3))
-        return points, apply(graph.centers, shifts, dtypes=(wp.vec3,))
+        matrices, shifts, _ = self._moved_nodes(values, setting)
+        points = apply(graph.points, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))
+        return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Bend the body."""
         points, centers = self._deformed(values, setting)
-        world.rest = world.renderer.deformed(self.body, points, centers, rest=world.rest)
+        has_spheres = len(setting.spheres(self.body)) > 0  # without shadows there are nodes, but no spheres
+        world.rest = world.renderer.deformed(self.body, points, centers if has_spheres else None, rest=world.rest)
         world.moves = True
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Differences between where neighboring nodes take each other."""
-        if not self.rigidity:
-            return None
+        """Differences between where neighboring nodes take each other, and stretches."""
         graph = setting.graph(self.body, self.count)
-        total = apply(graph.rigidity, *self._moved_nodes(values, setting), dtypes=(wp.mat33, wp.vec3))
-        return total[0] * (self.rigidity / (graph.neighbors.size * setting.diagonal(self.body) ** 2))
+        matrices, shifts, stretches = self._moved_nodes(values, setting)
+        gaps = apply(graph.rigidity, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))[0]
+        gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.body) ** 2)
+        return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Bend the body, mesh and spheres."""
         points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
-        body = found.scene.bodies[self.body]
-        found.change_body(
-            self.body,
-            mesh=replace(body.mesh, positions=points),
-            blockers=Spheres(centers, found.spheres(self.body).radii),
-        )
+        found.change_body(self.body, mesh=replace(found.scene.bodies[self.body].mesh, positions=points))
+        spheres = found.spheres(self.body)
+        if len(spheres):
+            found.change_body(self.body, blockers=Spheres(centers, spheres.radii))
 
 
 @dataclass(frozen=True)
@@ -441,8 +527,7 @@ class Radii(Free):
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Swell and shrink the spheres."""
         radii = setting.tensor(setting.spheres(self.body).radii) * values["log"].exp()
-        batch = radii if world.rest is None or world.rest.radii.ndim == 1 else radii[None]
-        world.rest = world.renderer.deformed(self.body, radii=batch, rest=world.rest)
+        world.rest = world.renderer.deformed(self.body, radii=radii, rest=world.rest)
         world.moves = True
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
@@ -484,12 +569,9 @@ class CameraPose(Free):
         self, values: Values, setting: Setting, cameras: tuple[Camera, ...]
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """R, t and K of the views; shifts of the eye are in units of its distance from the scene."""
-        low, high = zip(*(body.world_mesh().bounds for body in setting.scene.bodies), strict=True)
-        middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
-        eyes = np.stack([camera.eye for camera in cameras])
-        distances = np.linalg.norm(eyes - middle, axis=1, keepdims=True)
         rotations = rotation_matrices(values["turn"]) @ setting.tensor([camera.rotation for camera in cameras])
-        moved = setting.tensor(eyes) + setting.tensor(distances) * values["shift"]
+        eyes = setting.tensor([camera.eye for camera in cameras])
+        moved = eyes + setting.tensor(setting.distances) * values["shift"]
         intrinsics = setting.tensor([camera.intrinsics for camera in cameras])
         if self.focal:
             zoom = torch.ones_like(intrinsics)

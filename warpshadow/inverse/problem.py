@@ -17,7 +17,7 @@ from warpshadow.inverse.free import Free, Light, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene import Scene, Visibility
+from warpshadow.scene import SPHERE_METHODS, Scene, Visibility
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +50,10 @@ class Problem:
             if not items:
                 raise ValueError(f"{name}: got none, expected one or more")
             object.__setattr__(self, name, items)
+        for name, kind in (("targets", Target), ("free", Free)):
+            for number, item in enumerate(getattr(self, name)):
+                if not isinstance(item, kind):
+                    raise ValueError(f"{name}[{number}]: got {type(item).__name__}, expected a {kind.__name__}")
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:
             raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
@@ -62,11 +66,17 @@ class Problem:
                 'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '
                 'expected "directional", "log-sh" or "none"'
             )
+        self.cameras()  # raises for an image of other proportions
 
     @property
     def moves(self) -> bool:
         """Whether geometry or cameras are free."""
         return any(free.moves for free in self.free)
+
+    @property
+    def visibility(self) -> Visibility:
+        """How the fit computes visibility."""
+        return self.scene.visibility if self.moves or self.still is None else self.still
 
     @property
     def basis(self) -> Basis | None:
@@ -80,15 +90,16 @@ class Problem:
 
     def setting(self, device: torch.device, *, progress: bool = False) -> Setting:
         """Fit the spheres and find the units."""
-        cameras, scene = self.cameras(), replace(self.scene, camera=self.cameras()[0])
-        if not self.moves and self.still is not None:
-            scene = replace(scene, visibility=self.still)
-        spheres = scene_blockers(scene, device=str(device), progress=progress)
-        bodies = (replace(body, blockers=own) for body, own in zip(scene.bodies, spheres, strict=True))
+        cameras = self.cameras()
+        scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
+        if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
+            spheres = scene_blockers(scene, device=str(device), progress=progress)
+            bodies = (replace(body, blockers=own) for body, own in zip(scene.bodies, spheres, strict=True))
+            scene = replace(scene, bodies=tuple(bodies))
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
         weights = np.stack([target.weights() for target in self.targets])[..., None]
         unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))
-        return Setting(replace(scene, bodies=tuple(bodies)), cameras, unit or 1.0, device)
+        return Setting(scene, cameras, unit or 1.0, device)
 
     def start(self, setting: Setting) -> dict[str, Values]:
         """Values of what is free, by its name, where the scene has them."""
@@ -118,7 +129,8 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
             f"targets: got an image of {width} × {height} pixels, expected the proportions of the scene's camera, "
             f"{camera.width} × {camera.height}, or a camera of its own"
         )
-    return camera.resized(width / camera.width)
+    intrinsics = np.diag([width / camera.width, height / camera.height, 1]) @ camera.intrinsics
+    return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
 def _digest(value: object, digest: hashlib._Hash) -> None:
@@ -135,4 +147,4 @@ def _digest(value: object, digest: hashlib._Hash) -> None:
         for item in value:
             _digest(item, digest)
     else:
-        digest.update(repr(value).encode())
+        digest.update(f"{value!r};".encode())  # or 1, 23 were 12, 3

@@ -36,8 +36,6 @@ class Target:
         image = np.array(self.image, np.float32)
         if image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
             raise ValueError(f"image: got shape {image.shape}, expected [height, width, 3 or 4]")
-        check.finite("image", image)
-        object.__setattr__(self, "image", image)
         if self.mask is not None:
             mask = np.array(self.mask, np.float32)
             check.shape("mask", mask.shape, image.shape[:2])
@@ -47,6 +45,9 @@ class Target:
                     f"mask: got values from {mask.min():g} to {mask.max():g}, expected 0 to 1, and not 0 alone"
                 )
             object.__setattr__(self, "mask", mask)
+            image[mask == 0] = 0  # whatever is there
+        check.finite("image", image)
+        object.__setattr__(self, "image", image)
         size = image.shape[1], image.shape[0]
         if self.camera is not None and (self.camera.width, self.camera.height) != size:
             raise ValueError(

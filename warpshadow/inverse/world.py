@@ -11,11 +11,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from warpshadow.assembly import Assembly, Geometry
-from warpshadow.basis import Basis
+from warpshadow.assembly import Geometry
+from warpshadow.blockers import scene_blockers
 from warpshadow.camera import Camera
 from warpshadow.deform import DeformationGraph
-from warpshadow.scene import Scene
+from warpshadow.scene import SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.torch import TorchRenderer
 
@@ -24,7 +24,7 @@ class Setting:
     """What all stages of a fit have in common: the scene at the start and the units of its parameters.
 
     Args:
-        scene: The scene, its blockers fitted.
+        scene: The scene, its blockers fitted where its method has spheres.
         cameras: One for each target, of one size.
         unit: Radiance that counts as 1: the root mean square of the targets.
         device: Where tensors and arrays live.
@@ -36,17 +36,37 @@ class Setting:
         self.unit = unit
         self.device = device
         self._graphs: dict[tuple[int, int], DeformationGraph] = {}
+        self._smoothings: dict[tuple[int, int, float], torch.Tensor] = {}
 
     @functools.cached_property
-    def assembly(self) -> Assembly:
-        """The bodies at rest."""
-        return Assembly(self.scene, device=str(self.device))
+    def distances(self) -> np.ndarray:
+        """From the middle of the scene to the eye of each view, shape [view, 1]: the unit of the eye's shifts."""
+        low, high = zip(*(body.world_mesh().bounds for body in self.scene.bodies), strict=True)
+        middle = (np.min(low, axis=0) + np.max(high, axis=0)) / 2
+        return np.linalg.norm([camera.eye - middle for camera in self.cameras], axis=1, keepdims=True)
 
     def graph(self, body: int, count: int) -> DeformationGraph:
-        """The deformation graph of a body, made once."""
+        """The deformation graph of a body, whose nodes are its spheres, be it that nothing casts shadows."""
         if (body, count) not in self._graphs:
-            self._graphs[body, count] = self.assembly.graph(body, count=count)
+            shadowed = replace(self.scene, visibility=Visibility())
+            centers = scene_blockers(shadowed, device=str(self.device))[body].centers
+            points = self.scene.bodies[body].mesh.positions
+            self._graphs[body, count] = DeformationGraph.bind(points, centers, count=count, device=str(self.device))
         return self._graphs[body, count]
+
+    def smoothing(self, body: int, count: int, weight: float) -> torch.Tensor:
+        """What smooths values over the nodes of a body's graph, (I + λ L)⁻¹, [node, node]."""
+        if (body, count, weight) not in self._smoothings:
+            graph = self.graph(body, count)
+            pairs = graph.neighbors.numpy()
+            laplacian = np.zeros((graph.node_positions.shape[0],) * 2)
+            laplacian[pairs[:, 0], pairs[:, 1]] = -1
+            np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
+            laplacian /= len(pairs) / len(laplacian)
+            self._smoothings[body, count, weight] = self.tensor(
+                np.linalg.inv(np.eye(len(laplacian)) + weight * laplacian)
+            )
+        return self._smoothings[body, count, weight]
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""
@@ -57,10 +77,13 @@ class Setting:
         low, high = self.scene.bodies[body].mesh.bounds
         return (low.astype(np.float64) + high) / 2
 
-    def diagonal(self, body: int) -> float:
-        """Length of a body's bounding box from corner to corner, in its own space: the unit of its shifts."""
+    def extent(self, body: int) -> float:
+        """Half the diagonal of a body's bounding box, in its own space: the unit of its shifts.
+
+        A turn by a radian moves vertices about as far.
+        """
         low, high = self.scene.bodies[body].mesh.bounds
-        return float(np.linalg.norm(high.astype(np.float64) - low))
+        return float(np.linalg.norm(high.astype(np.float64) - low) / 2)
 
     def tensor(self, values: np.ndarray | Sequence | float) -> torch.Tensor:
         """Numbers as a float32 tensor on the device."""
@@ -71,8 +94,8 @@ class World:
     """A scene on its way to an image; each free parameter puts its tensors in place of what the scene has.
 
     Args:
-        renderer: Of the scene, at a stage's size and softness.
-        cameras: One for each view, at that size.
+        renderer: Of the scene, at a stage's size and softness, with a camera for each view.
+        cameras: The same.
 
     Attributes:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
@@ -110,7 +133,6 @@ class World:
             geometry=geometry,
             clip_matrices=self.clip_matrices,
         )
-        images = images if images.ndim == 4 else images[None]
         if self.exposures is not None:
             color = images[..., :3] * self.exposures[:, None, None, None]
             images = torch.cat([color, images[..., 3:]], dim=-1)
@@ -144,22 +166,6 @@ class Found:
 
 def _spheres(scene: Scene, body: int) -> Spheres:
     spheres = scene.bodies[body].blockers
-    assert isinstance(spheres, Spheres)  # a setting has them fitted
-    return spheres
-
-
-def make_renderer(
-    setting: Setting, scale: float, softness: float | None, directions: int | None, basis: Basis | None, progress: bool
-) -> tuple[TorchRenderer, tuple[Camera, ...]]:
-    """A renderer of the setting's scene at a size and softness, and the cameras of its views."""
-    scene, cameras = setting.scene, tuple(camera.resized(scale) for camera in setting.cameras)
-    visibility = scene.visibility
-    visibility = replace(
-        visibility,
-        softness=visibility.softness if softness is None else softness,
-        directions=visibility.directions if directions is None else directions,
-    )
-    staged = replace(scene, camera=cameras[0], visibility=visibility)
-    several = {"cameras": cameras} if len(cameras) > 1 else {}
-    renderer = TorchRenderer(staged, device=setting.device, basis=basis, progress=progress, **several)
-    return renderer, cameras
+    if scene.visibility.method in SPHERE_METHODS and isinstance(spheres, Spheres):
+        return spheres
+    return Spheres.concatenate([])

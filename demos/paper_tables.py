@@ -1,0 +1,232 @@
+"""The paper's tables on open scenes: texture, light, pose and geometry from one image, by each method.
+
+    python demos/paper_tables.py [--data FOLDER] [--scenes 10] [--iterations N] [--problems texture light pose geometry]
+    python demos/paper_tables.py --ablation
+
+Ten scenes: a body of 2 units on a ground of 6, 128 × 128 pixels (texture: 256 × 256), targets ray traced with 2048
+directions. With ``--data`` the meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder take part,
+without it what ships with Warp and synthetic skies. Every result is kept in OUTPUT/paper_tables.json as soon as it is
+there, and a run takes up what is not yet in it; ``--scenes`` and ``--iterations`` (of each stage) cut it short. Tables
+are printed as Markdown: mean ± standard deviation over the scenes, and every fit that failed.
+
+texture    mean squared error of the ground's texture, over the texels that a pixel or more sees
+light      mean squared error of images of two other bodies in the light that was found, relative to their mean square
+pose       MDE, mean distance of vertices to where they belong [% of the bounding box's diagonal]; RE, angle between the
+           rotations [rad]; TE, squared distance between the translations
+geometry   MDE of a body that was bent, twisted and stretched
+
+Where geometry stands still, "ray traced" is what a fit does by default. ``--ablation`` repeats the pose for 50 to 200
+spheres and 16 to 64 coefficients of log-SH. Mitsuba 3 takes part where it is installed (demos/mitsuba_fits.py).
+"""
+
+import argparse
+import dataclasses
+import importlib.util
+import itertools
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import problems
+import torch
+from problems import Case
+from scenes import shipped_mesh
+
+import warpshadow as ws
+from warpshadow import inverse
+
+COLUMNS: dict[str, ws.Visibility | None] = {
+    "direct illumination": problems.DIRECT,
+    "log-SH cap": ws.Visibility(method="log-sh", log="cap"),
+    "log-SH eigen": ws.Visibility(method="log-sh"),
+    "directional": ws.Visibility(),
+    "ray traced": None,
+}
+STILL = ("texture", "light")
+MITSUBA = "Mitsuba 3"
+SPHERES, ORDERS = (50, 100, 150, 200), (4, 5, 6, 7, 8)
+
+
+def scenes(data: Path | None) -> list[tuple[ws.Mesh, str, ws.EnvironmentMap]]:
+    """Ten pairs of a mesh and a sky."""
+    meshes = [shipped_mesh(name) for name in ("bunny", "bear", "rocks")]
+    if data is None:
+        skies = {
+            "high sun": ws.synthetic_sky((0.5, 0.9, 0.3)),
+            "low sun": ws.synthetic_sky((0.8, 0.4, 0.3)),
+            "soft sun": ws.synthetic_sky((-0.75, 0.6, -0.1), sun_strength=2.0, sun_radius=5.0),
+            "overcast": ws.synthetic_sky((0.3, 0.8, -0.4), sun_strength=0.5, sun_radius=10.0),
+        }
+    else:
+        meshes += [ws.load_mesh(file) for file in sorted((data / "meshes").iterdir())]
+        skies = {file.stem: ws.EnvironmentMap.read(file) for file in sorted((data / "envmaps").iterdir())}
+    names = list(skies)
+    return [(meshes[i % len(meshes)], names[i % len(names)], skies[names[i % len(names)]]) for i in range(10)]
+
+
+def cases(pairs: list[tuple[ws.Mesh, str, ws.EnvironmentMap]]) -> dict[str, Callable[..., Case]]:
+    """How each problem is made for a scene of a number."""
+    meshes = list({mesh.name: mesh for mesh, *_ in pairs}.values())
+
+    def light(number: int) -> Case:
+        mesh, _, sky = pairs[number]
+        others = [other for other in meshes if other.name != mesh.name]
+        return problems.light_case(mesh, sky, [others[number % len(others)], others[(number + 1) % len(others)]])
+
+    return {
+        "texture": lambda number: problems.texture_case(*_pair(pairs, number), number),
+        "light": light,
+        "pose": lambda number, **sizes: problems.pose_case(*_pair(pairs, number), number, **sizes),
+        "geometry": lambda number: problems.deformation_case(*_pair(pairs, number), number),
+    }
+
+
+def _pair(pairs: list, number: int) -> tuple[ws.Mesh, ws.EnvironmentMap]:
+    mesh, _, sky = pairs[number]
+    return mesh, sky
+
+
+class Results:
+    """Figures by key, kept in a JSON file that is replaced as a whole."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.figures: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.exists() else {}
+
+    def add(self, key: str, figures: dict[str, Any]) -> None:
+        """Put figures in their place."""
+        if self.path.exists():  # another process may have added to it
+            self.figures = json.loads(self.path.read_text()) | self.figures
+        self.figures[key] = figures
+        unfinished = self.path.with_suffix(f".{os.getpid()}.part")
+        unfinished.write_text(json.dumps(self.figures, indent=1, sort_keys=True))
+        os.replace(unfinished, self.path)
+
+
+def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
+    """Figures of one fit; one that fails has its error in place of them."""
+    stages = [
+        dataclasses.replace(stage, iterations=min(stage.iterations, iterations or stage.iterations))
+        for stage in case.stages
+    ]
+    start = time.perf_counter()
+    try:
+        if column == MITSUBA:
+            from mitsuba_fits import fit_by_mitsuba
+
+            scene, seconds, count, reason = fit_by_mitsuba(case, iterations)
+        else:
+            result = inverse.fit(case.by(COLUMNS[column]), stages, progress=True)
+            scene, seconds, reason = result.scene, result.seconds, result.reason
+            count = sum(map(len, result.losses))
+        figures: dict[str, Any] = case.measure(scene)
+    except (ValueError, ArithmeticError, RuntimeError) as error:
+        return {"error": f"{type(error).__name__}: {error}"}
+    seconds_in_all = time.perf_counter() - start
+    return figures | {"ms": 1e3 * seconds, "iterations": count, "seconds": seconds_in_all, "reason": reason}
+
+
+def main(data: Path | None, output: Path, count: int, names: list[str], iterations: int | None) -> None:
+    prepare(output)
+    results, pairs = Results(output / "paper_tables.json"), scenes(data)
+    make = cases(pairs)
+    has_mitsuba = importlib.util.find_spec("mitsuba") is not None
+    for number, name in itertools.product(range(count), names):
+        mesh, sky_name, _ = pairs[number]
+        columns = [column for column in COLUMNS if name in STILL or COLUMNS[column] is not None]
+        wanted = {
+            column: f"{name} | {number:02} {mesh.name}, {sky_name} | {column}"
+            for column in [*columns, *([MITSUBA] if has_mitsuba else [])]
+        }
+        missing = {column: key for column, key in wanted.items() if key not in results.figures}
+        case = make[name](number) if missing else None
+        for column, key in missing.items():
+            results.add(key, solve(case, column, iterations))
+            print(f"{key}: {shown(results.figures[key])}", flush=True)
+    for name in names:
+        print(f"\n{table(name, results.figures)}")
+
+
+def ablate(data: Path | None, output: Path, count: int, iterations: int | None) -> None:
+    """The pose by log-SH eigen, over numbers of spheres and coefficients."""
+    prepare(output)
+    results, pairs = Results(output / "ablation.json"), scenes(data)
+    make = cases(pairs)["pose"]
+    settings = [(spheres, 8) for spheres in SPHERES] + [(100, order) for order in ORDERS if order < 8]
+    for number, (spheres, order) in itertools.product(range(count), settings):
+        key = f"{spheres} spheres, {order**2} coefficients | {number:02} {pairs[number][0].name}, {pairs[number][1]}"
+        if key not in results.figures:
+            COLUMNS["ablation"] = ws.Visibility(method="log-sh", order=order)
+            results.add(key, solve(make(number, spheres=spheres), "ablation", iterations))
+            print(f"{key}: {shown(results.figures[key])}", flush=True)
+    print("\n| spheres | coefficients | pose MDE [%] | ms per iteration |\n| --- | --- | --- | --- |")
+    for spheres, order in settings:
+        prefix = f"{spheres} spheres, {order**2} coefficients |"
+        rows = [
+            figures for key, figures in results.figures.items() if key.startswith(prefix) and "error" not in figures
+        ]
+        if rows:
+            print(
+                f"| {spheres} | {order**2} | {spread(rows, 'pose MDE')} | {np.mean([row['ms'] for row in rows]):.0f} |"
+            )
+
+
+def prepare(output: Path) -> None:
+    ws.quiet()
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", module="warpshadow")  # meshes with unreferenced vertices
+    output.mkdir(parents=True, exist_ok=True)
+
+
+def table(name: str, figures: dict[str, dict[str, Any]]) -> str:
+    """Markdown of one problem: a row for each method, mean ± standard deviation over the scenes, and what failed."""
+    columns = [column for column in [*COLUMNS, MITSUBA] if any(_is(key, name, column) for key in figures)]
+    kinds = {"texture": ["texture MSE"], "light": ["relighting MSE"], "pose": ["pose MDE", "RE", "TE"]}
+    kinds["geometry"] = ["geometry MDE"]
+    lines = [f"| {name} | " + " | ".join(kinds[name]) + " | ms per iteration | scenes |"]
+    lines.append("| --- |" + " --- |" * (len(kinds[name]) + 2))
+    failures = []
+    for column in columns:
+        own = {key: row for key, row in figures.items() if _is(key, name, column)}
+        failures += [f"- failed: {key}: {row['error']}" for key, row in own.items() if "error" in row]
+        rows = [row for row in own.values() if "error" not in row]
+        if rows:
+            values = " | ".join(spread(rows, kind) for kind in kinds[name])
+            lines.append(f"| {column} | {values} | {np.median([row['ms'] for row in rows]):.1f} | {len(rows)} |")
+    return "\n".join([*lines, *failures])
+
+
+def _is(key: str, name: str, column: str) -> bool:
+    parts = key.split(" | ")
+    return parts[0] == name and parts[-1] == column
+
+
+def spread(rows: list[dict[str, Any]], kind: str) -> str:
+    values = [row[kind] for row in rows]
+    return f"{np.mean(values):.3g} ± {np.std(values):.2g}"
+
+
+def shown(figures: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in figures.items()
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
+    parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the results")
+    parser.add_argument("--scenes", type=int, default=10, choices=range(1, 11), help="the first so many")
+    parser.add_argument("--problems", nargs="+", default=["texture", "light", "pose", "geometry"])
+    parser.add_argument("--iterations", type=int, help="at most so many for each stage")
+    parser.add_argument("--ablation", action="store_true", help="spheres and coefficients in place of methods")
+    arguments = parser.parse_args()
+    if arguments.ablation:
+        ablate(arguments.data, arguments.output, arguments.scenes, arguments.iterations)
+    else:
+        main(arguments.data, arguments.output, arguments.scenes, arguments.problems, arguments.iterations)

@@ -1,0 +1,125 @@
+"""Models: the images of a problem, and their loss, as functions of the values of what is free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+
+from warpshadow.inverse.free import Light, Values
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.stages import Stage
+from warpshadow.inverse.target import stacked
+from warpshadow.inverse.world import Setting, World
+from warpshadow.torch import TorchRenderer
+
+_LIGHTS_AT_ONCE = 16
+_PIXELS_AT_ONCE = 65536
+_SEEN_VERTICES = 0.5  # the part of all vertices that an image sees, about
+
+
+class Model:
+    """Images of a problem at a size, and how unlike the targets they are.
+
+    Args:
+        problem: The problem.
+        setting: Of the problem.
+        stage: At what size and how softly.
+    """
+
+    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
+        self.problem, self.setting, self.regularization = problem, setting, stage.regularization
+        self.cameras = tuple(camera.resized(stage.scale) for camera in setting.cameras)
+        self.renderer = self._make_renderer(stage)
+        self.targets, self.weights = stacked(problem.targets, stage.scale, setting.device)
+
+    def _make_renderer(self, stage: Stage) -> TorchRenderer:
+        scene = self.setting.scene
+        scene = replace(
+            scene,
+            camera=self.cameras[0],
+            visibility=stage.visibility(scene.visibility),
+            supersampling=stage.supersampling or scene.supersampling,
+        )
+        camera, vertex_count = scene.camera, sum(body.mesh.vertex_count for body in scene.bodies)
+        sample_count = len(self.cameras) * camera.width * camera.height * scene.supersampling**2
+        is_coarse = stage.scale < 1 and sample_count < _SEEN_VERTICES * vertex_count
+        if self.problem.moves and is_coarse:  # of samples and vertices, the fewer are shaded
+            scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
+        return TorchRenderer(scene, device=self.setting.device, basis=self.problem.basis, cameras=self.cameras)
+
+    def images(self, values: Mapping[str, Values]) -> torch.Tensor:
+        """Images of the views, [view, height, width, 4]. Differentiable: values."""
+        world = World(self.renderer, self.cameras)
+        for free in self.problem.free:
+            free.place(values[free.name], self.setting, world)
+        return world.images()
+
+    def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
+        total, images = self._unlikeness(values)
+        for free in self.problem.free:
+            energy = free.energy(values[free.name], self.setting)
+            total = total if energy is None else total + self.regularization * energy
+        return total, images
+
+    def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The loss of the images, and they."""
+        images = self.images(values)
+        return self.problem.loss(images, self.targets, self.weights, self.setting.unit), images
+
+
+class LightModel(Model):
+    """The same where light alone is free and differences are squared: a quadratic form, computed without images.
+
+    Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
+    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the weights of the pixels over their sum. Sums are float64: what is
+    left of them at the end is a small difference.
+    """
+
+    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
+        super().__init__(problem, setting, stage)
+        (light,) = problem.free
+        assert isinstance(light, Light)
+        self.light = light
+        share = 1.0 if problem.loss.reduction == "sum" else 1.0 / float(self.weights.sum())
+        roots = (self.weights * share).sqrt()[..., None] / setting.unit
+        with torch.no_grad():
+            columns = torch.cat([(image[..., :3] * roots).reshape(1, -1, 3) for image in self._images_of_units()])
+            wanted = (self.targets[..., :3] * roots).reshape(-1, 3)
+            dark = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
+            alike = torch.cat([self.targets[..., :3], dark[..., 3:]], dim=-1)  # but for coverage
+            coverage = problem.loss(alike, self.targets, self.weights, setting.unit).double()
+        columns, wanted = columns.permute(2, 0, 1), wanted.T[..., None]  # [color, coefficient, pixel]
+        self._form = torch.stack([_product(column, column.T) for column in columns])
+        self._slope = torch.stack([_product(column, want) for column, want in zip(columns, wanted, strict=True)])
+        self._constant = coverage + wanted.double().square().sum()
+
+    @staticmethod
+    def applies(problem: Problem) -> bool:
+        """Whether a problem is one of light alone, and of squares."""
+        return len(problem.free) == 1 and isinstance(problem.free[0], Light) and problem.loss.kind == "l2"
+
+    def _images_of_units(self) -> list[torch.Tensor]:
+        """Images in light of which one coefficient is 1, [view, height, width, 4] each."""
+        units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
+        if len(self.cameras) > 1:
+            return [self.renderer(unit) for unit in units]
+        return [image[None] for part in units.split(_LIGHTS_AT_ONCE) for image in self.renderer(part)]
+
+    def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        light = self.light.coefficients(values[self.light.name], self.setting).double().T[..., None]
+        form = (light * (self._form @ light - 2 * self._slope)).sum()
+        return (form + self._constant).float(), None
+
+
+def _product(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+    """A product of matrices in float64, some pixels at a time, so that no copy of all is made."""
+    parts = zip(rows.split(_PIXELS_AT_ONCE, dim=1), columns.split(_PIXELS_AT_ONCE), strict=True)
+    return torch.stack([row.double() @ column.double() for row, column in parts]).sum(dim=0)
+
+
+def make_model(problem: Problem, setting: Setting, stage: Stage) -> Model:
+    """The model that leaves out what the problem does not need."""
+    return (LightModel if LightModel.applies(problem) else Model)(problem, setting, stage)

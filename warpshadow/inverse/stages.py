@@ -1,0 +1,127 @@
+"""Stages: what a descent does in which order, coarse to fine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from warpshadow.directions import check_count
+from warpshadow.inverse.problem import Problem
+from warpshadow.scene import Visibility
+
+LAST_RATE = 0.1
+"""Share of its learning rate that a stage ends with."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a descent; coarse ones first.
+
+    Args:
+        iterations: At most so many, for each candidate.
+        learning_rate: At the start; it falls along a cosine to a tenth.
+        scale: Size of the images as a part of the targets'.
+        softness: κ of directional visibility; by default the scene's. Softer shadows reach farther.
+        directions: Number of cells of directional visibility; by default the scene's.
+        supersampling: Samples a pixel across and down; by default the scene's.
+        candidates: How many descents take part. They go on from the best of the stage before; where those are fewer,
+            others start scattered around the best. The least loss tells them apart.
+        regularization: Factor of all regularizers: coarse stages want more of them.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    iterations: int = 200
+    learning_rate: float = 0.02
+    scale: float = 1.0
+    softness: float | None = None
+    directions: int | None = None
+    supersampling: int | None = None
+    candidates: int = 1
+    regularization: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name in ("iterations", "candidates"):
+            count = getattr(self, name)
+            if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+                raise ValueError(f"{name}: got {count!r}, expected a whole number from 1 on")
+        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
+            raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
+        if not (math.isfinite(self.regularization) and self.regularization >= 0):
+            raise ValueError(f"regularization: got {self.regularization!r}, expected a factor of 0 or more")
+        if not 0 < self.scale <= 1:
+            raise ValueError(f"scale: got {self.scale!r}, expected a part of the image, above 0 and up to 1")
+        if self.softness is not None and not (math.isfinite(self.softness) and self.softness > 0):
+            raise ValueError(f"softness: got {self.softness!r}, expected a positive number of cell radii")
+        if self.directions is not None:
+            check_count("directions", self.directions)
+        if self.supersampling is not None and self.supersampling not in range(1, 17):
+            raise ValueError(f"supersampling: got {self.supersampling!r}, expected a whole number from 1 to 16")
+
+    def rate(self, iteration: int) -> float:
+        """Learning rate of an iteration."""
+        fall = 0.5 * (1 + math.cos(math.pi * iteration / self.iterations))
+        return self.learning_rate * (LAST_RATE + (1 - LAST_RATE) * fall)
+
+    def visibility(self, visibility: Visibility) -> Visibility:
+        """A scene's visibility with what the stage says of it."""
+        softness = visibility.softness if self.softness is None else self.softness
+        directions = visibility.directions if self.directions is None else self.directions
+        return replace(visibility, softness=softness, directions=directions)
+
+
+def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
+    """Raise ValueError for what the last stage of a long fit would stumble over."""
+    if not stages:
+        raise ValueError("stages: got none, expected one or more")
+    visibility, camera = problem.visibility, problem.cameras()[0]
+    for number, stage in enumerate(stages):
+        try:
+            stage.visibility(visibility)
+            camera.resized(stage.scale)
+        except ValueError as error:
+            raise ValueError(f"stages[{number}]: {error}") from error
+
+
+# ------------------------------------------------------------------------------------------------ ways that work
+
+
+def pose_stages(problem: Problem) -> tuple[Stage, ...]:
+    """Find a pose from 10° to 40° and a quarter of the body away.
+
+    A descent from there ends in a wrong pose about once in eight times, and its loss tells: so it starts from the pose
+    as it is and turned by 30° fourteen ways, on images of some 32 pixels, and the best five, two and one go on.
+    """
+    small, middle, large = (_scale(problem, size) for size in (32, 64, 128))
+    coarse: dict[str, Any] = {"directions": 64, "supersampling": 1}
+    return (
+        Stage(25, 0.05, small, softness=1.0, candidates=15, **coarse),
+        Stage(25, 0.03, small, softness=0.5, candidates=5, **coarse),
+        Stage(30, 0.03, middle, softness=0.5, candidates=2, **coarse),
+        Stage(30, 0.015, large),
+    )
+
+
+def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
+    """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones."""
+    middle, large = (_scale(problem, size) for size in (64, 128))
+    coarse: dict[str, Any] = {"directions": 64, "supersampling": 1}
+    return (
+        Stage(60, 0.06, middle, softness=1.0, regularization=4.0, **coarse),
+        Stage(80, 0.04, middle, regularization=2.0, **coarse),
+        Stage(50, 0.02, large),
+    )
+
+
+def _scale(problem: Problem, size: int) -> float:
+    """The part 1 / n of the targets' size whose shorter side is nearest to a number of pixels, and whole."""
+    height, width, _ = problem.targets[0].image.shape
+    common = math.gcd(height, width)
+    factors = [n for n in range(1, common + 1) if common % n == 0]
+    return 1 / min(factors, key=lambda n: abs(math.log(min(height, width) / n / size)))
