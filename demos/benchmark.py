@@ -23,6 +23,7 @@ import warp as wp
 from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
+from warpshadow import inverse
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
@@ -135,6 +136,22 @@ def main(device: str, runs: int) -> None:
         print(f"  {label:54}{milliseconds:8.1f} ms")
 
 
+def time_fits(device: str) -> None:
+    """Median iterations of whole fits of the bunny scene: images of 256 × 256, steps of the optimizer included."""
+    scene = bunny_scene()
+    problems = {
+        "light, order 5, ray traced": (inverse.Light(), {}),
+        "light, order 5, images compared by l1": (inverse.Light(), {"loss": inverse.Loss("l1")}),
+        "texture of the ground, 256 × 256, ray traced": (inverse.Texture(1), {}),
+        "pose of the bunny": (inverse.Pose(0), {}),
+        "deformation of the bunny": (inverse.Deformation(0), {}),
+    }
+    target = inverse.Target(ws.render(scene, device=device) * 0.9)
+    for label, (free, options) in problems.items():
+        result = inverse.fit(inverse.Problem(scene, target, free, **options), [inverse.Stage(30)], device=device)
+        print(f"  {f'iteration of inverse.fit: {label}':70}{1e3 * result.seconds:8.2f} ms", flush=True)
+
+
 def in_turn(rows: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
     """Median milliseconds of each function, in turn.
 
@@ -198,5 +215,6 @@ if __name__ == "__main__":
     parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
     arguments = parser.parse_args()
     main(arguments.device, arguments.runs)
+    time_fits(arguments.device)
     if arguments.compile:
         time_compilation(arguments.device)

@@ -48,6 +48,7 @@ COLUMNS: dict[str, ws.Visibility | None] = {
     "ray traced": None,
 }
 STILL = ("texture", "light")
+CELLS = "ray traced, 512 cells"
 MITSUBA = "Mitsuba 3"
 SPHERES, ORDERS = (50, 100, 150, 200), (4, 5, 6, 7, 8)
 
@@ -121,7 +122,14 @@ def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
 
             scene, seconds, count, reason = fit_by_mitsuba(case, iterations)
         else:
-            result = inverse.fit(case.by(COLUMNS[column]), stages, progress=True)
+            problem = case.by(COLUMNS.get(column))
+            if column == CELLS:  # a map in place of 25 coefficients: lamps and suns, not their blur
+                problem = dataclasses.replace(problem, free=inverse.Light(order=None, directions=512))
+                stages = [
+                    dataclasses.replace(stage, iterations=min(500, iterations or 500), learning_rate=0.15)
+                    for stage in stages
+                ]
+            result = inverse.fit(problem, stages, progress=True)
             scene, seconds, reason = result.scene, result.seconds, result.reason
             count = sum(map(len, result.losses))
         figures: dict[str, Any] = case.measure(scene)
@@ -141,7 +149,7 @@ def main(data: Path | None, output: Path, count: int, names: list[str], iteratio
         columns = [column for column in COLUMNS if name in STILL or COLUMNS[column] is not None]
         wanted = {
             column: f"{name} | {number:02} {mesh.name}, {sky_name} | {column}"
-            for column in [*columns, *([MITSUBA] if has_mitsuba else [])]
+            for column in [*columns, *([CELLS] if name == "light" else []), *([MITSUBA] if has_mitsuba else [])]
         }
         missing = {column: key for column, key in wanted.items() if key not in results.figures}
         case = make[name](number) if missing else None
@@ -185,7 +193,7 @@ def prepare(output: Path) -> None:
 
 def table(name: str, figures: dict[str, dict[str, Any]]) -> str:
     """Markdown of one problem: a row for each method, mean ± standard deviation over the scenes, and what failed."""
-    columns = [column for column in [*COLUMNS, MITSUBA] if any(_is(key, name, column) for key in figures)]
+    columns = [column for column in [*COLUMNS, CELLS, MITSUBA] if any(_is(key, name, column) for key in figures)]
     kinds = {"texture": ["texture MSE"], "light": ["relighting MSE"], "pose": ["pose MDE", "RE", "TE"]}
     kinds["geometry"] = ["geometry MDE"]
     lines = [f"| {name} | " + " | ".join(kinds[name]) + " | ms per iteration | scenes |"]

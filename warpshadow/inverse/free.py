@@ -431,7 +431,7 @@ class Deformation(Free):
 
     body: int
     rigidity: float = 1.25
-    firmness: float = 0.01
+    firmness: float = 0.001
     smoothness: float = 6.0
     count: int = 4
 
