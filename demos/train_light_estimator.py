@@ -43,7 +43,7 @@ RENDERERS = {"directional": ws.Visibility(method="directional"), "none": ws.Visi
 RAY_TRACED = ws.Visibility(method="ray-traced", samples=256)
 LABELS = {"directional": "with shadows", "none": "without"}
 EVEN_LIGHT = np.eye(ORDER**2, 1) * np.full(3, math.sqrt(4 * math.pi))  # radiance 1 from everywhere
-MIRROR = np.diag([-1.0, 1.0, 1.0])
+MIRROR = torch.from_numpy(sh.rotation_matrix(ORDER, np.diag([-1.0, 1.0, 1.0])))  # of light: left is right
 PICTURED = 3
 
 
@@ -197,30 +197,37 @@ def train(lessons: Sequence[Lesson], course: Course, team: Team, path: Path, *, 
     team.wait()  # nobody writes while another still reads
     pupil = nn.parallel.DistributedDataParallel(network) if team.count > 1 else network
 
-    mirror = torch.tensor(sh.rotation_matrix(ORDER, MIRROR)).float().to(team.device)
     renderers = {lesson.number: teacher(lesson.scene, course.through, team.device) for lesson in lessons}
-    epochs = tqdm(
-        range(first_epoch, course.epochs), desc=f"through {course.through}", disable=not team.is_first or None
-    )
-    for epoch in epochs:
+    progress = {"desc": f"through {course.through}", "disable": not team.is_first or None}
+    for epoch in (bar := tqdm(range(first_epoch, course.epochs), **progress)):
         losses = []
         for batch, mirrored in batches(lessons, epoch, course, team):
             optimizer.zero_grad()
-            shading = torch.stack([lesson.shading for lesson in batch])
-            told = pupil(torch.where(mirrored[:, None, None, None], shading.flip(2), shading))
-            lights = torch.where(mirrored[:, None, None], mirror @ told, told)
-            lights = torch.stack([lesson.to_world for lesson in batch]) @ lights
-            drawn = torch.stack([renderers[lesson.number](light) for lesson, light in zip(batch, lights, strict=True)])
-            loss = mean_difference(drawn, torch.stack([lesson.image for lesson in batch]))
+            loss = loss_of(pupil, batch, mirrored, renderers)
             loss.backward()
             optimizer.step()
             losses.append(loss.item())
         schedule.step()
-        epochs.set_postfix(loss=f"{np.mean(losses):.4f}")
+        bar.set_postfix(loss=f"{np.mean(losses):.4f}")
         if team.is_first:
             states = {name: part.state_dict() for name, part in parts.items()}
             checkpoint.save(path, {"epoch": epoch + 1, "about": about, "loss": float(np.mean(losses)), **states})
     return network
+
+
+def loss_of(
+    network: nn.Module, batch: Sequence[Lesson], mirrored: torch.Tensor, renderers: dict[int, TorchRenderer]
+) -> torch.Tensor:
+    """Draw the scenes of a batch in the light that a network tells, and compare with what it saw.
+
+    Where it looks through a mirror, bool of shape [batch], what it tells is mirrored back.
+    """
+    shading = torch.stack([lesson.shading for lesson in batch])
+    told = network(torch.where(mirrored[:, None, None, None], shading.flip(2), shading))
+    lights = torch.where(mirrored[:, None, None], MIRROR.to(told) @ told, told)
+    lights = torch.stack([lesson.to_world for lesson in batch]) @ lights
+    drawn = torch.stack([renderers[lesson.number](light) for lesson, light in zip(batch, lights, strict=True)])
+    return mean_difference(drawn, torch.stack([lesson.image for lesson in batch]))
 
 
 def teacher(scene: ws.Scene, through: str, device: torch.device) -> TorchRenderer:

@@ -77,7 +77,7 @@ def test_a_mirrored_image_is_that_of_mirrored_light():
     light[0], light[3] = 3, 1  # from the right
     body = ws.Body(ws.icosphere(0.5, 4), blockers=SPHERE.blockers, translation=(0, 0.5, 0), receivers="pixel")
     scene = ws.Scene((body, ground), light, camera, demo.RENDERERS["none"])
-    mirrored = sh.rotation_matrix(demo.ORDER, demo.MIRROR) @ light
+    mirrored = demo.MIRROR.numpy() @ light
     image, other = (ws.render(scene), ws.Renderer(scene).render(mirrored.astype(np.float32)))
     np.testing.assert_allclose(image[:, ::-1], other, atol=0.02)
     assert np.abs(image - other).max() > 0.2
@@ -169,6 +169,7 @@ try:
     demo.train(lessons, course, team, folder / "parts")
 except ZeroDivisionError:
     demo.batches = batches
+team.wait()
 resumed = demo.train(lessons, course, team, folder / "parts", resume=True)
 assert torch.equal(test.parameters(resumed), test.parameters(network))
 demo.part(team)
