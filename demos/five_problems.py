@@ -12,6 +12,7 @@ Each is solved with shadows and without (direct illumination), and its figures a
 """
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ from scenes import shipped_mesh
 import warpshadow as ws
 from warpshadow import inverse
 
+PIXELS = 256  # of a picture, across and down
 SUN = (-0.75, 0.6, -0.1)
 
 
@@ -38,7 +40,8 @@ def texture() -> list[Case]:
 
 
 def light() -> list[Case]:
-    return [problems.light_case(shipped_mesh("bunny"), sky(), [shipped_mesh("bear")])]
+    free = inverse.Light(order=None, directions=512)
+    return [problems.light_case(shipped_mesh("bunny"), sky(), [shipped_mesh("bear")], light=free)]
 
 
 def pose() -> list[Case]:
@@ -80,9 +83,15 @@ def main(names: list[str], output: Path) -> None:
 
 
 def solve(case: Case) -> list[tuple[np.ndarray, str]]:
-    """Pictures of the start, of what a fit without shadows and one with them found, and of the truth."""
-    start = case.problem.scene
-    panels = [(picture(start, case), caption("start", case.measure(start)))]
+    """Pictures of the target, of the start, of what fits without and with shadows found, and of the truth."""
+    start, (target,) = case.problem.scene, case.problem.targets
+    panels = [
+        (
+            enlarged(target.image * target.weights()[..., None]),
+            "target" + (", masked" if target.mask is not None else ""),
+        )
+    ]
+    panels.append((picture(start, case), caption("start", case.measure(start))))
     for label, visibility in (("without shadows", problems.DIRECT), ("with shadows", None)):
         began = time.perf_counter()
         result = inverse.fit(case.by(visibility), case.stages, progress=True)
@@ -98,7 +107,15 @@ def caption(label: str, figures: dict[str, float]) -> str:
 
 def picture(scene: ws.Scene, case: Case) -> np.ndarray:
     """What was found, ray traced: a texture in plain light, light on another body, shapes where they are."""
-    return problems.ray_traced(case.shown(scene), 256)
+    shown = case.shown(scene)
+    return problems.ray_traced(
+        dataclasses.replace(shown, camera=shown.camera.resized(PIXELS / shown.camera.width)), 512
+    )
+
+
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """An image at the size of the pictures, pixels repeated."""
+    return image.repeat(PIXELS // len(image), axis=0).repeat(PIXELS // len(image), axis=1)
 
 
 if __name__ == "__main__":

@@ -83,8 +83,7 @@ def texture_case(mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_hidden:
     """
     truth = changed(body_on_ground(mesh, sky, size=256), 1, texture=pattern(seed))
     if is_hidden:
-        size = truth.camera.width
-        camera = ws.Camera.look_at((0.2, 3.2, 0.1), (-1.3, 0, -1.3), up=(-1, 0, -1), fov_y=36, size=(size, size))
+        camera = ws.Camera.look_at((1.9, 4.0, 0.2), (1.9, 0.0, 0.2), up=(0, 0, -1), fov_y=24)  # beside the body
         truth = dataclasses.replace(truth, camera=camera)
     start = changed(truth, 1, texture=np.full_like(truth.bodies[1].texture, 0.5))
     problem = inverse.Problem(start, inverse.Target(ray_traced(truth)), inverse.Texture(1))
@@ -125,7 +124,9 @@ def light_case(
     def on_another(scene: ws.Scene) -> ws.Scene:
         return dataclasses.replace(relit[0], light=scene.light)
 
-    return Case(problem, truth, (inverse.Stage(300, learning_rate=0.05),), measure, on_another)
+    is_map = problem.free[0].directions is not None
+    stage = inverse.Stage(500, learning_rate=0.15) if is_map else inverse.Stage(300, learning_rate=0.05)
+    return Case(problem, truth, (stage,), measure, on_another)
 
 
 # ------------------------------------------------------------------------------------------------ pose

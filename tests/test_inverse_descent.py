@@ -111,10 +111,11 @@ def test_stages_go_from_coarse_to_fine_and_from_soft_to_sharp_and_carry_the_best
     stages = [Stage(5, scale=0.25, softness=2.0), Stage(4, scale=0.5, directions=32), Stage(3)]
     result = fit(small_problem(loss=loss), stages)
     assert [len(losses) for losses in result.losses] == [5, 4, 3]
-    assert [image.shape[1] for image in loss.seen] == [6] * 5 + [12] * 4 + [24] * 3
+    # and once more where the last step of each led
+    assert [image.shape[1] for image in loss.seen] == [6] * 6 + [12] * 5 + [24] * 4
     alike = [Stage(5, learning_rate=0.1), Stage(3, learning_rate=0.1)]
     result = fit(small_problem(), alike)
-    assert result.losses[1][0] == min(result.losses[0])
+    assert result.losses[1][0] <= min(result.losses[0])
 
 
 @pytest.mark.parametrize("change", [{"softness": 2.0}, {"directions": 128}])
@@ -131,6 +132,11 @@ def test_the_rate_falls_along_a_cosine_to_a_tenth():
     rates = [stage.rate(iteration) for iteration in range(100)]
     assert rates[0] == 2 and rates[50] == pytest.approx(1.1) and 0.2 < rates[99] < 0.201
     assert sorted(rates, reverse=True) == rates
+
+
+def test_where_the_last_step_led_counts():
+    problem = small_problem()
+    assert not np.array_equal(fit(problem, [Stage(1)]).images(), fit(problem, [Stage(1)]).images_at_start())
 
 
 def test_a_size_that_is_not_whole_is_refused_at_once_with_its_stage():
@@ -366,7 +372,7 @@ def test_what_becomes_infinite_ends_the_fit_with_the_values_before(case):
     with pytest.warns(FitWarning, match=rf"stopped in stage 2: .*{what}.*the best values before it are kept"):
         result = fit(problem, stages, optimizer=optimizer)
     calm = fit(problem, stages[:1], optimizer=optimizer)
-    assert min(result.losses[-1]) == min(calm.losses[0])
+    assert min(result.losses[-1]) <= min(calm.losses[0])
     assert all(torch.isfinite(tensor).all() for own in result.values.values() for tensor in own.values())
     assert np.isfinite(ws.render(result.scene)).all() and np.isfinite(result.images()).all()
     assert np.array_equal(result.images(), calm.images())
@@ -448,7 +454,7 @@ def test_a_fit_that_has_ended_is_not_computed_again(tmp_path):
     first = fit(problem, STAGES, checkpoint=path)
     count = len(loss.seen)
     second = fit(problem, STAGES, checkpoint=path)
-    assert len(loss.seen) == count == 7 and same(first, second)
+    assert len(loss.seen) == count == 9 and same(first, second)  # 7 steps, and where the last of each stage led
     assert np.array_equal(first.images(), second.images())
 
 

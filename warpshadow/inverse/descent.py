@@ -203,7 +203,7 @@ class _Descent:
         is_over = has_converged or self.failure is not None or len(losses) == self.stages[self.stage].iterations
         if not is_over:
             return True
-        self.ended.append(_Run(min(losses, default=math.inf), self.best, self.failure))
+        self.ended.append(self._ended_run())
         if len(self.ended) < len(self.candidates):
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])
@@ -221,6 +221,18 @@ class _Descent:
         self.candidates, self.ended = self._widened(ranked), []
         self._begin_stage()
         return True
+
+    def _ended_run(self) -> _Run:
+        """The best values of a run; its last step may have led to them."""
+        best = _Run(min(self.losses[-1], default=math.inf), self.best, self.failure)
+        if self.failure is not None:
+            return best
+        try:
+            with torch.no_grad():
+                last = float(self.model.loss(self.values)[0])
+        except ValueError as error:  # a step too far to be drawn
+            return best._replace(failure=str(error))
+        return _Run(last, _copied(self.values), None) if last < best.loss else best
 
     def _step(self) -> None:
         """Evaluate the loss and take a step."""
@@ -299,7 +311,7 @@ def fit(
         tolerance: A stage has converged when over 25 iterations its loss fell by less than this part.
         device: Where to compute.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
-            off, with the result that it would have had.
+            off, with the result that it would have had (on a CPU, to the bit).
         checkpoint_seconds: Time between checkpoints [s].
         preview: PNG that shows targets, images and their difference while the fit runs.
         preview_seconds: Time between previews [s].

@@ -107,7 +107,11 @@ class Problem:
 
     def found(self, values: dict[str, Values], setting: Setting) -> Found:
         """The scene with values in it, and its own visibility."""
-        found = Found(replace(setting.scene, visibility=self.scene.visibility), list(setting.cameras))
+        found = Found(
+            replace(setting.scene, visibility=self.scene.visibility),
+            list(setting.cameras),
+            [1.0] * len(setting.cameras),
+        )
         with torch.no_grad():
             for free in self.free:
                 free.settle(values[free.name], setting, found)

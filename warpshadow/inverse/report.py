@@ -83,9 +83,9 @@ class Report:
         }
         if math.isfinite(seconds):
             fit["milliseconds_per_iteration"] = round(1e3 * seconds, 3)
-        exposures = found.exposures or [1.0] * len(found.cameras)
         views = [
-            {"exposure": factor} | camera_table(camera) for camera, factor in zip(found.cameras, exposures, strict=True)
+            {"exposure": factor} | camera_table(camera)
+            for camera, factor in zip(found.cameras, found.exposures, strict=True)
         ]
         return {"fit": fit, "view": views}
 

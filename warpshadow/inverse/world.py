@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -151,7 +151,7 @@ class Found:
 
     scene: Scene
     cameras: list[Camera]
-    exposures: list[float] = field(default_factory=list)
+    exposures: list[float]
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""
