@@ -73,36 +73,39 @@ def main(names: list[str], output: Path) -> None:
     ws.quiet()
     torch.set_num_threads(1)
     output.mkdir(parents=True, exist_ok=True)
+    every: list[list[tuple[np.ndarray, str]]] = []
     for name in names or PROBLEMS:
         rows = [solve(case) for case in PROBLEMS[name]()]
-        path = output / f"{name}.png"
-        contact_sheet(rows, margin=58).save(path)
+        every += rows
+        contact_sheet(rows, margin=58).save(output / f"{name}.png")
+        print(name)
         for _, caption in (panel for row in rows for panel in row):
             print("  " + ", ".join(caption.split("\n")))
-        print(f"{path}\n", flush=True)
+    contact_sheet(every, margin=58).save(output / "inverse.png")
+    print(f"{output / 'inverse.png'}, and a picture for each problem beside it")
 
 
 def solve(case: Case) -> list[tuple[np.ndarray, str]]:
     """Pictures of the target, of the start, of what fits without and with shadows found, and of the truth."""
     start, (target,) = case.problem.scene, case.problem.targets
+    truth = picture(case.truth, case)
+    seen = enlarged(target.image * target.weights()[..., None])
+    seen[..., :3] *= np.percentile(truth[..., :3], 99) / np.percentile(seen[..., :3], 99)  # as bright as the others
     panels = [
-        (
-            enlarged(target.image * target.weights()[..., None]),
-            "target" + (", masked" if target.mask is not None else ""),
-        )
+        (seen, "target" + (", masked" if target.mask is not None else "")),
+        (picture(start, case), caption("start", case.measure(start))),
     ]
-    panels.append((picture(start, case), caption("start", case.measure(start))))
     for label, visibility in (("without shadows", problems.DIRECT), ("with shadows", None)):
         began = time.perf_counter()
         result = inverse.fit(case.by(visibility), case.stages, progress=True)
         seconds = time.perf_counter() - began
         figures = caption(label, case.measure(result.scene))
         panels.append((picture(result.scene, case), f"{figures}\n{sum(map(len, result.losses))} it., {seconds:.0f} s"))
-    return [*panels, (picture(case.truth, case), "truth\nray traced")]
+    return [*panels, (truth, "truth\nray traced")]
 
 
 def caption(label: str, figures: dict[str, float]) -> str:
-    return f"{label}\n" + ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
+    return f"{label}\n" + ", ".join(f"{name} {value:.2g}" for name, value in figures.items())
 
 
 def picture(scene: ws.Scene, case: Case) -> np.ndarray:

@@ -111,11 +111,10 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
 def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
     """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones."""
     middle, large = (_scale(problem, size) for size in (64, 128))
-    coarse: dict[str, Any] = {"directions": 64, "supersampling": 1}
     return (
-        Stage(60, 0.06, middle, softness=1.0, regularization=4.0, **coarse),
-        Stage(80, 0.04, middle, regularization=2.0, **coarse),
-        Stage(50, 0.02, large),
+        Stage(50, 0.06, middle, softness=0.7, directions=64, supersampling=1, regularization=4.0),
+        Stage(100, 0.04, middle, supersampling=1, regularization=2.0),
+        Stage(40, 0.02, large),
     )
 
 
