@@ -9,7 +9,7 @@ with the intrinsics of the camera, the measured light, and the bunny where it is
 and reflectance.toml, which goes on from there and finds the ground without the shadow.
 
 The same is done with the image as it was before all that, which tells what a photograph costs, and by direct
-illumination, which tells what shadows are worth. Each has a folder, in which these two commands do the same:
+illumination, which tells what shadows are worth. Each has a folder, with the files that these commands would write:
 
     warpshadow fit pose.toml -o pose
     warpshadow fit reflectance.toml -o reflectance

@@ -124,11 +124,17 @@ def test_bodies_that_stand_on_the_ground_or_sink_in_a_little_still_have_a_ground
     assert not fitted
 
 
+def test_a_plane_in_which_a_body_stands_deep_is_its_ground_still(fitted):
+    """As it may where a fit of the body's pose starts."""
+    _, radii = spheres_of(ws.Body(ws.plane(8.0, 2), blockers=9), ball(translation=(0, 0.3, 0)))
+    assert not fitted and len(radii) == 1 + len(spheres_of(ball())[1])
+
+
 @pytest.mark.parametrize(
     ("name", "others"),
     [
         ("bodies on both sides of it", [(0, 1.5, 0), (0, -1.5, 0)]),
-        ("a body through it", [(0, 0.3, 0)]),
+        ("a body more behind it than before it", [(0, -0.3, 0)]),
         ("bodies below it", [(0, -1.5, 0)]),
         ("nothing else", []),
     ],

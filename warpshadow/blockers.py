@@ -11,7 +11,7 @@ from warpshadow.spheres import Spheres, fit_spheres
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
     """Find the spheres of each body, in its own space, fitting those that are wanted.
 
-    A flat body with (nearly) everything else on its front side is a ground (or a wall): one sphere that touches it from
+    A flat body with the middles of all others on its front side is a ground (or a wall): one sphere that touches it from
     behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets none.
     """
     if scene.visibility.method not in SPHERE_METHODS:
@@ -55,13 +55,13 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
     middle = points.mean(axis=0)
     *_, axes = np.linalg.svd(points - middle, full_matrices=False)
     seen_from = np.concatenate(others)
-    heights = (seen_from - middle) @ normal
     size = np.ptp((points - middle) @ axes.T, axis=0)
     is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
-    is_behind = np.mean(heights < -1e-2 * size[0])  # a body may stand a little in the ground
-    if not is_flat or is_behind > 0.1 or heights.mean() <= 0:
+    # a body may stand in the ground, and a fit may start with one deep in it
+    is_in_front = all(np.mean((other - middle) @ normal) > 0 for other in others)
+    if not is_flat or not is_in_front:
         return None
-    height = heights.mean()
+    height = np.mean((seen_from - middle) @ normal)
     a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
     length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
     numerator = (a * np.cross(b, c)).sum(axis=1)
