@@ -11,8 +11,9 @@ from warpshadow.spheres import Spheres, fit_spheres
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
     """Find the spheres of each body, in its own space, fitting those that are wanted.
 
-    A flat body with the middles of all others on its front side is a ground (or a wall): one sphere that touches it from
-    behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets none.
+    A flat body with the middles of all others on its front side is a ground (or a wall): one sphere that touches it
+    from behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets
+    none.
     """
     if scene.visibility.method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)
