@@ -81,9 +81,7 @@ def test_a_fit_is_measured_and_one_that_fails_is_listed(demos, ball_case):
     problems, tables = demos
     figures = tables.solve(ball_case, "directional", None)
     assert figures["iterations"] == 30 and figures["reason"] == "finished" and figures["ms"] > 0
-    assert (
-        figures["TE"] < 0.1 * ball_case.measure(ball_case.problem.scene)["TE"]
-    )  # how a ball is turned, none can tell
+    assert figures["TE"] < 0.1 * ball_case.measure(ball_case.problem.scene)["TE"]  # how a ball is turned, none can tell
     assert tables.solve(ball_case, "directional", 3)["iterations"] == 3
     key = "pose | 00 ball, sky | "
     shared = {key + "directional": figures, key + "direct illumination": {"error": "ValueError: it would not"}}
