@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from warpshadow import tables
-from warpshadow.image import linear_to_srgb, write_image
+from warpshadow.image import write_image
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.preview import white_of, write_picture
+from warpshadow.inverse.preview import white_of
 from warpshadow.inverse.stages import Stage
 from warpshadow.light import EnvironmentMap
 from warpshadow.scene_file import camera_table, write_scene
@@ -96,7 +96,7 @@ class Report:
         white = white_of(targets)
         for name, images in pictures.items():
             side_by_side = np.concatenate(list(images[..., :3]), axis=1)
-            write_picture(folder / f"{name}.png", linear_to_srgb(np.clip(side_by_side / white, 0, 1)))
+            write_image(folder / f"{name}.png", side_by_side / white)
         return [folder / f"{name}.png" for name in pictures]
 
 
