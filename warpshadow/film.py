@@ -4,13 +4,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
-from warpshadow.raster import Fragments
+from warpshadow.raster import Fragments, run_length
 from warpshadow.tape import launch, record_adjoint
-
-
-def run_length(device: wp.Device, width: int) -> int:
-    """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
-    return 1 if device.is_cuda else width
 
 
 @wp.func

@@ -51,6 +51,11 @@ class Fragments:
     barycentrics: wp.array
 
 
+def run_length(device: wp.Device, width: int) -> int:
+    """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
+    return 1 if device.is_cuda else width
+
+
 @wp.kernel(enable_backward=False)
 def _snap(
     # in

@@ -22,8 +22,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
-from warpshadow.film import run_length
-from warpshadow.raster import Fragments, _instance, _relative, _volumes
+from warpshadow.raster import Fragments, _instance, _relative, _volumes, run_length
 from warpshadow.tape import launch, record_adjoint
 
 MAX_PROBES = 7
