@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import statistics
 import time
@@ -52,7 +53,7 @@ class Result:
     reason: str
     seconds: float
 
-    @property
+    @functools.cached_property
     def found(self) -> Found:
         """Scene, cameras and exposures."""
         return self.problem.found(self.values, self.setting)
@@ -114,7 +115,7 @@ class _Descent:
         self.ended: list[_Run] = []
         self.losses: list[list[float]] = []
         self.reason: str | None = None
-        self._begin_stage()
+        self._begin_run(self.candidates[0])
         # The optimizer is known by what it makes: a partial or a lambda has no name that says all of it.
         made = f"{type(self.optimizer).__qualname__} {self.optimizer.state_dict()!r}"
         self.fingerprint = f"{problem.fingerprint()} {stages!r} {tolerance!r} {seed} {made}"
@@ -129,7 +130,8 @@ class _Descent:
         ]
         return [*best[:count], *scattered]
 
-    def _begin_stage(self) -> None:
+    def begin_stage(self) -> None:
+        """Set up the model of a stage, and its first candidate."""
         self.model = make_model(self.problem, self.setting, self.stages[self.stage])
         self._begin_run(self.candidates[0])
         self.losses.append([])
@@ -170,7 +172,7 @@ class _Descent:
         device = self.setting.device
         self.stage = state["stage"]
         self.candidates = [_copied(values, device) for values in state["candidates"]]
-        self._begin_stage()
+        self.begin_stage()
         self._begin_run(_copied(state["values"], device))
         self.optimizer.load_state_dict(state["optimizer"])
         self.ended = [_Run(loss, _copied(best, device), failure) for loss, best, failure in state["ended"]]
@@ -219,7 +221,7 @@ class _Descent:
             return False
         self.stage += 1
         self.candidates, self.ended = self._widened(ranked), []
-        self._begin_stage()
+        self.begin_stage()
         return True
 
     def _ended_run(self) -> _Run:
@@ -336,7 +338,9 @@ def fit(
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
     descent = _Descent(problem, stages, optimizer, tolerance, seed, torch.device(device), progress)
     state = None if checkpoint is None else checkpoints.load(checkpoint)
-    if state is not None:
+    if state is None:
+        descent.begin_stage()
+    else:
         descent.restore(state)
 
     def save() -> None:
