@@ -16,8 +16,12 @@ from warpshadow.directions import CHUNK
 Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
 """Coefficients of one receiver that reach the vector units together."""
 
-MODULE_OPTIONS = {"max_unroll": 1}
-"""Options of modules whose kernels loop over lanes: unrolled, such loops take ten times as long to compile."""
+MODULE_OPTIONS = {"max_unroll": 1, "cpu_compiler_flags": "-march=native -fno-unroll-loops -fno-slp-vectorize"}
+"""Options of modules whose kernels loop over lanes.
+
+Unrolled by Warp, such loops take ten times as long to compile. Unrolled by the compiler, they are put together again
+as far as it finds what belongs together; left alone, each becomes a vector instruction, and kernels run twice as fast.
+"""
 
 
 def lane_count(device: wp.DeviceLike) -> int:
@@ -39,6 +43,8 @@ def lane_type(lanes: int) -> type:
 class LaneFunctions(NamedTuple):
     """Kernel functions on lanes that Warp's vectors lack."""
 
+    is_any_above: wp.Function
+    find_group: wp.Function
     load: wp.Function
     load_products: wp.Function
     add_vectors: wp.Function
@@ -54,6 +60,33 @@ class LaneFunctions(NamedTuple):
 def lane_functions(lanes: int) -> LaneFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane = lane_type(lanes)
+
+    # Warp's maximum and sum of a vector go from item to item, each waiting for the one before.
+    @wp.func_native(f"""
+    bool is_above = false;
+    for (int lane = 0; lane < {lanes}; ++lane)
+        is_above |= value.c[lane] > limit;
+    return is_above;
+    """)
+    def is_any_above(value: Lane, limit: float) -> bool: ...
+
+    @wp.func_native(f"""
+    float part[{lanes}];
+    for (int lane = 0; lane < {lanes}; ++lane)
+        part[lane] = value.c[lane];
+    for (int half = {lanes} / 2; half > 0; half /= 2)
+        for (int lane = 0; lane < half; ++lane)
+            part[lane] += part[lane + half];
+    return part[0];
+    """)
+    def total(value: Lane) -> float: ...
+
+    @wp.func
+    def find_group(row: int, vertex_count: int):
+        """Instance and group of a row, where the groups of all instances follow each other."""
+        group_count = (vertex_count + (lanes - 1)) // lanes
+        batch = row // group_count
+        return batch, row - batch * group_count
 
     @wp.func
     def load(values: wp.array(dtype=wp.vec3), group: int):
@@ -78,12 +111,12 @@ def lane_functions(lanes: int) -> LaneFunctions:
         group: int,
         scratch: wp.array(dtype=Lane),
     ):
-        """scratch[k] = a b of the group's vertices in ``count`` columns k from ``begin`` on; 0 past the last vertex."""
-        for k in range(begin, begin + count):
+        """scratch[k] = a b of the group's vertices in the column ``begin`` + k, 0 past the last vertex."""
+        for k in range(count):
             value = Lane()
             for lane in range(wp.min(lanes, a.shape[0] - group * lanes)):
                 vertex = group * lanes + lane
-                value[lane] = a[vertex, k] * b[vertex, k]
+                value[lane] = a[vertex, begin + k] * b[vertex, begin + k]
             scratch[k] = value
 
     @wp.func
@@ -91,14 +124,6 @@ def lane_functions(lanes: int) -> LaneFunctions:
         """Add to a group's vectors."""
         for lane in range(wp.min(lanes, values.shape[0] - group * lanes)):
             wp.atomic_add(values, group * lanes + lane, wp.vec3(x[lane], y[lane], z[lane]))
-
-    @wp.func
-    def total(value: Lane):
-        """Sum over the lanes."""
-        sum_ = float(0.0)
-        for lane in range(lanes):
-            sum_ += value[lane]
-        return sum_
 
     @wp.func
     def add_to_sphere(
@@ -138,11 +163,11 @@ def lane_functions(lanes: int) -> LaneFunctions:
     def store_columns(
         scratch: wp.array(dtype=Lane), begin: int, count: int, group: int, rows: wp.array2d(dtype=wp.float32)
     ):
-        """rows[the group's vertices, k] = scratch[k] for ``count`` columns k from ``begin`` on."""
+        """rows[the group's vertices, begin + k] = scratch[k] for ``count`` columns."""
         for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
             vertex = group * lanes + lane
-            for k in range(begin, begin + count):
-                rows[vertex, k] = scratch[k][lane]
+            for k in range(count):
+                rows[vertex, begin + k] = scratch[k][lane]
 
     @wp.func
     def store_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
@@ -158,7 +183,17 @@ def lane_functions(lanes: int) -> LaneFunctions:
         return root
 
     return LaneFunctions(
-        load, load_products, add_vectors, add_to_sphere, load_rows, add_rows, store_rows, store_columns, sqrt
+        is_any_above,
+        find_group,
+        load,
+        load_products,
+        add_vectors,
+        add_to_sphere,
+        load_rows,
+        add_rows,
+        store_rows,
+        store_columns,
+        sqrt,
     )
 
 

@@ -18,6 +18,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.directions import CHUNK, check_count, chunk_cones, edge_width
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 
@@ -26,11 +27,15 @@ SOFTNESS = 0.35
 
 _OPAQUE = 1.0e-4  # below this transmittance a chunk is not looked at any more
 
+_PAIR_COST = 3.0e-3
+"""Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
+
 
 @functools.cache
 def _reach_function(lanes: int) -> wp.Function:
     """Make the kernel function that says whether a cone, widened by w, reaches that of a chunk for any receiver."""
     Lane = lane_type(lanes)
+    is_any_above = lane_functions(lanes).is_any_above
 
     @wp.func
     def reaches(
@@ -47,9 +52,37 @@ def _reach_function(lanes: int) -> wp.Function:
         # u·axis > cos(θ + w + the chunk's half-angle)
         limit = chunk_edge[0] * (cos_width * cosine - sin_width * sine)
         limit -= chunk_edge[1] * (sin_width * cosine + cos_width * sine)
-        return wp.max(axis[0] * ux + axis[1] * uy + axis[2] * uz - limit) > 0.0
+        return is_any_above(axis[0] * ux + axis[1] * uy + axis[2] * uz - limit, 0.0)
 
     return reaches
+
+
+@functools.cache
+def _rise_function(lanes: int) -> wp.Function:
+    """Make the kernel function that says whether a cone, widened by w, rises above the horizon of any receiver."""
+    Lane = lane_type(lanes)
+    is_any_above = lane_functions(lanes).is_any_above
+
+    @wp.func
+    def rises(
+        ux: Lane,
+        uy: Lane,
+        uz: Lane,
+        cosine: Lane,
+        sine: Lane,
+        nx: Lane,
+        ny: Lane,
+        nz: Lane,
+        cos_width: float,
+        sin_width: float,
+    ):
+        # u·n > cos(90° + θ + w), which a cone wider than 90° does anyway
+        height = wp.cw_mul(ux, nx) + wp.cw_mul(uy, ny) + wp.cw_mul(uz, nz)
+        depth = sin_width * cosine + cos_width * sine
+        excess = wp.max(sin_width * sine - cos_width * cosine, Lane(0.0)) * 1.0e9
+        return is_any_above(height + depth + excess, 0.0)
+
+    return rises
 
 
 @functools.cache
@@ -116,90 +149,248 @@ def _edge_adjoint(lanes: int) -> wp.Function:
     return adjoint
 
 
+RUN = 16
+"""Spheres that are culled together, in the order in which they are given: best near each other."""
+
+
+@wp.kernel(enable_backward=False)
+def _bound_runs(
+    # in
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    # out
+    bounds: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a run of spheres: center and radius of a sphere around them, which is negative for none."""
+    batch, run = wp.tid()
+    begin = run * RUN
+    end = wp.min(begin + RUN, radii.shape[1])
+    low = wp.vec3(wp.inf)
+    high = wp.vec3(-wp.inf)
+    for sphere in range(begin, end):
+        if radii[batch, sphere] > TINY_RADIUS:
+            extent = wp.vec3(radii[batch, sphere])
+            low = wp.min(low, centers[batch, sphere] - extent)
+            high = wp.max(high, centers[batch, sphere] + extent)
+    middle = 0.5 * (low + high)
+    reach = float(-1.0)
+    for sphere in range(begin, end):
+        if radii[batch, sphere] > TINY_RADIUS:
+            reach = wp.max(reach, wp.length(centers[batch, sphere] - middle) + radii[batch, sphere])
+    if reach < 0.0:
+        middle = wp.vec3(0.0)
+    bounds[batch, run] = wp.vec4(middle[0], middle[1], middle[2], reach)
+
+
+@functools.cache
+def _find_chunks_function(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that lists the chunks of directions that a run of spheres can reach."""
+    Lane = lane_type(lanes)
+    sqrt, is_any_above = lane_functions(lanes).sqrt, lane_functions(lanes).is_any_above
+    reaches, rises = _reach_function(lanes), _rise_function(lanes)
+
+    @wp.func
+    def find_chunks(
+        x: Lane,
+        y: Lane,
+        z: Lane,
+        nx: Lane,
+        ny: Lane,
+        nz: Lane,
+        bound: wp.vec4,
+        sphere: int,
+        first_chunk: int,
+        chunk_axes: wp.array(dtype=wp.vec3),
+        chunk_edges: wp.array(dtype=wp.vec2),
+        cos_width: float,
+        sin_width: float,
+        ends: wp.array(dtype=wp.int32),
+        found: wp.array(dtype=wp.int32),
+    ):
+        count = int(0)
+        if bound[3] > 0.0:
+            dx = Lane(bound[0]) - x
+            dy = Lane(bound[1]) - y
+            dz = Lane(bound[2]) - z
+            distance = sqrt(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz))
+            is_within = is_any_above(-distance, -1.001 * bound[3])
+            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(TINY_RADIUS)))
+            ux = wp.cw_mul(dx, inverse)
+            uy = wp.cw_mul(dy, inverse)
+            uz = wp.cw_mul(dz, inverse)
+            sine = wp.min(1.001 * bound[3] * inverse, Lane(1.0))
+            cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
+            is_up = bool(True)
+            if wp.static(has_horizon):
+                is_up = is_within or rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+            if is_up:
+                for chunk in range(ends.shape[0]):
+                    if ends[chunk] > sphere:
+                        place = first_chunk + chunk
+                        if is_within or reaches(
+                            ux, uy, uz, cosine, sine, chunk_axes[place], chunk_edges[place], cos_width, sin_width
+                        ):
+                            found[count] = chunk
+                            count += 1
+        return count
+
+    return find_chunks
+
+
 @functools.cache
 def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load, store_columns, sqrt = fn.load, fn.store_columns, fn.sqrt
-    cone, edge, reaches = relative_cone_function(lanes), _edge_function(lanes), _reach_function(lanes)
+    find_group, is_any_above = fn.find_group, fn.is_any_above
+    cone, edge = relative_cone_function(lanes), _edge_function(lanes)
+    reaches, rises, find_chunks = (
+        _reach_function(lanes),
+        _rise_function(lanes),
+        _find_chunks_function(has_horizon, lanes),
+    )
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
+        first_row: int,
+        worker: int,
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
         centers: wp.array2d(dtype=wp.vec3),
         radii: wp.array2d(dtype=wp.float32),
+        bounds: wp.array2d(dtype=wp.vec4),
         directions: wp.array(dtype=wp.vec3),
         chunk_axes: wp.array(dtype=wp.vec3),
         chunk_edges: wp.array(dtype=wp.vec2),
         cos_width: float,
         sin_width: float,
         # scratch
-        scratch: wp.array3d(dtype=Lane),
+        scratch: wp.array2d(dtype=Lane),
+        found_chunks: wp.array2d(dtype=wp.int32),
         # out
         ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a chunk of 16 directions; ends are where it stopped looking."""
-        batch, group, chunk = wp.tid()
-        begin = chunk * CHUNK
-        row = scratch[batch, group]
-        for q in range(begin, begin + CHUNK):
-            row[q] = Lane(1.0)
+        """A thread owns a group of receivers and a span of chunks; ends are where it stopped looking, for each."""
+        item, span = wp.tid()
+        row = first_row + item
+        batch, group = find_group(row, points.shape[1])
+        own = scratch_place(worker, row * ends.shape[1] + span)
+        passing = scratch[own]
+        found = found_chunks[own]
+        own_ends = ends[row, span]
+        chunk_count = own_ends.shape[0]
+        first_chunk = span * chunk_count
+        for q in range(chunk_count * CHUNK):
+            passing[q] = Lane(1.0)
         x, y, z = load(points[batch], group)
-        axis = chunk_axes[chunk]
-        brightest = float(1.0)
+        nx = Lane(0.0)
+        ny = Lane(0.0)
+        nz = Lane(0.0)
         if wp.static(has_horizon):
             nx, ny, nz = load(normals[batch], group)
-            if wp.max(axis[0] * nx + axis[1] * ny + axis[2] * nz) < -chunk_edges[chunk][1]:
-                brightest = 0.0  # wholly below the horizon: the cosine is zero there
-        sphere = int(0)
-        while sphere < centers.shape[1] and brightest > _OPAQUE:
-            radius = radii[batch, sphere]
-            center = centers[batch, sphere]
-            if radius > TINY_RADIUS:
-                curvature = 1.0 / radius
-                ux, uy, uz, cosine, sine2, weight = cone(
-                    curvature * (Lane(center[0]) - x),
-                    curvature * (Lane(center[1]) - y),
-                    curvature * (Lane(center[2]) - z),
-                )
-                sine = sqrt(sine2)
-                if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
-                    low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
-                    most = Lane(0.0)
-                    for q in range(begin, begin + CHUNK):
-                        omega = directions[q]
-                        t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
-                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                        passing = wp.cw_mul(row[q], Lane(1.0) - wp.cw_mul(opacity, step))
-                        most = wp.max(most, passing)
-                        row[q] = passing
-                    brightest = wp.max(most)
-            sphere += 1
-        ends[batch, group, chunk] = sphere
-        store_columns(row, begin, CHUNK, group, transmittance[batch])
+        for chunk in range(chunk_count):
+            own_ends[chunk] = centers.shape[1]
+            if wp.static(has_horizon):
+                axis = chunk_axes[first_chunk + chunk]
+                height = axis[0] * nx + axis[1] * ny + axis[2] * nz
+                if not is_any_above(height, -chunk_edges[first_chunk + chunk][1]):
+                    own_ends[chunk] = 0  # wholly below the horizon: the cosine is zero there
+        for run in range(bounds.shape[1]):
+            begin = run * RUN
+            found_count = find_chunks(
+                x,
+                y,
+                z,
+                nx,
+                ny,
+                nz,
+                bounds[batch, run],
+                begin,
+                first_chunk,
+                chunk_axes,
+                chunk_edges,
+                cos_width,
+                sin_width,
+                own_ends,
+                found,
+            )
+            sphere = begin
+            while found_count > 0 and sphere < wp.min(begin + RUN, centers.shape[1]):
+                radius = radii[batch, sphere]
+                center = centers[batch, sphere]
+                if radius > TINY_RADIUS:
+                    curvature = 1.0 / radius
+                    ux, uy, uz, cosine, sine2, weight = cone(
+                        curvature * (Lane(center[0]) - x),
+                        curvature * (Lane(center[1]) - y),
+                        curvature * (Lane(center[2]) - z),
+                    )
+                    sine = sqrt(sine2)
+                    is_up = bool(True)
+                    if wp.static(has_horizon):
+                        is_up = rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+                    if is_up:
+                        low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
+                        for k in range(found_count):
+                            chunk = found[k]
+                            place = first_chunk + chunk
+                            if own_ends[chunk] > sphere:
+                                if reaches(
+                                    ux,
+                                    uy,
+                                    uz,
+                                    cosine,
+                                    sine,
+                                    chunk_axes[place],
+                                    chunk_edges[place],
+                                    cos_width,
+                                    sin_width,
+                                ):
+                                    most = Lane(0.0)
+                                    for i in range(CHUNK):
+                                        omega = directions[place * CHUNK + i]
+                                        t = omega[0] * ux + omega[1] * uy + omega[2] * uz - low
+                                        t = wp.min(wp.max(wp.cw_mul(t, slope), Lane(0.0)), Lane(1.0))
+                                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                                        left = wp.cw_mul(
+                                            passing[chunk * CHUNK + i], Lane(1.0) - wp.cw_mul(opacity, step)
+                                        )
+                                        most = wp.max(most, left)
+                                        passing[chunk * CHUNK + i] = left
+                                    if not is_any_above(most, _OPAQUE):
+                                        own_ends[chunk] = sphere + 1
+                sphere += 1
+        store_columns(passing, first_chunk * CHUNK, chunk_count * CHUNK, group, transmittance[batch])
 
     return transmit
 
 
 @functools.cache
-def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
+def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    load, load_products, sqrt = fn.load, fn.load_products, fn.sqrt
+    find_group, load, load_products, sqrt = fn.find_group, fn.load, fn.load_products, fn.sqrt
     add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_ = relative_cone_function(lanes), cone_adjoint(lanes)
-    edge, edge_adjoint, reaches = _edge_function(lanes), _edge_adjoint(lanes), _reach_function(lanes)
+    edge, edge_adjoint = _edge_function(lanes), _edge_adjoint(lanes)
+    reaches, rises, find_chunks = (
+        _reach_function(lanes),
+        _rise_function(lanes),
+        _find_chunks_function(has_horizon, lanes),
+    )
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit_adjoint(
+        first_row: int,
+        worker: int,
         # in
         points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
         centers: wp.array2d(dtype=wp.vec3),
         radii: wp.array2d(dtype=wp.float32),
+        bounds: wp.array2d(dtype=wp.vec4),
         directions: wp.array(dtype=wp.vec3),
         chunk_axes: wp.array(dtype=wp.vec3),
         chunk_edges: wp.array(dtype=wp.vec2),
@@ -209,80 +400,136 @@ def _transmit_adjoint_kernel(lanes: int) -> wp.Kernel:
         transmittance: wp.array3d(dtype=wp.float32),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
-        scratch: wp.array3d(dtype=Lane),
+        scratch: wp.array2d(dtype=Lane),
+        found_chunks: wp.array2d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a chunk of 16 directions.
+        """A thread owns a group of receivers and a span of chunks.
 
         With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
         ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
         ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
         """
-        batch, group, chunk = wp.tid()
-        begin = chunk * CHUNK
-        row = scratch[batch, group]
-        load_products(transmittance[batch], adj_transmittance[batch], begin, CHUNK, group, row)
+        item, span = wp.tid()
+        row = first_row + item
+        batch, group = find_group(row, points.shape[1])
+        own = scratch_place(worker, row * ends.shape[1] + span)
+        products = scratch[own]
+        found = found_chunks[own]
+        own_ends = ends[row, span]
+        chunk_count = own_ends.shape[0]
+        first_chunk = span * chunk_count
+        load_products(
+            transmittance[batch], adj_transmittance[batch], first_chunk * CHUNK, chunk_count * CHUNK, group, products
+        )
         x, y, z = load(points[batch], group)
+        nx = Lane(0.0)
+        ny = Lane(0.0)
+        nz = Lane(0.0)
+        if wp.static(has_horizon):
+            nx, ny, nz = load(normals[batch], group)
         adj_x = Lane(0.0)
         adj_y = Lane(0.0)
         adj_z = Lane(0.0)
-        axis = chunk_axes[chunk]
-        for sphere in range(ends[batch, group, chunk]):
-            radius = radii[batch, sphere]
-            center = centers[batch, sphere]
-            if radius > TINY_RADIUS:
-                curvature = 1.0 / radius
-                dx = curvature * (Lane(center[0]) - x)
-                dy = curvature * (Lane(center[1]) - y)
-                dz = curvature * (Lane(center[2]) - z)
-                ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz)
-                sine = sqrt(sine2)
-                if reaches(ux, uy, uz, cosine, sine, axis, chunk_edges[chunk], cos_width, sin_width):
-                    low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
-                    sum_ = Lane(0.0)
-                    sum_t = Lane(0.0)
-                    sum_x = Lane(0.0)
-                    sum_y = Lane(0.0)
-                    sum_z = Lane(0.0)
-                    adj_opacity = Lane(0.0)
-                    for q in range(begin, begin + CHUNK):
-                        omega = directions[q]
-                        t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
-                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                        passing = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
-                        adj_blocked = -wp.cw_div(row[q], passing)
-                        adj_opacity += wp.cw_mul(adj_blocked, step)
-                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), wp.cw_mul(t, Lane(1.0) - t))
-                        sum_ += adj_t
-                        sum_t += wp.cw_mul(adj_t, t)
-                        sum_x += omega[0] * adj_t
-                        sum_y += omega[1] * adj_t
-                        sum_z += omega[2] * adj_t
-                    adj_low = wp.cw_mul(slope, sum_t - sum_)
-                    adj_high = -wp.cw_mul(slope, sum_t)
-                    adj_cosine, adj_sine2, adj_weight = edge_adjoint(
-                        cosine, sine, sine2, weight, cos_width, sin_width, adj_low, adj_high, adj_opacity
-                    )
-                    adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
-                        dx,
-                        dy,
-                        dz,
-                        curvature,
-                        wp.cw_mul(slope, sum_x),
-                        wp.cw_mul(slope, sum_y),
-                        wp.cw_mul(slope, sum_z),
-                        adj_cosine,
-                        adj_sine2,
-                        adj_weight,
-                    )
-                    adj_x -= adj_dx
-                    adj_y -= adj_dy
-                    adj_z -= adj_dz
-                    add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
+        for run in range(bounds.shape[1]):
+            begin = run * RUN
+            found_count = find_chunks(
+                x,
+                y,
+                z,
+                nx,
+                ny,
+                nz,
+                bounds[batch, run],
+                begin,
+                first_chunk,
+                chunk_axes,
+                chunk_edges,
+                cos_width,
+                sin_width,
+                own_ends,
+                found,
+            )
+            sphere = begin
+            while found_count > 0 and sphere < wp.min(begin + RUN, centers.shape[1]):
+                radius = radii[batch, sphere]
+                center = centers[batch, sphere]
+                if radius > TINY_RADIUS:
+                    curvature = 1.0 / radius
+                    dx = curvature * (Lane(center[0]) - x)
+                    dy = curvature * (Lane(center[1]) - y)
+                    dz = curvature * (Lane(center[2]) - z)
+                    ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz)
+                    sine = sqrt(sine2)
+                    is_up = bool(True)
+                    if wp.static(has_horizon):
+                        is_up = rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+                    if is_up:
+                        low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
+                        is_reached = bool(False)
+                        sum_ = Lane(0.0)
+                        sum_t = Lane(0.0)
+                        sum_x = Lane(0.0)
+                        sum_y = Lane(0.0)
+                        sum_z = Lane(0.0)
+                        adj_opacity = Lane(0.0)
+                        for k in range(found_count):
+                            chunk = found[k]
+                            place = first_chunk + chunk
+                            if own_ends[chunk] > sphere:
+                                if reaches(
+                                    ux,
+                                    uy,
+                                    uz,
+                                    cosine,
+                                    sine,
+                                    chunk_axes[place],
+                                    chunk_edges[place],
+                                    cos_width,
+                                    sin_width,
+                                ):
+                                    is_reached = True
+                                    for i in range(CHUNK):
+                                        omega = directions[place * CHUNK + i]
+                                        t = omega[0] * ux + omega[1] * uy + omega[2] * uz - low
+                                        t = wp.min(wp.max(wp.cw_mul(t, slope), Lane(0.0)), Lane(1.0))
+                                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                                        left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
+                                        adj_blocked = -wp.cw_div(products[chunk * CHUNK + i], left)
+                                        adj_opacity += wp.cw_mul(adj_blocked, step)
+                                        rise = wp.cw_mul(t, Lane(1.0) - t)
+                                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
+                                        sum_ += adj_t
+                                        sum_t += wp.cw_mul(adj_t, t)
+                                        sum_x += omega[0] * adj_t
+                                        sum_y += omega[1] * adj_t
+                                        sum_z += omega[2] * adj_t
+                        if is_reached:
+                            adj_low = wp.cw_mul(slope, sum_t - sum_)
+                            adj_high = -wp.cw_mul(slope, sum_t)
+                            adj_cosine, adj_sine2, adj_weight = edge_adjoint(
+                                cosine, sine, sine2, weight, cos_width, sin_width, adj_low, adj_high, adj_opacity
+                            )
+                            adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
+                                dx,
+                                dy,
+                                dz,
+                                curvature,
+                                wp.cw_mul(slope, sum_x),
+                                wp.cw_mul(slope, sum_y),
+                                wp.cw_mul(slope, sum_z),
+                                adj_cosine,
+                                adj_sine2,
+                                adj_weight,
+                            )
+                            adj_x -= adj_dx
+                            adj_y -= adj_dy
+                            adj_z -= adj_dz
+                            add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
+                sphere += 1
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
 
@@ -328,7 +575,6 @@ def transmittance(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    groups = group_count(vertex_count, lanes)
     axes, cosine, sine = chunk_cones(directions, width)
     cells = [
         wp.array(directions, dtype=wp.vec3, device=device),
@@ -337,8 +583,19 @@ def transmittance(
         float(np.cos(width)),
         float(np.sin(width)),
     ]
-    scratch = wp.empty((batch_count, groups, len(directions)), dtype=lane_type(lanes), device=device)
-    ends = wp.empty((batch_count, groups, len(axes)), dtype=wp.int32, device=device)
+    span_count = 1 if device.is_cpu else len(axes)  # threads for a group: one shares its cones among all chunks
+    chunk_count = len(axes) // span_count
+    bounds = wp.empty((batch_count, -(-radii.shape[1] // RUN)), dtype=wp.vec4, device=device)
+    wp.launch(
+        _bound_runs, dim=bounds.shape, inputs=[centers, radii], outputs=[bounds], device=device, record_tape=False
+    )
+    row_count = batch_count * group_count(vertex_count, lanes)
+    dim = row_count, span_count
+    scratch = [
+        empty_scratch(row_count * span_count, (chunk_count * CHUNK,), lane_type(lanes), device),
+        empty_scratch(row_count * span_count, (chunk_count,), wp.int32, device),
+    ]
+    ends = wp.empty((*dim, chunk_count), dtype=wp.int32, device=device)
     variables = [points, centers, radii]
     result = wp.empty(
         (batch_count, vertex_count, len(directions)),
@@ -346,23 +603,25 @@ def transmittance(
         device=device,
         requires_grad=any(variable.requires_grad for variable in variables),
     )
-    wp.launch(
+    cost = _PAIR_COST * lanes * radii.shape[1] * chunk_count * CHUNK
+    launch_slices(
         _transmit_kernel(normals is not None, lanes),
-        dim=ends.shape,
-        inputs=[points, normals, centers, radii, *cells, scratch],
+        dim=dim,
+        cost=cost,
+        inputs=[points, normals, centers, radii, bounds, *cells, *scratch],
         outputs=[ends, result],
         device=device,
-        record_tape=False,
     )
 
     def adjoint() -> None:
-        wp.launch(
-            _transmit_adjoint_kernel(lanes),
-            dim=ends.shape,
-            inputs=[points, centers, radii, *cells, ends, result, result.grad, scratch],
-            outputs=[variable.grad for variable in variables],
+        launch_slices(
+            _transmit_adjoint_kernel(normals is not None, lanes),
+            dim=dim,
+            cost=2 * cost,
+            inputs=[points, normals, centers, radii, bounds, *cells, ends, result, result.grad, *scratch],
+            outputs=[points.grad],
+            sums=[centers.grad, radii.grad],
             device=device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, result])

@@ -32,6 +32,7 @@ import warp as wp
 
 from warpshadow import check, sh
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import multiply, product_table
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.zonal_logs import zonal_eigen_log
@@ -67,6 +68,9 @@ LOUD = 24.0
 
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
+
+_SQUARING_COST = 0.05
+"""Nanoseconds that exponentiation takes for a receiver and a pair of coefficients."""
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
@@ -288,11 +292,14 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load_rows, store_rows, multiply_ = fn.load_rows, fn.store_rows, multiply(order, lanes)
+    find_group = fn.find_group
     measure, approximate = _measure_function(order, lanes), _base_function(order, base, lanes)
     square_held = _square_function(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def exponentiate_log_sh(
+        first_row: int,
+        worker: int,
         # in
         log_sh: wp.array3d(dtype=wp.float32),
         threshold: float,
@@ -301,7 +308,7 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
         values: wp.array(dtype=wp.float32),
         optimal: wp.array(dtype=wp.vec2),
         # scratch
-        scratch: wp.array4d(dtype=Lane),
+        scratch: wp.array3d(dtype=Lane),
         # out
         powers: wp.array4d(dtype=Lane),
         visibility: wp.array3d(dtype=wp.float32),
@@ -312,10 +319,14 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
         Powers are the approximation of f / 2^{p+1}, then what is squared. Faults count the receivers whose squarings
         are held, and those whose log is too large or not finite.
         """
-        batch, group = wp.tid()
-        row = scratch[batch, group, 0]
-        square = scratch[batch, group, 1]
-        half = powers[batch, group, 0]
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, log_sh.shape[1])
+        own = scratch[scratch_place(worker, thread)]
+        row = own[0]
+        square = own[1]
+        half = own[2]
+        if wp.static(keeps_powers):
+            half = powers[batch, group, 0]
         load_rows(log_sh[batch], group, row)
         count, scale, norm, depth, most, root, blend, _slope = measure(row, threshold)
         mean = row[0]
@@ -352,11 +363,14 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
     load_rows, add_rows, multiply_ = fn.load_rows, fn.add_rows, multiply(order, lanes)
+    find_group = fn.find_group
     measure, factors = _measure_function(order, lanes), _factor_function(base, lanes)
     square_held_adjoint = _square_adjoint_function(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def exponentiate_log_sh_adjoint(
+        first_row: int,
+        worker: int,
         # in
         log_sh: wp.array3d(dtype=wp.float32),
         threshold: float,
@@ -367,7 +381,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         powers: wp.array4d(dtype=Lane),
         adj_visibility: wp.array3d(dtype=wp.float32),
         # scratch
-        scratch: wp.array4d(dtype=Lane),
+        scratch: wp.array3d(dtype=Lane),
         # out
         adj_log_sh: wp.array3d(dtype=wp.float32),
     ):
@@ -378,11 +392,13 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         f̄0 = 2^−p/√4π (Σ q̄ q + ½ Σ ū u), h̄ = F (b q̄ + 2c h * q̄) + ½ √F (b ū + 2c (h/2) * ū), and for a(|h|), b(|h|)
         also F (√4π q̄0 a' + b' Σ q̄ h) h/|h| and the like of ū. For `quadratic` q = 4 √F u − F (3 + h).
         """
-        batch, group = wp.tid()
-        log = scratch[batch, group, 0]
-        adj_row = scratch[batch, group, 1]
-        product = scratch[batch, group, 2]
-        bent = scratch[batch, group, 3]
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, log_sh.shape[1])
+        own = scratch[scratch_place(worker, thread)]
+        log = own[0]
+        adj_row = own[1]
+        product = own[2]
+        bent = own[3]
         load_rows(log_sh[batch], group, log)
         load_rows(adj_visibility[batch], group, adj_row)
         count, scale, norm, depth, most, root, blend, blend_slope = measure(log, threshold)
@@ -500,19 +516,22 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     groups = group_count(vertex_count, lanes)
     needs_gradient = log_sh.requires_grad
     # memory that no squaring reaches is never touched
-    powers_shape = (batch_count, groups, MOST_SQUARINGS + 1 if needs_gradient else 1, order**2)
-    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device)
-    scratch = wp.empty((batch_count, groups, 4, order**2), dtype=lane_type(lanes), device=device)
+    powers_shape = (batch_count, groups, MOST_SQUARINGS + 1, order**2)
+    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if needs_gradient else None
+    row_count = batch_count * groups
+    scratch = empty_scratch(row_count, (4, order**2), lane_type(lanes), device)
     visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = wp.zeros(2, dtype=wp.int32, device=device)
-    wp.launch(
+    cost = _SQUARING_COST * lanes * order**4
+    launch_slices(
         _exponentiate_kernel(order, base, needs_gradient, lanes),
-        dim=(batch_count, groups),
+        dim=[row_count],
+        cost=cost,
         inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal, scratch],
-        outputs=[powers, visibility, faults],
+        outputs=[powers, visibility],
+        sums=[faults],
         device=device,
-        record_tape=False,
     )
     if not device.is_capturing:
         held, broken = faults.numpy().tolist()
@@ -527,13 +546,13 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
 
     def adjoint() -> None:
         table = product_table(order, str(device))
-        wp.launch(
+        launch_slices(
             _exponentiate_adjoint_kernel(order, base, lanes),
-            dim=(batch_count, groups),
+            dim=[row_count],
+            cost=2 * cost,
             inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad, scratch],
             outputs=[log_sh.grad],
             device=device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [log_sh, visibility])

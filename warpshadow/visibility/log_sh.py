@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow import check, sh
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
@@ -17,6 +18,13 @@ from warpshadow.visibility.zonal_logs import LOGS, band_type, look_up, look_up_s
 
 HORIZON_FADE = 0.5
 """A sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane."""
+
+
+_PAIR_COST = 0.25
+"""Nanoseconds that a sphere costs for a receiver and a coefficient."""
+
+_PRODUCT_COST = 0.05
+"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
 
 
 @functools.cache
@@ -37,12 +45,14 @@ def _horizon_function(lanes: int) -> wp.Function:
 def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = lane_functions(lanes)
-    load, store_rows = fn.load, fn.store_rows
+    find_group, load, store_rows = fn.find_group, fn.load, fn.store_rows
     cone, horizon, look_up_ = relative_cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
     add_rotated_zonal_ = add_rotated_zonal(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def accumulate_log_sh(
+        first_row: int,
+        worker: int,
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
@@ -50,19 +60,20 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         radii: wp.array2d(dtype=wp.float32),
         table: wp.array2d(dtype=Band),
         # scratch
-        total: wp.array3d(dtype=Lane),
+        total: wp.array2d(dtype=Lane),
         # out
         log_sh: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers and sums the log-visibility of all spheres."""
-        batch, group = wp.tid()
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, points.shape[1])
         x, y, z = load(points[batch], group)
         nx = Lane(0.0)
         ny = Lane(0.0)
         nz = Lane(0.0)
         if wp.static(has_horizon):
             nx, ny, nz = load(normals[batch], group)
-        row = total[batch, group]
+        row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
         for sphere in range(centers.shape[1]):
@@ -93,13 +104,16 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
 def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
     fn = lane_functions(lanes)
-    load, load_rows, add_vectors, add_to_sphere = fn.load, fn.load_rows, fn.add_vectors, fn.add_to_sphere
+    find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
+    add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_, horizon = relative_cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
     look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def accumulate_log_sh_adjoint(
+        first_row: int,
+        worker: int,
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
@@ -108,7 +122,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         table: wp.array2d(dtype=Band),
         adj_log_sh: wp.array3d(dtype=wp.float32),
         # scratch
-        scratch: wp.array3d(dtype=Lane),
+        scratch: wp.array2d(dtype=Lane),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_normals: wp.array2d(dtype=wp.vec3),
@@ -120,8 +134,9 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā s²,
         and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
         """
-        batch, group = wp.tid()
-        row = scratch[batch, group]
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, points.shape[1])
+        row = scratch[scratch_place(worker, thread)]
         load_rows(adj_log_sh[batch], group, row)
         x, y, z = load(points[batch], group)
         nx = Lane(0.0)
@@ -235,33 +250,35 @@ def accumulate(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    groups = group_count(vertex_count, lanes)
+    row_count = batch_count * group_count(vertex_count, lanes)
     variables = [points, normals, centers, radii]
     table = zonal_table(order, log, str(device))
-    scratch = wp.empty((batch_count, groups, order**2), dtype=lane_type(lanes), device=device)
+    scratch = empty_scratch(row_count, (order**2,), lane_type(lanes), device)
     log_sh = wp.empty(
         (batch_count, vertex_count, order**2),
         dtype=wp.float32,
         device=device,
         requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
     )
-    wp.launch(
+    cost = _PAIR_COST * lanes * radii.shape[1] * order**2
+    launch_slices(
         _accumulate_kernel(order, normals is not None, lanes),
-        dim=(batch_count, groups),
+        dim=[row_count],
+        cost=cost,
         inputs=[*variables, table, scratch],
         outputs=[log_sh],
         device=device,
-        record_tape=False,
     )
 
     def adjoint() -> None:
-        wp.launch(
+        launch_slices(
             _accumulate_adjoint_kernel(order, normals is not None, lanes),
-            dim=(batch_count, groups),
+            dim=[row_count],
+            cost=2 * cost,
             inputs=[*variables, table, log_sh.grad, scratch],
-            outputs=[None if variable is None else variable.grad for variable in variables],
+            outputs=[points.grad, None if normals is None else normals.grad],
+            sums=[centers.grad, radii.grad],
             device=device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, log_sh])
@@ -275,13 +292,15 @@ def accumulate(
 def _product_kernel(order: int, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = lane_functions(lanes)
-    load, store_rows = fn.load, fn.store_rows
+    find_group, load, store_rows = fn.find_group, fn.load, fn.store_rows
     cone, look_up_ = relative_cone_function(lanes), look_up(order, lanes)
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     UNIT = wp.constant(float(np.sqrt(4 * np.pi)))  # the coefficient of the constant function 1
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def multiply_spheres(
+        first_row: int,
+        worker: int,
         # in
         points: wp.array2d(dtype=wp.vec3),
         centers: wp.array2d(dtype=wp.vec3),
@@ -291,15 +310,17 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
         pairs: wp.array(dtype=wp.vec2i),
         values: wp.array(dtype=wp.float32),
         # scratch
-        scratch: wp.array4d(dtype=Lane),
+        scratch: wp.array3d(dtype=Lane),
         # out
         visibility: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers and multiplies the visibility of one sphere after the other."""
-        batch, group = wp.tid()
-        so_far = scratch[batch, group, 0]
-        factor = scratch[batch, group, 1]
-        product = scratch[batch, group, 2]
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, points.shape[1])
+        own = scratch[scratch_place(worker, thread)]
+        so_far = own[0]
+        factor = own[1]
+        product = own[2]
         for i in range(wp.static(order**2)):
             so_far[i] = Lane(0.0)
         so_far[0] = Lane(UNIT)
@@ -354,22 +375,22 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    groups = group_count(vertex_count, lanes)
+    row_count = batch_count * group_count(vertex_count, lanes)
     visibility = wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device)
-    wp.launch(
+    launch_slices(
         _product_kernel(order, lanes),
-        dim=(batch_count, groups),
+        dim=[row_count],
+        cost=_PRODUCT_COST * lanes * radii.shape[1] * order**4,
         inputs=[
             points,
             centers,
             radii,
             zonal_table(order, "indicator", str(device)),
             *product_table(order, str(device)),
-            wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device),
+            empty_scratch(row_count, (3, order**2), lane_type(lanes), device),
         ],
         outputs=[visibility],
         device=device,
-        record_tape=False,
     )
     if not (device.is_capturing or np.isfinite(visibility.numpy()).all()):
         count = radii.shape[1]

@@ -1,0 +1,168 @@
+"""All cores: kernels that take long on a CPU run in slices, on threads of a pool.
+
+Warp runs a CPU kernel on the thread that launches it, one item after another. It calls the kernel through ctypes, which
+lets go of Python's lock; so the rows of a launch are cut into slices that several threads run at once. What a kernel
+needs for that is in its first two arguments:
+
+    first_row   the slice's first row, to which it adds the row that Warp tells it
+    worker      which thread runs it, so which scratch memory is its own; -1 on a GPU, where each row has some
+
+Where rows add to the same numbers, each slice adds to numbers of its own, which are then summed in the slices' order.
+So results are the same to the bit whatever the number of threads. A GPU gets the whole launch as one slice.
+"""
+
+import collections
+import copy
+import functools
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
+
+_LEAST_WORK = 1.0e5
+"""Nanoseconds of work that a slice has at least: waking a thread takes a third of that."""
+
+_SLICES_PER_THREAD = 4
+"""Rows differ in how long they take; threads that are done early take what slices are left."""
+
+_SUMMED_SLICES = 16
+"""Most slices of a launch whose sums are its slices' own: the same for any number of threads."""
+
+_thread_count: int | None = None
+
+
+def thread_count() -> int:
+    """Threads that kernels run on on a CPU."""
+    if _thread_count is not None:
+        return _thread_count
+    text = os.environ.get(ENVIRONMENT_VARIABLE, "")
+    if not text:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not text.isdecimal() or int(text) < 1:
+        raise ValueError(f"{ENVIRONMENT_VARIABLE}: got {text!r}, expected a positive whole number")
+    return int(text)
+
+
+def set_thread_count(count: int | None) -> None:
+    """Set how many threads kernels run on on a CPU; results do not depend on it.
+
+    Args:
+        count: Positive; None for what the environment variable WARPSHADOW_NUM_THREADS says, or all cores.
+
+    Raises:
+        ValueError: for another count.
+    """
+    global _thread_count
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise ValueError(f"count: got {count!r}, expected a positive whole number, or None for all cores")
+    _thread_count = count
+
+
+@functools.cache
+def _pool(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="warpshadow")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has the pool but not its threads
+
+
+@wp.func
+def scratch_place(worker: int, row: int):
+    """The scratch memory that a kernel's thread may use."""
+    place = worker
+    if worker < 0:
+        place = row
+    return place
+
+
+def empty_scratch(row_count: int, shape: Sequence[int], dtype: type, device: wp.Device) -> wp.array:
+    """Scratch memory, [*shape] for each worker on a CPU, and for each row on a GPU."""
+    return wp.empty((thread_count() if device.is_cpu else row_count, *shape), dtype=dtype, device=device)
+
+
+def launch_slices(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    *,
+    cost: float,
+    inputs: Sequence[Any],
+    outputs: Sequence[wp.array | None],
+    sums: Sequence[wp.array | None] = (),
+    device: wp.Device,
+) -> None:
+    """Launch a kernel off the tape, on a CPU in slices that threads share.
+
+    Args:
+        kernel: Its arguments are ``first_row`` and ``worker``, then inputs, outputs and sums.
+        dim: Threads in Warp's sense; the first dimension is that of rows, which write to different places.
+        cost: Roughly how long one of these threads takes [ns], which decides whether slices are worth it.
+        inputs, outputs: Arguments.
+        sums: Arrays that all rows add to; None for those that are not wanted.
+        device: Where to launch.
+    """
+    row_count = dim[0]
+    total = 1
+    for extent in dim:
+        total *= extent
+    if total == 0:
+        return
+    summed = [array for array in sums if array is not None]
+    most = _SUMMED_SLICES if summed else _SLICES_PER_THREAD * thread_count()
+    is_divisible = device.is_cpu and not device.is_capturing
+    slice_count = min(row_count, most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
+    if slice_count <= 1 or (not summed and thread_count() == 1):
+        arguments = {"inputs": [0, 0 if device.is_cpu else -1, *inputs], "outputs": [*outputs, *sums]}
+        wp.launch(kernel, dim=dim, **arguments, device=device, record_tape=False)
+        return
+    starts = [row_count * k // slice_count for k in range(slice_count + 1)]
+    own_sums = [None if array is None else wp.zeros((slice_count, *array.shape), array.dtype) for array in sums]
+    command = wp.launch(
+        kernel,
+        dim=dim,
+        inputs=[0, 0, *inputs],
+        outputs=[*outputs, *sums],
+        device=device,
+        record_tape=False,
+        record_cmd=True,
+    )
+    sums_at = 2 + len(inputs) + len(outputs)
+    slices = collections.deque()
+    for number, (first, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+        piece = copy.copy(command)
+        piece.params, piece.fwd_args = list(command.params), list(command.fwd_args)
+        piece.set_dim([end - first, *dim[1:]])
+        piece.set_param_at_index(0, first)
+        for index, array in enumerate(own_sums):
+            if array is not None:
+                piece.set_param_at_index(sums_at + index, array[number])
+        slices.append(piece)
+    _share(slices)
+    for array, parts in zip(sums, own_sums, strict=True):
+        if array is not None:
+            array.numpy()[...] += parts.numpy().sum(axis=0)
+
+
+def _share(slices: collections.deque) -> None:
+    """Run slices on the calling thread and those of the pool."""
+
+    def work(worker: int) -> None:
+        while True:
+            try:
+                piece = slices.popleft()
+            except IndexError:
+                return
+            piece.set_param_at_index(1, worker)
+            piece.launch()
+
+    count = min(thread_count(), len(slices))
+    others = [_pool(thread_count()).submit(work, worker) for worker in range(1, count)]
+    try:
+        work(0)
+    finally:
+        for other in others:
+            other.result()
