@@ -13,7 +13,7 @@ from warpshadow.visibility import directional
 # The step's slope in the dot product is 1/(hi − lo), up to 1/(1 − cos w) ≈ Q/0.245 for small caps: that much float32
 # dot products are magnified. Measured 2e-6, 8e-6, 1.3e-5, 2.7e-5 and 1.9e-4.
 FLOAT32 = {16: 1e-5, 64: 5e-5, 128: 1e-4, 256: 2e-4, 1024: 1e-3}
-# A chunk whose brightest transmittance is below 1e-4 is not looked at any more.
+# A bundle whose brightest transmittance is below 1e-4 is not looked at any more.
 OPAQUE = 1e-4
 
 
@@ -61,11 +61,11 @@ def test_softness_widens_the_edge_like_the_twins(softness, device):
 
 @pytest.mark.parametrize("count", [64, 128])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.95])
-def test_a_chunk_opposite_to_a_sphere_is_not_culled_where_the_soft_edge_reaches_it(count, share, device):
-    """The blocked cone, the softness and a chunk's cone may add up to more than 180°."""
+def test_a_bundle_opposite_to_a_sphere_is_not_culled_where_the_soft_edge_reaches_it(count, share, device):
+    """The blocked cone, the softness and a bundle's cone may add up to more than 180°."""
     directions = cells.fibonacci(count)
     softness = share * np.pi / 4 / cells.cell_radius(count)
-    for axis in cells.chunk_cones(directions).axes:
+    for axis in cells.bundle_cones(directions).axes:
         point = np.float32(0.9 * axis)[None]  # inside the sphere, which is opposite to the axis; alone in its group
         got = transmittance(point, None, [[0, 0, 0]], [1.0], directions, device, softness=softness)
         expected = twins.transmittance(*wide(point, np.zeros((1, 3)), np.ones(1)), directions, softness)
@@ -83,7 +83,7 @@ def test_transmittance_is_within_0_and_1(seed, sphere_count, scale):
 
 def test_culling_below_the_horizon_changes_nothing_above_it(device):
     points, normals, centers, radii = twins.random_scene(4, vertex_count=64)
-    normals[:] = np.repeat(normals[::16], 16, axis=0)  # groups that face one way, so that whole chunks are culled
+    normals[:] = np.repeat(normals[::16], 16, axis=0)  # groups that face one way, so that whole bundles are culled
     directions = cells.fibonacci(128)
     everything = transmittance(points, None, centers, radii, directions, device)
     culled = transmittance(points, normals, centers, radii, directions, device)

@@ -31,27 +31,28 @@ def test_equal_cells_integrate_the_first_bands(count):
 
 
 @pytest.mark.parametrize("count", [128, 256, 1024])
-def test_chunks_are_compact(count):
-    """A cap of 16 cells has half-angle arccos(1 − 32/Q); a chunk spans at most twice that."""
-    cones = cells.chunk_cones(cells.fibonacci(count))
-    assert np.arccos(cones.cosine).max() < 2 * np.arccos(1 - 32 / count)
+def test_bundles_are_compact(count):
+    """A cap of 4 cells has half-angle arccos(1 − 8/Q); a bundle spans at most twice that."""
+    cones = cells.bundle_cones(cells.fibonacci(count))
+    assert np.arccos(cones.cosine).max() < 2 * np.arccos(1 - 8 / count)
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_each_cone_holds_its_chunk_or_culls_nothing(count):
+def test_each_cone_holds_its_bundle_or_culls_nothing(count):
     directions = cells.fibonacci(count)
-    axes, cosine, sine = cells.chunk_cones(directions)
-    for chunk, axis, edge in zip(directions.reshape(-1, 16, 3), axes, cosine, strict=True):
+    axes, cosine, sine = cells.bundle_cones(directions)
+    for bundle, axis, edge in zip(directions.reshape(-1, 4, 3), axes, cosine, strict=True):
         if not axis.any():
             assert edge == 0
             continue
         assert abs(np.linalg.norm(axis) - 1) < EXACT
-        assert (chunk @ axis).min() > edge - EXACT
+        assert (bundle @ axis).min() > edge - EXACT
     np.testing.assert_allclose(cosine**2 + sine**2, 1, atol=EXACT)
 
 
-def test_a_chunk_all_over_the_sphere_has_no_axis():
-    axes, cosine, sine = cells.chunk_cones(cells.fibonacci(16))
+def test_a_bundle_all_over_the_sphere_has_no_axis():
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    axes, cosine, sine = cells.bundle_cones(corners)
     assert not axes.any() and cosine[0] == 0 and sine[0] == 1
 
 

@@ -1,4 +1,4 @@
-"""Cells of the sphere of directions: Q directions, each standing for a solid angle of 4π/Q, in compact chunks of 16."""
+"""Cells of the sphere of directions: Q directions, each standing for a solid angle of 4π/Q, in compact bundles of 4."""
 
 import functools
 from typing import NamedTuple
@@ -6,6 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 CHUNK = 16
+"""Directions that fill a vector register; their number is a multiple of it."""
+
+BUNDLE = 4
 """Directions that are culled together."""
 
 
@@ -17,7 +20,7 @@ def check_count(name: str, count: int) -> None:
 
 @functools.cache
 def fibonacci(count: int) -> np.ndarray:
-    """Fibonacci directions z = 1 − (2i+1)/Q, φ = π(1+√5)(i+½), ordered so that each run of 16 is compact.
+    """Fibonacci directions z = 1 − (2i+1)/Q, φ = π(1+√5)(i+½), ordered so that each run of 4, 8, 16, … is compact.
 
     Args:
         count: Number of directions Q, a multiple of 16.
@@ -36,13 +39,14 @@ def fibonacci(count: int) -> np.ndarray:
 
 
 def compact_order(directions: np.ndarray) -> np.ndarray:
-    """Reorder directions [Q, 3] by recursive bisection along their longest extent, down to chunks of 16."""
-    chunks = len(directions) // CHUNK
-    if chunks <= 1:
+    """Reorder directions [Q, 3] by recursive bisection along their longest extent, down to bundles."""
+    unit = CHUNK if len(directions) > CHUNK else BUNDLE
+    count = len(directions) // unit
+    if count <= 1:
         return directions
     _, axes = np.linalg.eigh(np.cov(directions.T))
     ordered = directions[np.argsort(directions @ axes[:, -1], kind="stable")]
-    middle = chunks // 2 * CHUNK
+    middle = count // 2 * unit
     return np.concatenate([compact_order(ordered[:middle]), compact_order(ordered[middle:])])
 
 
@@ -66,8 +70,8 @@ def edge_width(softness: float, count: int) -> float:
     return width
 
 
-class ChunkCones(NamedTuple):
-    """The cone around each chunk: axes [chunk, 3], cosine and sine of the half-angle [chunk].
+class BundleCones(NamedTuple):
+    """The cone around each bundle: axes [bundle, 3], cosine and sine of the half-angle [bundle].
 
     A half-angle that culls nothing is given as an axis of zero length with cosine 0 and sine 1.
     """
@@ -77,15 +81,15 @@ class ChunkCones(NamedTuple):
     sine: np.ndarray
 
 
-def chunk_cones(directions: np.ndarray, width: float = 0.0) -> ChunkCones:
-    """Bound every run of 16 directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
+def bundle_cones(directions: np.ndarray, width: float = 0.0) -> BundleCones:
+    """Bound every run of 4 directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
 
-    All three together must stay within 180°, where cosines order angles; a chunk that is too wide culls nothing.
+    All three together must stay within 180°, where cosines order angles; a bundle that is too wide culls nothing.
     """
-    chunks = directions.reshape(-1, CHUNK, 3)
-    axes = chunks.mean(axis=1)
+    bundles = directions.reshape(-1, BUNDLE, 3)
+    axes = bundles.mean(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
-    cosine = np.einsum("cqx,cx->cq", chunks, axes).min(axis=1)
+    cosine = np.einsum("bqx,bx->bq", bundles, axes).min(axis=1)
     is_wide = cosine < max(np.cos(np.radians(80)), np.sin(width))
     cosine = np.where(is_wide, 0.0, cosine)
-    return ChunkCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))
+    return BundleCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))

@@ -4,8 +4,13 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
+from warpshadow.parallel import launch_slices
 from warpshadow.raster import Fragments, run_length
 from warpshadow.tape import launch, record_adjoint
+
+
+_SAMPLE_COST = 5.0
+"""Nanoseconds that a sample takes."""
 
 
 @wp.func
@@ -19,6 +24,8 @@ def _received(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.ar
 
 @wp.kernel(enable_backward=False)
 def _expose(
+    first_row: int,
+    worker: int,
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -30,7 +37,10 @@ def _expose(
     samples: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples; they are zero before."""
-    batch, thread = wp.tid()
+    row = first_row + wp.tid()
+    run_count = samples.shape[1] // run
+    batch = row // run_count
+    thread = row - batch * run_count
     view = wp.min(batch, face_ids.shape[0] - 1)
     lit = wp.min(batch, shading.shape[0] - 1)
     reflected = wp.min(batch, albedo.shape[0] - 1)
@@ -44,6 +54,8 @@ def _expose(
 
 @wp.kernel(enable_backward=False)
 def _expose_adjoint(
+    first_row: int,
+    worker: int,
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -54,14 +66,14 @@ def _expose_adjoint(
     adj_samples: wp.array2d(dtype=wp.vec4),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
-    adj_shading: wp.array2d(dtype=wp.vec3),
     adj_albedo: wp.array2d(dtype=wp.vec3),
+    adj_shading: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples of all instances.
 
     With received r = Σ_k w_k s_k and color c = r a:  r̄ = c̄ a,  ā = c̄ r,  s̄_k = w_k r̄,  w̄_k = r̄ · s_k.
     """
-    thread = wp.tid()
+    thread = first_row + wp.tid()
     for batch in range(adj_samples.shape[0]):
         view = wp.min(batch, face_ids.shape[0] - 1)
         lit = wp.min(batch, shading.shape[0] - 1)
@@ -119,24 +131,26 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
     run = run_length(shading.device, width)
     run_count = height * width // run
     factors = [rows(fragments.face_ids), rows(fragments.barycentrics), faces, shading, rows(albedo), run]
-    wp.launch(
+    cost = _SAMPLE_COST * run
+    launch_slices(
         _expose,
-        dim=(samples.shape[0], run_count),
+        dim=[samples.shape[0] * run_count],
+        cost=cost,
         inputs=factors,
         outputs=[rows(samples)],
         device=shading.device,
-        record_tape=False,
     )
     variables = [fragments.barycentrics, shading, albedo]
 
     def adjoint() -> None:
-        wp.launch(
+        launch_slices(
             _expose_adjoint,
-            dim=run_count,
+            dim=[run_count],
+            cost=2 * cost * samples.shape[0],
             inputs=[*factors, rows(samples.grad)],
-            outputs=[rows(variable.grad) for variable in variables],
+            outputs=[rows(fragments.barycentrics.grad), rows(albedo.grad)],
+            sums=[shading.grad],
             device=shading.device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, samples])

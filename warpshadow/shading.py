@@ -6,10 +6,14 @@ from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.directions import CHUNK
 from warpshadow.lanes import Chunk, as_chunks
+from warpshadow.parallel import launch_slices
 from warpshadow.tape import record_adjoint
 
 _SLAB = 256
 """Receivers whose gradients to light a thread sums before it adds them to the others'."""
+
+_COEFFICIENT_COST = 1.0
+"""Nanoseconds that a coefficient of a receiver takes."""
 
 
 @wp.kernel(enable_backward=False)
@@ -46,6 +50,8 @@ def _sum(values: Chunk):
 
 @wp.kernel(enable_backward=False)
 def _shade(
+    first_row: int,
+    worker: int,
     # in
     transfer: wp.array3d(dtype=wp.float32),
     transfer_chunks: wp.array3d(dtype=Chunk),
@@ -55,7 +61,9 @@ def _shade(
     shading: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
-    batch, vertex = wp.tid()
+    row = first_row + wp.tid()
+    batch = row // shading.shape[1]
+    vertex = row - batch * shading.shape[1]
     seen = wp.min(batch, transfer.shape[0] - 1)
     lit = wp.min(batch, light.shape[0] - 1)
     red = Chunk(0.0)
@@ -74,6 +82,8 @@ def _shade(
 
 @wp.kernel(enable_backward=False)
 def _shade_adjoint_transfer(
+    first_row: int,
+    worker: int,
     # in
     light: wp.array3d(dtype=wp.float32),
     light_chunks: wp.array3d(dtype=Chunk),
@@ -83,7 +93,9 @@ def _shade_adjoint_transfer(
     adj_transfer_chunks: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
-    seen, vertex = wp.tid()
+    row = first_row + wp.tid()
+    seen = row // adj_shading.shape[1]
+    vertex = row - seen * adj_shading.shape[1]
     begin = seen
     end = seen + 1
     if adj_transfer.shape[0] == 1:
@@ -106,6 +118,8 @@ def _shade_adjoint_transfer(
 
 @wp.kernel(enable_backward=False)
 def _shade_adjoint_light(
+    first_row: int,
+    worker: int,
     # in
     transfer: wp.array3d(dtype=wp.float32),
     transfer_chunks: wp.array3d(dtype=Chunk),
@@ -113,8 +127,9 @@ def _shade_adjoint_light(
     # out
     adj_light: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a slab of receivers and a chunk of coefficients, the last one those left over:  L̄ = Σ T s̄."""
-    batch, slab, chunk = wp.tid()
+    """A thread owns a chunk of coefficients, the last one those left over, and a slab of receivers:  L̄ = Σ T s̄."""
+    row, batch, slab = wp.tid()
+    chunk = first_row + row
     seen = wp.min(batch, transfer.shape[0] - 1)
     lit = wp.min(batch, adj_light.shape[0] - 1)
     begin = slab * _SLAB
@@ -176,28 +191,29 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
     channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
     wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
     factors = [transfer, as_chunks(transfer), channels, as_chunks(channels)]
-    wp.launch(_shade, dim=shading.shape, inputs=factors, outputs=[shading], device=device, record_tape=False)
+    cost = _COEFFICIENT_COST * count
+    launch_slices(_shade, dim=[shading.size], cost=cost, inputs=factors, outputs=[shading], device=device)
 
     def adjoint() -> None:
         if transfer.requires_grad:
-            wp.launch(
+            launch_slices(
                 _shade_adjoint_transfer,
-                dim=transfer.shape[:2],
+                dim=[transfer.shape[0] * transfer.shape[1]],
+                cost=cost * instances / transfer.shape[0],
                 inputs=[*factors[2:], shading.grad],
                 outputs=[transfer.grad, as_chunks(transfer.grad)],
                 device=device,
-                record_tape=False,
             )
         if light.requires_grad:
             adj_channels = wp.zeros_like(channels)
             slab_count = -(-transfer.shape[1] // _SLAB)
-            wp.launch(
+            launch_slices(
                 _shade_adjoint_light,
-                dim=(instances, slab_count, -(-count // CHUNK)),
+                dim=(-(-count // CHUNK), instances, slab_count),
+                cost=_COEFFICIENT_COST * CHUNK * _SLAB,
                 inputs=[*factors[:2], shading.grad],
                 outputs=[adj_channels],
                 device=device,
-                record_tape=False,
             )
             wp.launch(
                 _join_channels,

@@ -22,8 +22,12 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
+from warpshadow.parallel import launch_slices
 from warpshadow.raster import Fragments, _instance, _relative, _volumes, run_length
 from warpshadow.tape import launch, record_adjoint
+
+_SAMPLE_COST = 15.0
+"""Nanoseconds that a sample takes."""
 
 MAX_PROBES = 7
 """Most probes of a footprint, an odd number; where it is longer still, its probes grow wider."""
@@ -542,6 +546,8 @@ def _bilinear(texels: wp.array(dtype=wp.vec3), cell: _Cell):
 
 @wp.kernel(enable_backward=False)
 def _sample(
+    first_row: int,
+    worker: int,
     # in
     face_ids: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -558,7 +564,10 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples."""
-    instance, thread = wp.tid()
+    row = first_row + wp.tid()
+    run_count = albedo.shape[1] // run
+    instance = row // run_count
+    thread = row - instance * run_count
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
     for sample in range(thread * run, (thread + 1) * run):
         texture = texture_ids[footprint, sample]
@@ -769,7 +778,14 @@ def sample_albedo(
     run = run_length(albedo.device, width)
     dim = batch_count, height * width // run
     seen = [*_seen(textures, footprints), run]
-    _launch(_sample, dim, [face_ids, barycentrics, faces, *reflecting, *seen], [rows(albedo)])
+    launch_slices(
+        _sample,
+        dim=[dim[0] * dim[1]],
+        cost=_SAMPLE_COST * run,
+        inputs=[face_ids, barycentrics, faces, *reflecting, *seen],
+        outputs=[rows(albedo)],
+        device=albedo.device,
+    )
 
     def adjoint() -> None:
         adj_albedo = rows(albedo.grad)

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.directions import CHUNK, check_count, chunk_cones, edge_width
+from warpshadow.directions import BUNDLE, CHUNK, bundle_cones, check_count, edge_width
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.tape import record_adjoint
@@ -25,7 +25,7 @@ from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
 
-_OPAQUE = 1.0e-4  # below this transmittance a chunk is not looked at any more
+_OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
 _PAIR_COST = 3.0e-3
 """Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
@@ -33,7 +33,7 @@ _PAIR_COST = 3.0e-3
 
 @functools.cache
 def _reach_function(lanes: int) -> wp.Function:
-    """Make the kernel function that says whether a cone, widened by w, reaches that of a chunk for any receiver."""
+    """Make the kernel function that says whether a cone, widened by w, reaches that of a bundle for any receiver."""
     Lane = lane_type(lanes)
     is_any_above = lane_functions(lanes).is_any_above
 
@@ -45,13 +45,10 @@ def _reach_function(lanes: int) -> wp.Function:
         cosine: Lane,
         sine: Lane,
         axis: wp.vec3,
-        chunk_edge: wp.vec2,
-        cos_width: float,
-        sin_width: float,
+        bundle_edge: wp.vec2,
     ):
-        # u·axis > cos(θ + w + the chunk's half-angle)
-        limit = chunk_edge[0] * (cos_width * cosine - sin_width * sine)
-        limit -= chunk_edge[1] * (sin_width * cosine + cos_width * sine)
+        # u·axis > cos(θ + w + the bundle's half-angle), cosine and sine being those of θ + w
+        limit = bundle_edge[0] * cosine - bundle_edge[1] * sine
         return is_any_above(axis[0] * ux + axis[1] * uy + axis[2] * uz - limit, 0.0)
 
     return reaches
@@ -64,43 +61,29 @@ def _rise_function(lanes: int) -> wp.Function:
     is_any_above = lane_functions(lanes).is_any_above
 
     @wp.func
-    def rises(
-        ux: Lane,
-        uy: Lane,
-        uz: Lane,
-        cosine: Lane,
-        sine: Lane,
-        nx: Lane,
-        ny: Lane,
-        nz: Lane,
-        cos_width: float,
-        sin_width: float,
-    ):
+    def rises(ux: Lane, uy: Lane, uz: Lane, cosine: Lane, sine: Lane, nx: Lane, ny: Lane, nz: Lane):
         # u·n > cos(90° + θ + w), which a cone wider than 90° does anyway
         height = wp.cw_mul(ux, nx) + wp.cw_mul(uy, ny) + wp.cw_mul(uz, nz)
-        depth = sin_width * cosine + cos_width * sine
-        excess = wp.max(sin_width * sine - cos_width * cosine, Lane(0.0)) * 1.0e9
-        return is_any_above(height + depth + excess, 0.0)
+        return is_any_above(height + sine + 1.0e9 * wp.max(-cosine, Lane(0.0)), 0.0)
 
     return rises
 
 
 @functools.cache
 def _edge_function(lanes: int) -> wp.Function:
-    """Make the kernel function of a cone's soft edge: cos θ, sin θ, sin²θ, weight, w → lo, hi, 1/(hi−lo), A."""
+    """Make the kernel function of a cone's soft edge: cos θ, sin θ, sin²θ, weight, lo, w → hi, 1/(hi−lo), A."""
     Lane = lane_type(lanes)
     sqrt = lane_functions(lanes).sqrt
 
     @wp.func
-    def edge(cosine: Lane, sine: Lane, sine2: Lane, weight: Lane, cos_width: float, sin_width: float):
-        low = cos_width * cosine - sin_width * sine
+    def edge(cosine: Lane, sine: Lane, sine2: Lane, weight: Lane, low: Lane, cos_width: float, sin_width: float):
         # cos(max(θ − w, 0)): where θ < w the sine of the difference is cut off at 0
         inner = wp.max(cos_width * sine - sin_width * cosine, Lane(0.0))
         high = sqrt(Lane(1.0) - wp.cw_mul(inner, inner))
         slope = wp.cw_div(Lane(1.0), high - low)
         solid_angle = wp.cw_div(sine2, Lane(1.0) + cosine)
         opacity = wp.cw_div(solid_angle, Lane(1.0) - 0.5 * (high + low))
-        return low, high, slope, wp.cw_mul(weight, wp.min(opacity, Lane(1.0)))
+        return high, slope, wp.cw_mul(weight, wp.min(opacity, Lane(1.0)))
 
     return edge
 
@@ -183,14 +166,32 @@ def _bound_runs(
 
 
 @functools.cache
-def _find_chunks_function(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that lists the chunks of directions that a run of spheres can reach."""
+def _load_normals_function(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that loads the normals of a group, 0 where there is no horizon."""
+    Lane = lane_type(lanes)
+    load = lane_functions(lanes).load
+
+    @wp.func
+    def load_normals(normals: wp.array2d(dtype=wp.vec3), batch: int, group: int):
+        x = Lane(0.0)
+        y = Lane(0.0)
+        z = Lane(0.0)
+        if wp.static(has_horizon):
+            x, y, z = load(normals[batch], group)
+        return x, y, z
+
+    return load_normals
+
+
+@functools.cache
+def _find_bundles_function(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that lists the bundles of directions that a run of spheres can reach."""
     Lane = lane_type(lanes)
     sqrt, is_any_above = lane_functions(lanes).sqrt, lane_functions(lanes).is_any_above
     reaches, rises = _reach_function(lanes), _rise_function(lanes)
 
     @wp.func
-    def find_chunks(
+    def find_bundles(
         x: Lane,
         y: Lane,
         z: Lane,
@@ -199,56 +200,89 @@ def _find_chunks_function(has_horizon: bool, lanes: int) -> wp.Function:
         nz: Lane,
         bound: wp.vec4,
         sphere: int,
-        first_chunk: int,
-        chunk_axes: wp.array(dtype=wp.vec3),
-        chunk_edges: wp.array(dtype=wp.vec2),
+        first_bundle: int,
+        axes: wp.array(dtype=wp.vec3),
+        edges: wp.array(dtype=wp.vec2),
         cos_width: float,
         sin_width: float,
         ends: wp.array(dtype=wp.int32),
         found: wp.array(dtype=wp.int32),
     ):
+        """Returns how many, 0 for a run that is wholly below the horizon."""
         count = int(0)
         if bound[3] > 0.0:
+            reach = 1.001 * bound[3]  # rounding included
             dx = Lane(bound[0]) - x
             dy = Lane(bound[1]) - y
             dz = Lane(bound[2]) - z
             distance = sqrt(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz))
-            is_within = is_any_above(-distance, -1.001 * bound[3])
-            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(TINY_RADIUS)))
+            is_within = is_any_above(-distance, -reach)
+            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
             ux = wp.cw_mul(dx, inverse)
             uy = wp.cw_mul(dy, inverse)
             uz = wp.cw_mul(dz, inverse)
-            sine = wp.min(1.001 * bound[3] * inverse, Lane(1.0))
+            sine = reach * inverse
             cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
+            wide_cosine = cos_width * cosine - sin_width * sine
+            wide_sine = sin_width * cosine + cos_width * sine
             is_up = bool(True)
             if wp.static(has_horizon):
-                is_up = is_within or rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+                is_up = is_within or rises(ux, uy, uz, wide_cosine, wide_sine, nx, ny, nz)
             if is_up:
-                for chunk in range(ends.shape[0]):
-                    if ends[chunk] > sphere:
-                        place = first_chunk + chunk
-                        if is_within or reaches(
-                            ux, uy, uz, cosine, sine, chunk_axes[place], chunk_edges[place], cos_width, sin_width
-                        ):
-                            found[count] = chunk
+                for bundle in range(ends.shape[0]):
+                    if ends[bundle] > sphere:
+                        place = first_bundle + bundle
+                        if is_within or reaches(ux, uy, uz, wide_cosine, wide_sine, axes[place], edges[place]):
+                            found[count] = bundle
                             count += 1
         return count
 
-    return find_chunks
+    return find_bundles
+
+
+@functools.cache
+def _block_function(lanes: int) -> wp.Function:
+    """Make the kernel function that lets a sphere block its share of what passes towards a bundle of directions."""
+    Lane = lane_type(lanes)
+    is_any_above = lane_functions(lanes).is_any_above
+
+    @wp.func
+    def block(
+        ux: Lane,
+        uy: Lane,
+        uz: Lane,
+        low: Lane,
+        slope: Lane,
+        opacity: Lane,
+        direction: int,
+        directions: wp.array(dtype=wp.vec3),
+        place: int,
+        passing: wp.array(dtype=Lane),
+    ):
+        """Returns whether anything is left."""
+        most = Lane(0.0)
+        for i in range(BUNDLE):
+            omega = directions[direction + i]
+            t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
+            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+            left = wp.cw_mul(passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
+            most = wp.max(most, left)
+            passing[place + i] = left
+        return is_any_above(most, _OPAQUE)
+
+    return block
 
 
 @functools.cache
 def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    load, store_columns, sqrt = fn.load, fn.store_columns, fn.sqrt
-    find_group, is_any_above = fn.find_group, fn.is_any_above
-    cone, edge = relative_cone_function(lanes), _edge_function(lanes)
-    reaches, rises, find_chunks = (
-        _reach_function(lanes),
-        _rise_function(lanes),
-        _find_chunks_function(has_horizon, lanes),
-    )
+    find_group, load, load_normals = fn.find_group, fn.load, _load_normals_function(has_horizon, lanes)
+    store_columns, sqrt, is_any_above = fn.store_columns, fn.sqrt, fn.is_any_above
+    cone, edge, block = relative_cone_function(lanes), _edge_function(lanes), _block_function(lanes)
+    reaches, rises = _reach_function(lanes), _rise_function(lanes)
+    find_bundles = _find_bundles_function(has_horizon, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
@@ -261,45 +295,41 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         radii: wp.array2d(dtype=wp.float32),
         bounds: wp.array2d(dtype=wp.vec4),
         directions: wp.array(dtype=wp.vec3),
-        chunk_axes: wp.array(dtype=wp.vec3),
-        chunk_edges: wp.array(dtype=wp.vec2),
+        axes: wp.array(dtype=wp.vec3),
+        edges: wp.array(dtype=wp.vec2),
         cos_width: float,
         sin_width: float,
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found_chunks: wp.array2d(dtype=wp.int32),
+        found_bundles: wp.array2d(dtype=wp.int32),
         # out
-        ends: wp.array3d(dtype=wp.int32),
+        all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of chunks; ends are where it stopped looking, for each."""
+        """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         item, span = wp.tid()
         row = first_row + item
         batch, group = find_group(row, points.shape[1])
-        own = scratch_place(worker, row * ends.shape[1] + span)
-        passing = scratch[own]
-        found = found_chunks[own]
-        own_ends = ends[row, span]
-        chunk_count = own_ends.shape[0]
-        first_chunk = span * chunk_count
-        for q in range(chunk_count * CHUNK):
-            passing[q] = Lane(1.0)
+        place = scratch_place(worker, row * all_ends.shape[1] + span)
+        passing = scratch[place]
+        found = found_bundles[place]
+        ends = all_ends[row, span]
+        first_bundle = span * ends.shape[0]
         x, y, z = load(points[batch], group)
-        nx = Lane(0.0)
-        ny = Lane(0.0)
-        nz = Lane(0.0)
-        if wp.static(has_horizon):
-            nx, ny, nz = load(normals[batch], group)
-        for chunk in range(chunk_count):
-            own_ends[chunk] = centers.shape[1]
+        nx, ny, nz = load_normals(normals, batch, group)
+        for bundle in range(ends.shape[0]):
+            for i in range(BUNDLE):
+                passing[bundle * BUNDLE + i] = Lane(1.0)
+            ends[bundle] = centers.shape[1]
             if wp.static(has_horizon):
-                axis = chunk_axes[first_chunk + chunk]
+                axis = axes[first_bundle + bundle]
                 height = axis[0] * nx + axis[1] * ny + axis[2] * nz
-                if not is_any_above(height, -chunk_edges[first_chunk + chunk][1]):
-                    own_ends[chunk] = 0  # wholly below the horizon: the cosine is zero there
+                if not is_any_above(height, -edges[first_bundle + bundle][1]):
+                    ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
         for run in range(bounds.shape[1]):
             begin = run * RUN
-            found_count = find_chunks(
+            end = wp.min(begin + RUN, centers.shape[1])
+            found_count = find_bundles(
                 x,
                 y,
                 z,
@@ -308,16 +338,17 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                 nz,
                 bounds[batch, run],
                 begin,
-                first_chunk,
-                chunk_axes,
-                chunk_edges,
+                first_bundle,
+                axes,
+                edges,
                 cos_width,
                 sin_width,
-                own_ends,
+                ends,
                 found,
             )
-            sphere = begin
-            while found_count > 0 and sphere < wp.min(begin + RUN, centers.shape[1]):
+            if found_count == 0:
+                end = begin
+            for sphere in range(begin, end):
                 radius = radii[batch, sphere]
                 center = centers[batch, sphere]
                 if radius > TINY_RADIUS:
@@ -328,41 +359,27 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                         curvature * (Lane(center[2]) - z),
                     )
                     sine = sqrt(sine2)
+                    low = cos_width * cosine - sin_width * sine
+                    wide_sine = sin_width * cosine + cos_width * sine
                     is_up = bool(True)
                     if wp.static(has_horizon):
-                        is_up = rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+                        is_up = rises(ux, uy, uz, low, wide_sine, nx, ny, nz)
                     if is_up:
-                        low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
+                        _high, slope, opacity = edge(cosine, sine, sine2, weight, low, cos_width, sin_width)
                         for k in range(found_count):
-                            chunk = found[k]
-                            place = first_chunk + chunk
-                            if own_ends[chunk] > sphere:
-                                if reaches(
-                                    ux,
-                                    uy,
-                                    uz,
-                                    cosine,
-                                    sine,
-                                    chunk_axes[place],
-                                    chunk_edges[place],
-                                    cos_width,
-                                    sin_width,
-                                ):
-                                    most = Lane(0.0)
-                                    for i in range(CHUNK):
-                                        omega = directions[place * CHUNK + i]
-                                        t = omega[0] * ux + omega[1] * uy + omega[2] * uz - low
-                                        t = wp.min(wp.max(wp.cw_mul(t, slope), Lane(0.0)), Lane(1.0))
-                                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                                        left = wp.cw_mul(
-                                            passing[chunk * CHUNK + i], Lane(1.0) - wp.cw_mul(opacity, step)
-                                        )
-                                        most = wp.max(most, left)
-                                        passing[chunk * CHUNK + i] = left
-                                    if not is_any_above(most, _OPAQUE):
-                                        own_ends[chunk] = sphere + 1
-                sphere += 1
-        store_columns(passing, first_chunk * CHUNK, chunk_count * CHUNK, group, transmittance[batch])
+                            bundle = found[k]
+                            at = first_bundle + bundle
+                            is_met = ends[bundle] > sphere
+                            if is_met:
+                                is_met = reaches(ux, uy, uz, low, wide_sine, axes[at], edges[at])
+                            if is_met:
+                                is_left = block(
+                                    ux, uy, uz, low, slope, opacity, at * BUNDLE, directions, bundle * BUNDLE, passing
+                                )
+                                if not is_left:
+                                    ends[bundle] = sphere + 1
+        count = ends.shape[0] * BUNDLE
+        store_columns(passing, first_bundle * BUNDLE, count, group, transmittance[batch])
 
     return transmit
 
@@ -371,15 +388,12 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
 def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = lane_functions(lanes)
-    find_group, load, load_products, sqrt = fn.find_group, fn.load, fn.load_products, fn.sqrt
-    add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
+    find_group, load, load_normals = fn.find_group, fn.load, _load_normals_function(has_horizon, lanes)
+    load_products, sqrt, add_vectors, add_to_sphere = fn.load_products, fn.sqrt, fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_ = relative_cone_function(lanes), cone_adjoint(lanes)
     edge, edge_adjoint = _edge_function(lanes), _edge_adjoint(lanes)
-    reaches, rises, find_chunks = (
-        _reach_function(lanes),
-        _rise_function(lanes),
-        _find_chunks_function(has_horizon, lanes),
-    )
+    reaches, rises = _reach_function(lanes), _rise_function(lanes)
+    find_bundles = _find_bundles_function(has_horizon, lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit_adjoint(
@@ -392,22 +406,22 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         radii: wp.array2d(dtype=wp.float32),
         bounds: wp.array2d(dtype=wp.vec4),
         directions: wp.array(dtype=wp.vec3),
-        chunk_axes: wp.array(dtype=wp.vec3),
-        chunk_edges: wp.array(dtype=wp.vec2),
+        axes: wp.array(dtype=wp.vec3),
+        edges: wp.array(dtype=wp.vec2),
         cos_width: float,
         sin_width: float,
-        ends: wp.array3d(dtype=wp.int32),
+        all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found_chunks: wp.array2d(dtype=wp.int32),
+        found_bundles: wp.array2d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of chunks.
+        """A thread owns a group of receivers and a span of bundles.
 
         With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
         ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
@@ -416,27 +430,22 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         item, span = wp.tid()
         row = first_row + item
         batch, group = find_group(row, points.shape[1])
-        own = scratch_place(worker, row * ends.shape[1] + span)
-        products = scratch[own]
-        found = found_chunks[own]
-        own_ends = ends[row, span]
-        chunk_count = own_ends.shape[0]
-        first_chunk = span * chunk_count
-        load_products(
-            transmittance[batch], adj_transmittance[batch], first_chunk * CHUNK, chunk_count * CHUNK, group, products
-        )
+        place = scratch_place(worker, row * all_ends.shape[1] + span)
+        products = scratch[place]
+        found = found_bundles[place]
+        ends = all_ends[row, span]
+        first_bundle = span * ends.shape[0]
+        count = ends.shape[0] * BUNDLE
+        load_products(transmittance[batch], adj_transmittance[batch], first_bundle * BUNDLE, count, group, products)
         x, y, z = load(points[batch], group)
-        nx = Lane(0.0)
-        ny = Lane(0.0)
-        nz = Lane(0.0)
-        if wp.static(has_horizon):
-            nx, ny, nz = load(normals[batch], group)
+        nx, ny, nz = load_normals(normals, batch, group)
         adj_x = Lane(0.0)
         adj_y = Lane(0.0)
         adj_z = Lane(0.0)
         for run in range(bounds.shape[1]):
             begin = run * RUN
-            found_count = find_chunks(
+            end = wp.min(begin + RUN, centers.shape[1])
+            found_count = find_bundles(
                 x,
                 y,
                 z,
@@ -445,16 +454,17 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                 nz,
                 bounds[batch, run],
                 begin,
-                first_chunk,
-                chunk_axes,
-                chunk_edges,
+                first_bundle,
+                axes,
+                edges,
                 cos_width,
                 sin_width,
-                own_ends,
+                ends,
                 found,
             )
-            sphere = begin
-            while found_count > 0 and sphere < wp.min(begin + RUN, centers.shape[1]):
+            if found_count == 0:
+                end = begin
+            for sphere in range(begin, end):
                 radius = radii[batch, sphere]
                 center = centers[batch, sphere]
                 if radius > TINY_RADIUS:
@@ -464,12 +474,14 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                     dz = curvature * (Lane(center[2]) - z)
                     ux, uy, uz, cosine, sine2, weight = cone(dx, dy, dz)
                     sine = sqrt(sine2)
+                    low = cos_width * cosine - sin_width * sine
+                    wide_sine = sin_width * cosine + cos_width * sine
                     is_up = bool(True)
                     if wp.static(has_horizon):
-                        is_up = rises(ux, uy, uz, cosine, sine, nx, ny, nz, cos_width, sin_width)
+                        is_up = rises(ux, uy, uz, low, wide_sine, nx, ny, nz)
                     if is_up:
-                        low, _high, slope, opacity = edge(cosine, sine, sine2, weight, cos_width, sin_width)
-                        is_reached = bool(False)
+                        _high, slope, opacity = edge(cosine, sine, sine2, weight, low, cos_width, sin_width)
+                        is_any_met = bool(False)
                         sum_ = Lane(0.0)
                         sum_t = Lane(0.0)
                         sum_x = Lane(0.0)
@@ -477,37 +489,29 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                         sum_z = Lane(0.0)
                         adj_opacity = Lane(0.0)
                         for k in range(found_count):
-                            chunk = found[k]
-                            place = first_chunk + chunk
-                            if own_ends[chunk] > sphere:
-                                if reaches(
-                                    ux,
-                                    uy,
-                                    uz,
-                                    cosine,
-                                    sine,
-                                    chunk_axes[place],
-                                    chunk_edges[place],
-                                    cos_width,
-                                    sin_width,
-                                ):
-                                    is_reached = True
-                                    for i in range(CHUNK):
-                                        omega = directions[place * CHUNK + i]
-                                        t = omega[0] * ux + omega[1] * uy + omega[2] * uz - low
-                                        t = wp.min(wp.max(wp.cw_mul(t, slope), Lane(0.0)), Lane(1.0))
-                                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                                        left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
-                                        adj_blocked = -wp.cw_div(products[chunk * CHUNK + i], left)
-                                        adj_opacity += wp.cw_mul(adj_blocked, step)
-                                        rise = wp.cw_mul(t, Lane(1.0) - t)
-                                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
-                                        sum_ += adj_t
-                                        sum_t += wp.cw_mul(adj_t, t)
-                                        sum_x += omega[0] * adj_t
-                                        sum_y += omega[1] * adj_t
-                                        sum_z += omega[2] * adj_t
-                        if is_reached:
+                            bundle = found[k]
+                            at = first_bundle + bundle
+                            is_met = ends[bundle] > sphere
+                            if is_met:
+                                is_met = reaches(ux, uy, uz, low, wide_sine, axes[at], edges[at])
+                            if is_met:
+                                is_any_met = True
+                                for i in range(BUNDLE):
+                                    omega = directions[at * BUNDLE + i]
+                                    t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
+                                    t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+                                    step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                                    left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
+                                    adj_blocked = -wp.cw_div(products[bundle * BUNDLE + i], left)
+                                    adj_opacity += wp.cw_mul(adj_blocked, step)
+                                    rise = wp.cw_mul(t, Lane(1.0) - t)
+                                    adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
+                                    sum_ += adj_t
+                                    sum_t += wp.cw_mul(adj_t, t)
+                                    sum_x += omega[0] * adj_t
+                                    sum_y += omega[1] * adj_t
+                                    sum_z += omega[2] * adj_t
+                        if is_any_met:
                             adj_low = wp.cw_mul(slope, sum_t - sum_)
                             adj_high = -wp.cw_mul(slope, sum_t)
                             adj_cosine, adj_sine2, adj_weight = edge_adjoint(
@@ -529,7 +533,6 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                             adj_y -= adj_dy
                             adj_z -= adj_dz
                             add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
-                sphere += 1
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
 
@@ -549,8 +552,8 @@ def transmittance(
 
     Args:
         points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals, vec3 of shape [batch, vertex]: chunks of directions wholly below a receiver's horizon,
-            where the cosine is zero, are left at 1. None computes them all.
+        normals: Unit normals, vec3 of shape [batch, vertex]: what lies below a receiver's horizon, where the cosine
+            is zero, may be left at 1. None computes it all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.directions.fibonacci`.
@@ -575,7 +578,7 @@ def transmittance(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    axes, cosine, sine = chunk_cones(directions, width)
+    axes, cosine, sine = bundle_cones(directions, width)
     cells = [
         wp.array(directions, dtype=wp.vec3, device=device),
         wp.array(axes, dtype=wp.vec3, device=device),
@@ -583,8 +586,9 @@ def transmittance(
         float(np.cos(width)),
         float(np.sin(width)),
     ]
-    span_count = 1 if device.is_cpu else len(axes)  # threads for a group: one shares its cones among all chunks
-    chunk_count = len(axes) // span_count
+    # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
+    span_count = 1 if device.is_cpu else len(directions) // CHUNK
+    bundle_count = len(axes) // span_count
     bounds = wp.empty((batch_count, -(-radii.shape[1] // RUN)), dtype=wp.vec4, device=device)
     wp.launch(
         _bound_runs, dim=bounds.shape, inputs=[centers, radii], outputs=[bounds], device=device, record_tape=False
@@ -592,10 +596,10 @@ def transmittance(
     row_count = batch_count * group_count(vertex_count, lanes)
     dim = row_count, span_count
     scratch = [
-        empty_scratch(row_count * span_count, (chunk_count * CHUNK,), lane_type(lanes), device),
-        empty_scratch(row_count * span_count, (chunk_count,), wp.int32, device),
+        empty_scratch(row_count * span_count, (bundle_count * BUNDLE,), lane_type(lanes), device),
+        empty_scratch(row_count * span_count, (bundle_count,), wp.int32, device),
     ]
-    ends = wp.empty((*dim, chunk_count), dtype=wp.int32, device=device)
+    ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
     variables = [points, centers, radii]
     result = wp.empty(
         (batch_count, vertex_count, len(directions)),
@@ -603,7 +607,7 @@ def transmittance(
         device=device,
         requires_grad=any(variable.requires_grad for variable in variables),
     )
-    cost = _PAIR_COST * lanes * radii.shape[1] * chunk_count * CHUNK
+    cost = _PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
     launch_slices(
         _transmit_kernel(normals is not None, lanes),
         dim=dim,

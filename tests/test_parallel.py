@@ -1,0 +1,191 @@
+"""Slices of kernels on all cores: the same results whatever the number of threads, and who decides on it."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+import twins
+import warp as wp
+
+from warpshadow import parallel
+from warpshadow.directions import fibonacci
+from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.shading import shade
+from warpshadow.transfer import directional_transfer, sh_transfer
+from warpshadow.visibility import directional, log_sh
+from warpshadow.visibility.exponential import exponentiate
+
+
+@pytest.fixture(autouse=True)
+def all_cores_afterwards():
+    yield
+    parallel.set_thread_count(None)
+
+
+@wp.kernel(enable_backward=False)
+def _spread(
+    first_row: int,
+    worker: int,
+    # in
+    values: wp.array(dtype=wp.float32),
+    # scratch
+    scratch: wp.array2d(dtype=wp.float32),
+    # out
+    squares: wp.array(dtype=wp.float32),
+    workers: wp.array(dtype=wp.int32),
+    # sums
+    total: wp.array(dtype=wp.float32),
+):
+    """A thread owns a value; the scratch memory would not keep it, were it another thread's, too."""
+    row = first_row + wp.tid()
+    own = scratch[scratch_place(worker, row)]
+    for _ in range(200):
+        own[0] = values[row]
+    squares[row] = own[0] * own[0]
+    workers[row] = worker
+    if total:
+        wp.atomic_add(total, 0, values[row])
+
+
+def spread(values, *, wants_total=True, cost=1e4):
+    device = wp.get_device("cpu")
+    count = len(values)
+    squares = wp.full(count, np.nan, dtype=wp.float32, device=device)
+    workers = wp.empty(count, dtype=wp.int32, device=device)
+    total = wp.full(1, 3.0, dtype=wp.float32, device=device) if wants_total else None
+    launch_slices(
+        _spread,
+        dim=[count],
+        cost=cost,
+        inputs=[wp.array(values, dtype=wp.float32, device=device), empty_scratch(count, (1,), wp.float32, device)],
+        outputs=[squares, workers],
+        sums=[total],
+        device=device,
+    )
+    return squares.numpy(), workers.numpy(), None if total is None else total.numpy()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_every_row_runs_once_and_sums_are_added_to_what_is_there(count):
+    parallel.set_thread_count(count)
+    values = np.arange(1000, dtype=np.float32)
+    squares, workers, total = spread(values)
+    np.testing.assert_array_equal(squares, values**2)
+    assert total == values.sum() + 3  # whole numbers: exact
+    assert set(workers) <= set(range(count))
+
+
+def test_sums_are_the_same_to_the_bit_for_any_number_of_threads():
+    values = np.random.default_rng(0).normal(size=5000).astype(np.float32)
+    totals = []
+    for count in (1, 2, 3, 8):
+        parallel.set_thread_count(count)
+        totals.append(spread(values)[2])
+    assert len({total.tobytes() for total in totals}) == 1
+    assert totals[0] != np.float32(3) + np.cumsum(values)[-1]  # they are the slices' sums, not one after the other
+
+
+def test_short_launches_are_not_divided():
+    parallel.set_thread_count(4)
+    assert set(spread(np.ones(100), cost=1.0)[1]) == {0}
+
+
+def test_nothing_is_launched_over_no_rows():
+    parallel.set_thread_count(4)
+    assert spread(np.ones(0))[2] == 3
+
+
+def test_launches_from_several_python_threads_do_not_meet():
+    parallel.set_thread_count(3)
+    failures = []
+
+    def run(seed):
+        values = np.random.default_rng(seed).normal(size=3000).astype(np.float32)
+        for _ in range(20):
+            if not np.array_equal(spread(values, wants_total=False)[0], values**2):
+                failures.append(seed)
+
+    threads = [threading.Thread(target=run, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failures
+
+
+def shaded_with_gradients(method):
+    """Shading of 3000 receivers in a batch of two, and its gradients, as bytes."""
+    parts = [twins.random_scene(seed, vertex_count=3000, sphere_count=40) for seed in (0, 1)]
+    dtypes = (wp.vec3, wp.vec3, wp.vec3, wp.float32)
+    points, normals, centers, radii = (
+        wp.array(np.stack(pair), dtype=dtype, device="cpu", requires_grad=True)
+        for pair, dtype in zip(zip(*parts, strict=True), dtypes, strict=True)
+    )
+    directions = fibonacci(128)
+    rng = np.random.default_rng(2)
+    size = 128 if method == "directional" else 64
+    light = wp.array(rng.uniform(size=(2, size, 3)), dtype=wp.vec3, device="cpu", requires_grad=True)
+    with wp.Tape() as tape:
+        if method == "directional":
+            seen = directional.transmittance(points, normals, centers, radii, directions)
+            transfer = directional_transfer(seen, normals, directions)
+        else:
+            seen = exponentiate(log_sh.accumulate(points, normals, centers, radii))
+            transfer = sh_transfer(seen, normals, order=8)
+        shading = shade(transfer, light)
+    shading.grad.assign(rng.normal(size=(2, 3000, 3)).astype(np.float32))
+    tape.backward()
+    return [shading.numpy().tobytes()] + [
+        array.grad.numpy().tobytes() for array in (points, normals, centers, radii, light)
+    ]
+
+
+@pytest.mark.filterwarnings("ignore:log-SH visibility")
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_shading_and_its_gradients_do_not_depend_on_the_number_of_threads(method):
+    results = []
+    for count in (1, 2, 5):
+        parallel.set_thread_count(count)
+        results.append(shaded_with_gradients(method))
+    assert results[0] == results[1] == results[2]
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, "2", True])
+def test_a_count_that_is_none_is_refused(count):
+    with pytest.raises(ValueError, match="count: got .*, expected a positive whole number, or None for all cores"):
+        parallel.set_thread_count(count)
+
+
+def test_the_environment_says_how_many_threads_run(monkeypatch):
+    monkeypatch.setenv(parallel.ENVIRONMENT_VARIABLE, "3")
+    assert parallel.thread_count() == 3
+    parallel.set_thread_count(2)
+    assert parallel.thread_count() == 2
+    parallel.set_thread_count(None)
+    for text in ("0", "-1", "two", "1.5"):
+        monkeypatch.setenv(parallel.ENVIRONMENT_VARIABLE, text)
+        with pytest.raises(ValueError, match=f"WARPSHADOW_NUM_THREADS: got '{text}', expected a positive whole number"):
+            parallel.thread_count()
+    monkeypatch.setenv(parallel.ENVIRONMENT_VARIABLE, "")
+    assert parallel.thread_count() == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_has_threads_of_its_own():
+    program = """
+import os, sys
+sys.path.insert(0, "tests")
+import numpy as np
+import test_parallel as test
+test.parallel.set_thread_count(2)
+test.spread(np.ones(1000))
+child = os.fork()
+if child == 0:
+    squares, _, total = test.spread(np.ones(1000))
+    os._exit(0 if squares.sum() == 1000 and total == 1003 else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
