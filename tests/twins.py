@@ -217,6 +217,38 @@ def transmittance(points, centers, radii, directions, softness=0.35):
     return result
 
 
+def merged_quads(centers, radii):
+    """Centers [quad, 3], radii [quad] and extents [quad] of the spheres of quads: moments by eigenvalues."""
+    quads = len(radii) // 4
+    c, r = centers[: 4 * quads].reshape(-1, 4, 3), radii[: 4 * quads].reshape(-1, 4)
+    share = r**3 / (r**3).sum(axis=1, keepdims=True)
+    middle = np.einsum("qk,qkx->qx", share, c)
+    d = c - middle[:, None]
+    moments = np.einsum("qk,qkx,qky->qxy", share, d, d)
+    moments += np.einsum("qk,qk,xy->qxy", share, r**2, np.eye(3)) / 5
+    x, y, z = np.linalg.eigvalsh(moments).T
+    shadow, total = 5.4 * np.sqrt((x * y + y * z + z * x) / 3), (r**2).sum(axis=1)
+    extents = ((np.sum(d**2, axis=-1) + r**2) ** 4).sum(axis=1) ** (1 / 8)
+    return middle, (shadow**-4.0 + total**-4.0) ** (-1 / 8), extents
+
+
+def merging_transmittance(points, centers, radii, directions, merging, softness=0.35):
+    """Transmittance of spheres that merge, [vertex, direction]: each quad's four and its own by their shares."""
+    middle, radius, extents = merged_quads(centers, radii)
+    tau = merging * 2 / np.sqrt(len(directions))
+    q = (extents / np.linalg.norm(middle - points[:, None], axis=-1)) ** 2
+    m = smoothstep((tau**2 - q) / (tau**2 - (0.7 * tau) ** 2))
+    result = np.ones((len(points), len(directions)))
+    for s in range(len(radii)):
+        blocked = 1 - transmittance(points, centers[s : s + 1], radii[s : s + 1], directions, softness)
+        share = 1 - m[:, s // 4] if s // 4 < len(radius) else np.ones(len(points))
+        result *= 1 - share[:, None] * blocked
+    for k in range(len(radius)):
+        blocked = 1 - transmittance(points, middle[k : k + 1], radius[k : k + 1], directions, softness)
+        result *= 1 - m[:, k, None] * blocked
+    return result
+
+
 # ------------------------------------------------------------------------------------------ shading
 
 

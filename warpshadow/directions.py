@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.order import compact_order
+
 CHUNK = 16
 """Directions that fill a vector register; their number is a multiple of it."""
 
@@ -33,21 +35,10 @@ def fibonacci(count: int) -> np.ndarray:
     z = 1 - (2 * i + 1) / count
     azimuth = np.pi * (1 + np.sqrt(5)) * (i + 0.5)
     radius = np.sqrt(1 - z**2)
-    directions = compact_order(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1))
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+    directions = directions[compact_order(directions, runs=(CHUNK, BUNDLE))]
     directions.flags.writeable = False
     return directions
-
-
-def compact_order(directions: np.ndarray) -> np.ndarray:
-    """Reorder directions [Q, 3] by recursive bisection along their longest extent, down to bundles."""
-    unit = CHUNK if len(directions) > CHUNK else BUNDLE
-    count = len(directions) // unit
-    if count <= 1:
-        return directions
-    _, axes = np.linalg.eigh(np.cov(directions.T))
-    ordered = directions[np.argsort(directions @ axes[:, -1], kind="stable")]
-    middle = count // 2 * unit
-    return np.concatenate([compact_order(ordered[:middle]), compact_order(ordered[middle:])])
 
 
 def cell_radius(count: int) -> float:

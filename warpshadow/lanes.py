@@ -54,6 +54,7 @@ class LaneFunctions(NamedTuple):
     store_rows: wp.Function
     store_columns: wp.Function
     sqrt: wp.Function
+    total: wp.Function
 
 
 @functools.cache
@@ -194,6 +195,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
         store_rows,
         store_columns,
         sqrt,
+        total,
     )
 
 

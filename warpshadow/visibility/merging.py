@@ -1,0 +1,171 @@
+"""Merging: four neighboring spheres, seen from so far that they fall into one cell of directions, are one sphere.
+
+Spheres that follow each other in memory make up a quad, which has a sphere of its own at their middle, as large as they
+look on average over all directions, and an extent E, about half of their diameter. A receiver at distance D sees the
+quad under a half-angle of about E/D, and takes
+
+    m = smoothstep((τ² − (E/D)²) / (τ² − τ0²)),  τ0 = 0.7 τ
+
+of the quad's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that nothing
+jumps as bodies move. What is seen is moved by τ at most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
+
+How large a quad looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
+they cover more than the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their parts of
+the volume, which is 5 √(e2(M)/3) on average, e2 being the sum of the products of two eigenvalues; overlapping spheres
+bulge out of it, which a factor of 1.08 makes up for. So r² = (S⁻⁴ + (5.4 √(e2/3))⁻⁴)^(−1/4): for four spheres at random
+the covered area within 10%, on average.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from warpshadow.batch import concatenate
+from warpshadow.lanes import lane_type
+from warpshadow.tape import launch
+from warpshadow.visibility.cones import TINY_RADIUS
+
+QUAD = 4
+"""Spheres that merge, in the order in which they are given: best near each other."""
+
+MERGED_FROM = 512
+"""Fewer spheres do not merge: they are so large that hardly a receiver is far enough from them."""
+
+_BLEND = 0.7  # τ0 / τ
+
+_SHADOW = 5.4  # of an ellipsoid, from the moments of spheres
+
+_FARTHEST2 = 1.0e30  # (D/E)² is kept where its products are float32
+
+
+class Nodes(NamedTuple):
+    """Spheres, and after them those of their quads; of the quads there may be none."""
+
+    centers: wp.array  # [batch, node] vec3
+    radii: wp.array  # [batch, node] float32
+    extents: wp.array  # [batch, quad] float32
+
+
+@wp.kernel
+def _merge(
+    # in
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    # out
+    merged_centers: wp.array2d(dtype=wp.vec3),
+    merged_radii: wp.array2d(dtype=wp.float32),
+    extents: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a quad."""
+    batch, quad = wp.tid()
+    a = centers[batch, 4 * quad]
+    b = centers[batch, 4 * quad + 1]
+    c = centers[batch, 4 * quad + 2]
+    d = centers[batch, 4 * quad + 3]
+    radius = wp.vec4(
+        radii[batch, 4 * quad], radii[batch, 4 * quad + 1], radii[batch, 4 * quad + 2], radii[batch, 4 * quad + 3]
+    )
+    largest = wp.max(radius)
+    if largest > TINY_RADIUS:
+        share = radius / largest
+        share = wp.cw_mul(share, wp.cw_mul(share, share))
+        share = share / (share[0] + share[1] + share[2] + share[3])
+        middle = share[0] * a + share[1] * b + share[2] * c + share[3] * d
+        size = largest + wp.max(
+            wp.max(wp.max(wp.abs(a - middle)), wp.max(wp.abs(b - middle))),
+            wp.max(wp.max(wp.abs(c - middle)), wp.max(wp.abs(d - middle))),
+        )
+        a = (a - middle) / size
+        b = (b - middle) / size
+        c = (c - middle) / size
+        d = (d - middle) / size
+        square = wp.cw_mul(radius, radius) / (size * size)
+        moments = share[0] * wp.outer(a, a) + share[1] * wp.outer(b, b)
+        moments += share[2] * wp.outer(c, c) + share[3] * wp.outer(d, d)
+        moments += 0.2 * wp.dot(share, square) * wp.identity(n=3, dtype=wp.float32)
+        trace = wp.trace(moments)
+        shadow = _SHADOW * wp.sqrt(wp.max((trace * trace - wp.ddot(moments, moments)) / 6.0, 1.0e-30))
+        total = wp.max(square[0] + square[1] + square[2] + square[3], 1.0e-15)
+        less = wp.min(shadow, total)
+        ratio = less / wp.max(shadow, total)
+        ratio = ratio * ratio * ratio * ratio
+        reach = square + wp.vec4(wp.dot(a, a), wp.dot(b, b), wp.dot(c, c), wp.dot(d, d))
+        reach = wp.cw_mul(reach, reach)
+        merged_centers[batch, quad] = middle
+        merged_radii[batch, quad] = size * wp.sqrt(less / wp.sqrt(wp.sqrt(1.0 + ratio)))
+        extents[batch, quad] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(reach, reach))))
+    else:
+        merged_centers[batch, quad] = a
+        merged_radii[batch, quad] = largest
+        extents[batch, quad] = largest
+
+
+def check_merging(merging: float) -> None:
+    """Raise ValueError unless ``merging`` is a half-angle in cell radii, 0 to 1."""
+    if not 0 <= merging <= 1:
+        raise ValueError(f"merging: got {merging!r}, expected 0 (never) to 1 cell radius")
+
+
+def merge(centers: wp.array, radii: wp.array) -> Nodes:
+    """Merge every four spheres that follow each other; what is left over stays as it is.
+
+    Args:
+        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
+        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+
+    Differentiable: centers, radii.
+    """
+    batch_count, sphere_count = radii.shape
+    shape = batch_count, sphere_count // QUAD
+    options = {"device": radii.device, "requires_grad": centers.requires_grad or radii.requires_grad}
+    merged_centers = wp.empty(shape, dtype=wp.vec3, **options)
+    merged_radii, extents = (wp.empty(shape, dtype=wp.float32, **options) for _ in range(2))
+    launch(
+        _merge, dim=shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents], device=radii.device
+    )
+    counts = [sphere_count, shape[1]]
+    return Nodes(concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents)
+
+
+def unmerged(centers: wp.array, radii: wp.array) -> Nodes:
+    """Spheres that do not merge."""
+    return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
+
+
+@functools.cache
+def merged_function(lanes: int) -> wp.Function:
+    """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
+    Lane = lane_type(lanes)
+    BLEND2 = wp.constant(_BLEND**2)
+    FARTHEST2 = wp.constant(_FARTHEST2)
+
+    @wp.func
+    def merged(x: Lane, y: Lane, z: Lane, angle: float):
+        distance2 = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(FARTHEST2)))
+        slope = 1.0 / (angle * angle * (1.0 - BLEND2))
+        t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
+        rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
+        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), rise
+
+    return merged
+
+
+@functools.cache
+def merged_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`merged_function`: x = d/E, 1/E, m' m̄ → d̄, Ē.
+
+    X² = |d|²/E², so d̄ = 2 x X̄² / E and Ē = −2 |x|² X̄² / E, X̄² being m' m̄.
+    """
+    Lane = lane_type(lanes)
+
+    @wp.func
+    def adjoint(x: Lane, y: Lane, z: Lane, inverse: float, adj_distance2: Lane):
+        pull = 2.0 * inverse * adj_distance2
+        adj_x = wp.cw_mul(pull, x)
+        adj_y = wp.cw_mul(pull, y)
+        adj_z = wp.cw_mul(pull, z)
+        return adj_x, adj_y, adj_z, -(wp.cw_mul(adj_x, x) + wp.cw_mul(adj_y, y) + wp.cw_mul(adj_z, z))
+
+    return adjoint
