@@ -20,6 +20,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.mesh import Mesh
+from warpshadow.order import compact_order
 from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
@@ -109,6 +110,7 @@ def fit_spheres(
     job = _Job(normalized, faces, seed, steps if refine else 0, wp.get_device(device))
     fit = partial(_cached_fit if cache else _fit, job, progress)
     balls, report = fit(int(count)) if error is None else _search(fit, error)
+    balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
     spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
     return SphereFit(spheres, report)
 
@@ -156,26 +158,29 @@ class _Job:
 
 def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
     """Fit spheres [sphere, 4] to a normalized mesh."""
+    from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
     began = time.perf_counter()
     mesh = NormalizedMesh(job.positions, job.faces, job.device)
     rng = np.random.default_rng(job.seed)
     spheres = np.zeros((0, 4))
-    if count:
-        spheres, balls = greedy_cover(mesh, count, rng)
-        cover_steps = COVER_STEPS_FIRST if job.steps else COVER_STEPS
-        total = cover_steps + job.steps
-        with tqdm(total=total, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False) as bar:
+    cover_steps = COVER_STEPS_FIRST if job.steps else COVER_STEPS
+    total = cover_steps + job.steps if count else 0
+    bar = tqdm(total=total, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False)
+    # threads for products of such small matrices wait for each other, for seconds where cores are busy
+    with bar, threadpool_limits(limits=1):
+        if count:
+            spheres, balls = greedy_cover(mesh, count, rng)
             for covering in descend_cover(mesh, spheres, cover_steps, rng):
                 spheres = covering
                 bar.update()
-            if job.steps:
-                for refined in Refinement(mesh, rng).run(spheres, balls, job.steps):
-                    spheres = refined
-                    bar.update()
-    spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
-    return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
+        if count and job.steps:
+            for refined in Refinement(mesh, rng).run(spheres, balls, job.steps):
+                spheres = refined
+                bar.update()
+        spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
+        return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
 
 
 # -------------------------------------------------------------------------------- cache
