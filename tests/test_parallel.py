@@ -12,7 +12,9 @@ import warp as wp
 
 from warpshadow import parallel
 from warpshadow.directions import fibonacci
+from warpshadow.mesh import icosphere
 from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.raster import interpolate, rasterize
 from warpshadow.shading import shade
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, log_sh
@@ -151,6 +153,41 @@ def test_shading_and_its_gradients_do_not_depend_on_the_number_of_threads(method
         parallel.set_thread_count(count)
         results.append(shaded_with_gradients(method))
     assert results[0] == results[1] == results[2]
+
+
+def image_with_gradients():
+    """A sphere that fills an image, and its gradients to positions in clip space and colors."""
+    ball = icosphere(subdivisions=4)
+    rng = np.random.default_rng(5)
+    clip = np.concatenate([ball.positions * 0.9, np.ones((len(ball.positions), 1))], axis=1)
+    clip[:, 2] = 0.5 - 0.4 * clip[:, 2]
+    options = {"device": "cpu", "requires_grad": True}
+    clip_positions = wp.array(clip[None], dtype=wp.vec4, **options)
+    colors = wp.array(rng.uniform(size=(1, *ball.positions.shape)), dtype=wp.vec3, **options)
+    faces = wp.array(ball.faces, dtype=wp.vec3i, device="cpu")
+    with wp.Tape() as tape:
+        image = interpolate(rasterize(clip_positions, faces, 200, 200), faces, colors)
+    image.grad.assign(rng.normal(size=(1, 200, 200, 3)).astype(np.float32))
+    tape.backward()
+    return [array.numpy().copy() for array in (image, clip_positions.grad, colors.grad)]
+
+
+def test_kernels_that_warp_differentiates_are_divided_both_ways(monkeypatch):
+    parallel.set_thread_count(2)
+    with monkeypatch.context() as patch:
+        patch.setattr(parallel, "_LEAST_WORK", 1e18)
+        whole = image_with_gradients()
+    results = []
+    for count in (1, 2, 5):
+        parallel.set_thread_count(count)
+        results.append(image_with_gradients())
+    for divided, *others in zip(*results, strict=True):
+        for other in others:
+            np.testing.assert_array_equal(divided, other)
+    np.testing.assert_array_equal(results[0][0], whole[0])
+    for divided, expected in zip(results[0][1:], whole[1:], strict=True):
+        np.testing.assert_allclose(divided, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+        assert not np.array_equal(divided, expected)  # or nothing was divided
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, "2", True])

@@ -14,12 +14,16 @@ So results are the same to the bit whatever the number of threads. A GPU gets th
 import collections
 import copy
 import functools
+import itertools
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
+
+from warpshadow.tape import record_adjoint
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
@@ -30,7 +34,10 @@ _SLICES_PER_THREAD = 4
 """Rows differ in how long they take; threads that are done early take what slices are left."""
 
 _SUMMED_SLICES = 16
-"""Most slices of a launch whose sums are its slices' own: the same for any number of threads."""
+"""Most slices of a launch whose sums are its slices' own."""
+
+_SUMMED_SIZE = 100_000
+"""Items that the sums of all slices have at most, beyond two slices: they are to be added up."""
 
 _thread_count: int | None = None
 
@@ -105,46 +112,79 @@ def launch_slices(
         sums: Arrays that all rows add to; None for those that are not wanted.
         device: Where to launch.
     """
-    row_count = dim[0]
-    total = 1
-    for extent in dim:
-        total *= extent
-    if total == 0:
-        return
-    summed = [array for array in sums if array is not None]
-    most = _SUMMED_SLICES if summed else _SLICES_PER_THREAD * thread_count()
+    arguments = {"inputs": [0, _worker(device), *inputs], "outputs": [*outputs, *sums]}
+    first_sum = 2 + len(inputs) + len(outputs)
+    _launch(kernel, dim, cost, arguments, {first_sum + k: array for k, array in enumerate(sums)}, device)
+
+
+def launch_differentiable(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    *,
+    cost: float,
+    inputs: Sequence[Any],
+    outputs: Sequence[wp.array],
+    gathered: Collection[int] = (),
+    device: wp.Device,
+) -> None:
+    """Launch a kernel that Warp differentiates, on the tape if an input requires a gradient, both ways in slices.
+
+    Args:
+        kernel, dim, cost, device: As for :func:`launch_slices`.
+        inputs, outputs: Arguments after ``first_row`` and ``worker``.
+        gathered: Which of the inputs are read anywhere, so that all rows add to their gradients; counted from 0.
+    """
+    arguments = {"inputs": [0, _worker(device), *inputs], "outputs": [*outputs]}
+    _launch(kernel, dim, cost, arguments, {}, device)
+
+    def adjoint() -> None:
+        adjoints = [value.grad if isinstance(value, wp.array) else value for value in arguments["inputs"]]
+        both = {**arguments, "adj_inputs": adjoints, "adj_outputs": [output.grad for output in outputs]}
+        _launch(kernel, dim, 2 * cost, both, {2 + k: inputs[k].grad for k in gathered}, device)
+
+    record_adjoint(adjoint, [*(value for value in inputs if isinstance(value, wp.array)), *outputs])
+
+
+def _worker(device: wp.Device) -> int:
+    return 0 if device.is_cpu else -1
+
+
+def _launch(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    cost: float,
+    arguments: dict[str, Sequence[Any]],
+    sums: dict[int, wp.array | None],
+    device: wp.Device,
+) -> None:
+    """Launch a kernel, or its adjoint if there are adjoint arguments; sums by their places among the arguments."""
+    options = {"device": device, "record_tape": False, "adjoint": "adj_inputs" in arguments}
+    total = math.prod(dim)
+    summed = {place: array for place, array in sums.items() if array is not None}
+    most = _SLICES_PER_THREAD * thread_count()
+    if summed:  # as many for any number of threads
+        most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(array.size for array in summed.values())))
     is_divisible = device.is_cpu and not device.is_capturing
-    slice_count = min(row_count, most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
+    slice_count = min(dim[0], most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
     if slice_count <= 1 or (not summed and thread_count() == 1):
-        arguments = {"inputs": [0, 0 if device.is_cpu else -1, *inputs], "outputs": [*outputs, *sums]}
-        wp.launch(kernel, dim=dim, **arguments, device=device, record_tape=False)
+        wp.launch(kernel, dim=dim, **arguments, **options)
         return
-    starts = [row_count * k // slice_count for k in range(slice_count + 1)]
-    own_sums = [None if array is None else wp.zeros((slice_count, *array.shape), array.dtype) for array in sums]
-    command = wp.launch(
-        kernel,
-        dim=dim,
-        inputs=[0, 0, *inputs],
-        outputs=[*outputs, *sums],
-        device=device,
-        record_tape=False,
-        record_cmd=True,
-    )
-    sums_at = 2 + len(inputs) + len(outputs)
+    own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
+    command = wp.launch(kernel, dim=dim, **arguments, **options, record_cmd=True)
+    starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
     slices = collections.deque()
-    for number, (first, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for number, (first, end) in enumerate(itertools.pairwise(starts)):
         piece = copy.copy(command)
-        piece.params, piece.fwd_args = list(command.params), list(command.fwd_args)
+        for name in ("params", "fwd_args", "adj_args"):
+            setattr(piece, name, list(getattr(command, name)))
         piece.set_dim([end - first, *dim[1:]])
         piece.set_param_at_index(0, first)
-        for index, array in enumerate(own_sums):
-            if array is not None:
-                piece.set_param_at_index(sums_at + index, array[number])
+        for place, parts in own.items():
+            piece.set_param_at_index(place, parts[number], adjoint=options["adjoint"])
         slices.append(piece)
     _share(slices)
-    for array, parts in zip(sums, own_sums, strict=True):
-        if array is not None:
-            array.numpy()[...] += parts.numpy().sum(axis=0)
+    for place, parts in own.items():
+        summed[place].numpy()[...] += parts.numpy().sum(axis=0)
 
 
 def _share(slices: collections.deque) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch
-from warpshadow.tape import launch
+from warpshadow.parallel import launch_differentiable
 
 MAX_SIZE = 1 << 15
 """Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
@@ -30,6 +30,9 @@ _WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind
 
 # In boxes wider than this each row is trimmed to the span inside the edges; else testing pixels is faster.
 _TRIM_WIDTH = 8
+
+_PIXEL_COST = 8.0
+"""Nanoseconds that a pixel takes."""
 
 _INT32_MASK = (1 << 32) - 1
 _DEPTH_ONE = 0x3F800000
@@ -415,6 +418,8 @@ def _adj_weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_ret: wp.v
 
 @wp.kernel
 def _barycentrics(
+    first_row: int,
+    worker: int,
     # in
     face_ids: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
@@ -425,7 +430,7 @@ def _barycentrics(
     barycentrics: wp.array(dtype=wp.vec3),
 ):
     """One thread owns one pixel; barycentrics are zero before."""
-    pixel = wp.tid()
+    pixel = first_row + wp.tid()
     face = face_ids[pixel]
     if face >= 0:
         instance = _instance(pixel, width * height, clip_positions.shape[0])
@@ -445,6 +450,8 @@ def _interpolation(dtype: type):
 
     @wp.kernel(module="unique")
     def interpolate(
+        first_row: int,
+        worker: int,
         # in
         face_ids: wp.array(dtype=wp.int32),
         barycentrics: wp.array(dtype=wp.vec3),
@@ -455,7 +462,7 @@ def _interpolation(dtype: type):
         image: wp.array(dtype=dtype),
     ):
         """One thread owns one pixel; the image is zero before."""
-        pixel = wp.tid()
+        pixel = first_row + wp.tid()
         instance = _instance(pixel, pixels_per_instance, attributes.shape[0])
         seen = pixel
         if face_ids.shape[0] == pixels_per_instance:
@@ -519,10 +526,12 @@ def barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) 
     device = clip_positions.device
     weights = wp.zeros(face_ids.shape, dtype=wp.vec3, device=device, requires_grad=clip_positions.requires_grad)
     _, height, width = face_ids.shape
-    launch(
+    launch_differentiable(
         _barycentrics,
-        dim=face_ids.size,
+        dim=[face_ids.size],
+        cost=_PIXEL_COST,
         inputs=[face_ids.flatten(), faces, clip_positions, width, height],
+        gathered=[2],
         outputs=[weights.flatten()],
         device=device,
     )
@@ -555,9 +564,10 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         device=face_ids.device,
         requires_grad=attributes.requires_grad or fragments.barycentrics.requires_grad,
     )
-    launch(
+    launch_differentiable(
         _interpolation(attributes.dtype),
-        dim=image.size,
+        dim=[image.size],
+        cost=_PIXEL_COST,
         inputs=[
             face_ids.flatten(),
             fragments.barycentrics.flatten(),
@@ -565,6 +575,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
             attributes,
             face_ids.shape[1] * face_ids.shape[2],
         ],
+        gathered=[1, 3] if instances > face_ids.shape[0] else [3],
         outputs=[image.flatten()],
         device=face_ids.device,
     )

@@ -1,0 +1,90 @@
+"""Every kernel of the package as a GPU gets it, compiled without one: Warp's NVRTC makes PTX of each module."""
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import warp as wp
+from warp._src.context import user_modules  # Warp has no public way to list them
+
+import warpshadow
+from warpshadow import batch, raster, silhouette, transfer
+from warpshadow.visibility import directional, exponential, log_sh
+
+LANES = 1
+"""Receivers of a thread on a GPU, lanes.lane_count."""
+
+ORDERS = (2, 8)
+
+FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
+    **{
+        f"{make.__name__} {order} {horizon}": partial(make, order, horizon, LANES)
+        for make in (log_sh._accumulate_kernel, log_sh._accumulate_adjoint_kernel)
+        for order, horizon in [(2, False), (8, True)]
+    },
+    **{f"_product_kernel {order}": partial(log_sh._product_kernel, order, LANES) for order in ORDERS},
+    **{
+        f"_exponentiate_kernel {order} {base} {keeps}": partial(
+            exponential._exponentiate_kernel, order, base, keeps, LANES
+        )
+        for order, base, keeps in [(2, "quadratic", True), *((8, base, False) for base in exponential.THRESHOLDS)]
+    },
+    **{
+        f"_exponentiate_adjoint_kernel {order} {base}": partial(
+            exponential._exponentiate_adjoint_kernel, order, base, LANES
+        )
+        for order, base in [(2, "quadratic"), *((8, base) for base in exponential.THRESHOLDS)]
+    },
+    **{
+        f"{make.__name__} {has_horizon}": partial(make, has_horizon, LANES)
+        for make in (directional._transmit_kernel, directional._transmit_adjoint_kernel)
+        for has_horizon in (False, True)
+    },
+    **{
+        f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)
+        for make in (transfer._sh_transfer_kernel, transfer._sh_transfer_adjoint_kernel)
+        for order, is_shadowed in [(2, True), (8, True), (8, False)]
+    },
+    **{
+        f"{make.__name__} {dtype.__name__}": partial(make, dtype)
+        for make in (
+            raster._interpolation,
+            silhouette._add_kernel,
+            silhouette._blend_kernel,
+            silhouette._blend_adjoint_kernel,
+        )
+        for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
+    },
+    **{f"_copy_kernel {dtype.__name__}": partial(batch._copy_kernel, dtype) for dtype in (wp.float32, wp.vec3)},
+}
+"""Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""
+
+
+def import_package() -> None:
+    """Import all files of the package, so that Warp knows their kernels."""
+    for info in pkgutil.walk_packages(warpshadow.__path__, "warpshadow."):
+        if not info.name.endswith("__main__"):
+            importlib.import_module(info.name)
+
+
+def file_modules() -> dict[str, wp.Module]:
+    """Warp modules that hold the kernels of a file of the package, by its name: those that no factory makes."""
+    import_package()
+    return {name: module for name, module in user_modules.items() if name.startswith("warpshadow") and module.kernels}
+
+
+def compile_ptx(module: wp.Module, architectures: list[int], folder: Path) -> list[Path]:
+    """Compile a Warp module.
+
+    Args:
+        module: The module; a kernel's is ``kernel.module``.
+        architectures: Compute capabilities, 90 for sm_90.
+        folder: Empty folder to compile in.
+
+    Returns:
+        PTX files, one an architecture.
+    """
+    wp.compile_aot_module(module, device=None, arch=architectures, module_dir=folder, use_ptx=True)
+    return sorted(folder.glob("*.ptx"))
