@@ -14,26 +14,10 @@ import warp as wp
 from warpshadow.directions import bundle_cones
 from warpshadow.lanes import lane_functions, lane_type
 from warpshadow.visibility.cones import TINY_RADIUS
-from warpshadow.visibility.merging import QUAD, Nodes
+from warpshadow.visibility.merging import ITEMS, QUAD, Nodes, Spheres
 
 QUADS = 4
 """Quads that make up a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
-
-ITEMS = QUAD + 1
-"""Spheres of a quad, its own included."""
-
-
-@wp.struct
-class Spheres:
-    """Spheres and their quads, as kernels see them."""
-
-    centers: wp.array2d(dtype=wp.vec3)  # [batch, node]
-    radii: wp.array2d(dtype=wp.float32)
-    extents: wp.array2d(dtype=wp.float32)  # [batch, quad]
-    bounds_of_quads: wp.array2d(dtype=wp.vec4)
-    bounds_of_runs: wp.array2d(dtype=wp.vec4)
-    count: int  # of nodes that are no quad's
-    merging_angle: float
 
 
 @wp.struct

@@ -22,10 +22,8 @@ from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 from warpshadow.visibility.culling import (
-    ITEMS,
     QUADS,
     Cells,
-    Spheres,
     find_bundles_function,
     find_node,
     make_cells,
@@ -34,21 +32,21 @@ from warpshadow.visibility.culling import (
     rise_function,
 )
 from warpshadow.visibility.merging import (
+    ITEMS,
     MERGED_FROM,
+    MERGING,
     QUAD,
+    Spheres,
     check_merging,
+    load_merged_function,
     merge,
     merged_adjoint,
-    merged_function,
     unmerged,
 )
 from warpshadow.visibility.soft_edges import edge_adjoint, edge_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
-
-MERGING = 0.75
-"""τ: half-angle in cell radii under which four spheres are seen as one."""
 
 _OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
@@ -72,37 +70,6 @@ def _load_normals_function(has_horizon: bool, lanes: int) -> wp.Function:
         return x, y, z
 
     return load_normals
-
-
-@functools.cache
-def _load_merged_function(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
-    Lane = lane_type(lanes)
-    find_merged = merged_function(lanes)
-
-    @wp.func
-    def load_merged(
-        x: Lane,
-        y: Lane,
-        z: Lane,
-        batch: int,
-        quad: int,
-        spheres: Spheres,
-    ):
-        merged = Lane(0.0)
-        if quad < spheres.extents.shape[1]:
-            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
-            center = spheres.centers[batch, spheres.count + quad]
-            share, _slope = find_merged(
-                inverse * (Lane(center[0]) - x),
-                inverse * (Lane(center[1]) - y),
-                inverse * (Lane(center[2]) - z),
-                spheres.merging_angle,
-            )
-            merged = share
-        return merged
-
-    return load_merged
 
 
 @functools.cache
@@ -147,7 +114,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     store_columns, sqrt, is_any_above = fn.store_columns, fn.sqrt, fn.is_any_above
     cone, edge, block = relative_cone_function(lanes), edge_function(lanes), _block_function(lanes)
     reaches, rises = reach_function(lanes), rise_function(lanes)
-    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), _load_merged_function(lanes)
+    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit(
@@ -293,10 +260,10 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     load_products, sqrt, add_vectors, add_to_sphere = fn.load_products, fn.sqrt, fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_ = relative_cone_function(lanes), cone_adjoint(lanes)
     edge, edge_adjoint_ = edge_function(lanes), edge_adjoint(lanes)
-    find_merged, merged_adjoint_ = merged_function(lanes), merged_adjoint(lanes)
-    is_any_above, total = fn.is_any_above, fn.total
+    merged_adjoint_ = merged_adjoint(lanes)
+    is_any_above = fn.is_any_above
     reaches, rises = reach_function(lanes), rise_function(lanes)
-    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), _load_merged_function(lanes)
+    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transmit_adjoint(
@@ -479,23 +446,13 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
                                 adj_y -= adj_dy
                                 adj_z -= adj_dz
                                 add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, node, adj_centers, adj_radii)
-                if item_count > 0 and quad < spheres.extents.shape[1]:
-                    node = spheres.count + quad
-                    center = spheres.centers[batch, node]
-                    inverse = 1.0 / spheres.extents[batch, quad]
-                    dx = inverse * (Lane(center[0]) - x)
-                    dy = inverse * (Lane(center[1]) - y)
-                    dz = inverse * (Lane(center[2]) - z)
-                    _merged, slope = find_merged(dx, dy, dz, spheres.merging_angle)
-                    if is_any_above(slope, 0.0):
-                        adj_distance2 = wp.cw_mul(adj_merged, slope)
-                        adj_dx, adj_dy, adj_dz, adj_extent = merged_adjoint_(dx, dy, dz, inverse, adj_distance2)
-                        adj_x -= adj_dx
-                        adj_y -= adj_dy
-                        adj_z -= adj_dz
-                        add_to_sphere(adj_dx, adj_dy, adj_dz, Lane(0.0), batch, node, adj_centers, adj_radii)
-                        if adj_extents:
-                            wp.atomic_add(adj_extents, batch, quad, total(adj_extent))
+                if item_count > 0:
+                    adj_dx, adj_dy, adj_dz = merged_adjoint_(
+                        x, y, z, batch, quad, adj_merged, spheres, adj_centers, adj_radii, adj_extents
+                    )
+                    adj_x -= adj_dx
+                    adj_y -= adj_dy
+                    adj_z -= adj_dz
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
 

@@ -9,11 +9,25 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check, sh
+from warpshadow.directions import cell_radius
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
+from warpshadow.visibility.culling import find_node, make_spheres
+from warpshadow.visibility.merging import (
+    ITEMS,
+    MERGED_FROM,
+    MERGING,
+    QUAD,
+    Spheres,
+    check_merging,
+    load_merged_function,
+    merge,
+    merged_adjoint,
+    unmerged,
+)
 from warpshadow.visibility.zonal_logs import LOGS, band_type, look_up, look_up_slope, zonal_table
 
 HORIZON_FADE = 0.5
@@ -42,10 +56,26 @@ def _horizon_function(lanes: int) -> wp.Function:
 
 
 @functools.cache
+def _above_horizon_function(lanes: int) -> wp.Function:
+    """Make the kernel function that says whether a sphere is above the horizon of any receiver, if only in part."""
+    Lane = lane_type(lanes)
+    is_any_above = lane_functions(lanes).is_any_above
+
+    @wp.func
+    def is_above_horizon(x: Lane, y: Lane, z: Lane, nx: Lane, ny: Lane, nz: Lane, bound: wp.vec4):
+        height = wp.cw_mul(nx, Lane(bound[0]) - x)
+        height += wp.cw_mul(ny, Lane(bound[1]) - y) + wp.cw_mul(nz, Lane(bound[2]) - z)
+        return is_any_above(height, -1.001 * bound[3])  # rounding included
+
+    return is_above_horizon
+
+
+@functools.cache
 def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = lane_functions(lanes)
-    find_group, load, store_rows = fn.find_group, fn.load, fn.store_rows
+    find_group, load, store_rows, is_any_above = fn.find_group, fn.load, fn.store_rows, fn.is_any_above
+    load_merged, is_above_horizon = load_merged_function(lanes), _above_horizon_function(lanes)
     cone, horizon, look_up_ = relative_cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
     add_rotated_zonal_ = add_rotated_zonal(order, lanes)
 
@@ -56,8 +86,7 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        centers: wp.array2d(dtype=wp.vec3),
-        radii: wp.array2d(dtype=wp.float32),
+        spheres: Spheres,
         table: wp.array2d(dtype=Band),
         # scratch
         total: wp.array2d(dtype=Lane),
@@ -76,25 +105,37 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
-        for sphere in range(centers.shape[1]):
-            radius = radii[batch, sphere]
-            if radius > TINY_RADIUS:
-                center = centers[batch, sphere]
-                dx = Lane(center[0]) - x
-                dy = Lane(center[1]) - y
-                dz = Lane(center[2]) - z
-                curvature = 1.0 / radius
-                ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
-                if wp.static(has_horizon):
-                    height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
-                    fade, _slope = horizon(curvature * height)
-                    weight = wp.cw_mul(weight, fade)
-                if wp.max(weight) > 0.0:
-                    amount = wp.cw_mul(sine2, weight)
-                    zonal = look_up_(cosine, table)
-                    for band in range(order):
-                        zonal[band] = wp.cw_mul(zonal[band], amount)
-                    add_rotated_zonal_(ux, uy, uz, zonal, row)
+        for quad in range(spheres.bounds_of_quads.shape[1]):
+            merged = load_merged(x, y, z, batch, quad, spheres)
+            is_up = bool(True)
+            if wp.static(has_horizon):
+                is_up = is_above_horizon(x, y, z, nx, ny, nz, spheres.bounds_of_quads[batch, quad])
+            for item in range(ITEMS):
+                node = find_node(quad, item, spheres.count, spheres.radii.shape[1])
+                share = Lane(1.0) - merged
+                if item == QUAD:
+                    share = merged
+                radius = float(0.0)
+                if node >= 0 and is_up:
+                    radius = spheres.radii[batch, node]
+                if radius > TINY_RADIUS:
+                    center = spheres.centers[batch, node]
+                    dx = Lane(center[0]) - x
+                    dy = Lane(center[1]) - y
+                    dz = Lane(center[2]) - z
+                    curvature = 1.0 / radius
+                    ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
+                    weight = wp.cw_mul(weight, share)
+                    if wp.static(has_horizon):
+                        height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
+                        fade, _slope = horizon(curvature * height)
+                        weight = wp.cw_mul(weight, fade)
+                    if is_any_above(weight, 0.0):
+                        amount = wp.cw_mul(sine2, weight)
+                        zonal = look_up_(cosine, table)
+                        for band in range(order):
+                            zonal[band] = wp.cw_mul(zonal[band], amount)
+                        add_rotated_zonal_(ux, uy, uz, zonal, row)
         store_rows(row, group, log_sh[batch])
 
     return accumulate_log_sh
@@ -107,6 +148,8 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
     find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
     add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
     cone, cone_adjoint_, horizon = relative_cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
+    load_merged, merged_adjoint_ = load_merged_function(lanes), merged_adjoint(lanes)
+    is_any_above, is_above_horizon = fn.is_any_above, _above_horizon_function(lanes)
     look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
 
@@ -117,8 +160,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        centers: wp.array2d(dtype=wp.vec3),
-        radii: wp.array2d(dtype=wp.float32),
+        spheres: Spheres,
         table: wp.array2d(dtype=Band),
         adj_log_sh: wp.array3d(dtype=wp.float32),
         # scratch
@@ -128,6 +170,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         adj_normals: wp.array2d(dtype=wp.vec3),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
+        adj_extents: wp.array2d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers.
 
@@ -150,61 +193,83 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         adj_nx = Lane(0.0)
         adj_ny = Lane(0.0)
         adj_nz = Lane(0.0)
-        for sphere in range(centers.shape[1]):
-            radius = radii[batch, sphere]
-            if radius > TINY_RADIUS:
-                center = centers[batch, sphere]
-                dx = Lane(center[0]) - x
-                dy = Lane(center[1]) - y
-                dz = Lane(center[2]) - z
-                curvature = 1.0 / radius
-                ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
-                height = Lane(0.0)
-                fade = Lane(1.0)
-                fade_slope = Lane(0.0)
-                if wp.static(has_horizon):
-                    height = curvature * (wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz))
-                    height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
-                    fade, fade_slope = horizon(height)
-                faded = wp.cw_mul(weight, fade)
-                if wp.max(faded) > 0.0:
-                    amount = wp.cw_mul(sine2, faded)
-                    shape = look_up_(cosine, table)
-                    slope = look_up_slope_(cosine, table)
-                    zonal = Zonal()
-                    for band in range(order):
-                        zonal[band] = wp.cw_mul(shape[band], amount)
-                    adj_ux, adj_uy, adj_uz, adj_zonal = rotated_zonal_adjoint_(ux, uy, uz, zonal, row)
-                    adj_amount = Lane(0.0)
-                    adj_cosine = Lane(0.0)
-                    for band in range(order):
-                        adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
-                        adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
-                    adj_faded = wp.cw_mul(adj_amount, sine2)
-                    adj_height = curvature * wp.cw_mul(wp.cw_mul(adj_faded, weight), fade_slope)
-                    adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
-                        curvature * dx,
-                        curvature * dy,
-                        curvature * dz,
-                        curvature,
-                        adj_ux,
-                        adj_uy,
-                        adj_uz,
-                        wp.cw_mul(adj_cosine, amount),
-                        wp.cw_mul(adj_amount, faded),
-                        wp.cw_mul(adj_faded, fade),
-                    )
-                    adj_dx += wp.cw_mul(adj_height, nx)
-                    adj_dy += wp.cw_mul(adj_height, ny)
-                    adj_dz += wp.cw_mul(adj_height, nz)
-                    adj_radius -= wp.cw_mul(adj_height, height)
-                    adj_nx += wp.cw_mul(adj_height, dx)
-                    adj_ny += wp.cw_mul(adj_height, dy)
-                    adj_nz += wp.cw_mul(adj_height, dz)
-                    adj_x -= adj_dx
-                    adj_y -= adj_dy
-                    adj_z -= adj_dz
-                    add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, sphere, adj_centers, adj_radii)
+        for quad in range(spheres.bounds_of_quads.shape[1]):
+            merged = load_merged(x, y, z, batch, quad, spheres)
+            adj_merged = Lane(0.0)
+            is_up = bool(True)
+            if wp.static(has_horizon):
+                is_up = is_above_horizon(x, y, z, nx, ny, nz, spheres.bounds_of_quads[batch, quad])
+            for item in range(ITEMS):
+                node = find_node(quad, item, spheres.count, spheres.radii.shape[1])
+                share = Lane(1.0) - merged
+                sign = float(-1.0)
+                if item == QUAD:
+                    share = merged
+                    sign = 1.0
+                radius = float(0.0)
+                if node >= 0 and is_up:
+                    radius = spheres.radii[batch, node]
+                if radius > TINY_RADIUS:
+                    center = spheres.centers[batch, node]
+                    dx = Lane(center[0]) - x
+                    dy = Lane(center[1]) - y
+                    dz = Lane(center[2]) - z
+                    curvature = 1.0 / radius
+                    ux, uy, uz, cosine, sine2, near = cone(curvature * dx, curvature * dy, curvature * dz)
+                    weight = wp.cw_mul(near, share)
+                    height = Lane(0.0)
+                    fade = Lane(1.0)
+                    fade_slope = Lane(0.0)
+                    if wp.static(has_horizon):
+                        height = curvature * (wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz))
+                        height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
+                        fade, fade_slope = horizon(height)
+                    faded = wp.cw_mul(weight, fade)
+                    if is_any_above(faded, 0.0):
+                        amount = wp.cw_mul(sine2, faded)
+                        shape = look_up_(cosine, table)
+                        slope = look_up_slope_(cosine, table)
+                        zonal = Zonal()
+                        for band in range(order):
+                            zonal[band] = wp.cw_mul(shape[band], amount)
+                        adj_ux, adj_uy, adj_uz, adj_zonal = rotated_zonal_adjoint_(ux, uy, uz, zonal, row)
+                        adj_amount = Lane(0.0)
+                        adj_cosine = Lane(0.0)
+                        for band in range(order):
+                            adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
+                            adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
+                        adj_faded = wp.cw_mul(adj_amount, sine2)
+                        adj_height = curvature * wp.cw_mul(wp.cw_mul(adj_faded, weight), fade_slope)
+                        adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
+                            curvature * dx,
+                            curvature * dy,
+                            curvature * dz,
+                            curvature,
+                            adj_ux,
+                            adj_uy,
+                            adj_uz,
+                            wp.cw_mul(adj_cosine, amount),
+                            wp.cw_mul(adj_amount, faded),
+                            wp.cw_mul(wp.cw_mul(adj_faded, fade), share),
+                        )
+                        adj_merged += sign * wp.cw_mul(wp.cw_mul(adj_faded, fade), near)
+                        adj_dx += wp.cw_mul(adj_height, nx)
+                        adj_dy += wp.cw_mul(adj_height, ny)
+                        adj_dz += wp.cw_mul(adj_height, nz)
+                        adj_radius -= wp.cw_mul(adj_height, height)
+                        adj_nx += wp.cw_mul(adj_height, dx)
+                        adj_ny += wp.cw_mul(adj_height, dy)
+                        adj_nz += wp.cw_mul(adj_height, dz)
+                        adj_x -= adj_dx
+                        adj_y -= adj_dy
+                        adj_z -= adj_dz
+                        add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, node, adj_centers, adj_radii)
+            adj_dx, adj_dy, adj_dz = merged_adjoint_(
+                x, y, z, batch, quad, adj_merged, spheres, adj_centers, adj_radii, adj_extents
+            )
+            adj_x -= adj_dx
+            adj_y -= adj_dy
+            adj_z -= adj_dz
         if adj_points:
             add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
         if adj_normals:
@@ -221,6 +286,7 @@ def accumulate(
     *,
     order: int = 8,
     log: str = "eigen",
+    merging: float = MERGING,
 ) -> wp.array:
     """Accumulate the log-visibility of spheres in spherical harmonics.
 
@@ -234,6 +300,8 @@ def accumulate(
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
         order: Number of SH bands n, 2 to 8.
         log: "eigen" (Ren et al. 2006, accurate where spheres overlap) or "cap" (the paper's).
+        merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
+            or more, in radii 2/order of a cell for each coefficient; 0 for never.
 
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
@@ -246,12 +314,15 @@ def accumulate(
     """
     sh.check_order(order)
     check.choice("log", log, LOGS)
+    check_merging(merging)
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
-    variables = [points, normals, centers, radii]
+    nodes = merge(centers, radii) if merging > 0 and radii.shape[1] >= MERGED_FROM else unmerged(centers, radii)
+    spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(order**2))
+    variables = [points, normals, *nodes]
     table = zonal_table(order, log, str(device))
     scratch = empty_scratch(row_count, (order**2,), lane_type(lanes), device)
     log_sh = wp.empty(
@@ -265,7 +336,7 @@ def accumulate(
         _accumulate_kernel(order, normals is not None, lanes),
         dim=[row_count],
         cost=cost,
-        inputs=[*variables, table, scratch],
+        inputs=[points, normals, spheres, table, scratch],
         outputs=[log_sh],
         device=device,
     )
@@ -275,9 +346,9 @@ def accumulate(
             _accumulate_adjoint_kernel(order, normals is not None, lanes),
             dim=[row_count],
             cost=2 * cost,
-            inputs=[*variables, table, log_sh.grad, scratch],
+            inputs=[points, normals, spheres, table, log_sh.grad, scratch],
             outputs=[points.grad, None if normals is None else normals.grad],
-            sums=[centers.grad, radii.grad],
+            sums=[array.grad for array in nodes],
             device=device,
         )
 

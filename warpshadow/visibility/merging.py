@@ -22,12 +22,18 @@ from typing import NamedTuple
 import warp as wp
 
 from warpshadow.batch import concatenate
-from warpshadow.lanes import lane_type
+from warpshadow.lanes import lane_functions, lane_type
 from warpshadow.tape import launch
 from warpshadow.visibility.cones import TINY_RADIUS
 
 QUAD = 4
 """Spheres that merge, in the order in which they are given: best near each other."""
+
+ITEMS = QUAD + 1
+"""Spheres of a quad, its own included."""
+
+MERGING = 0.75
+"""τ: half-angle in cell radii under which four spheres are seen as one."""
 
 MERGED_FROM = 512
 """Fewer spheres do not merge: they are so large that hardly a receiver is far enough from them."""
@@ -133,8 +139,21 @@ def unmerged(centers: wp.array, radii: wp.array) -> Nodes:
     return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
 
 
+@wp.struct
+class Spheres:
+    """Spheres and their quads, as kernels see them."""
+
+    centers: wp.array2d(dtype=wp.vec3)  # [batch, node]
+    radii: wp.array2d(dtype=wp.float32)
+    extents: wp.array2d(dtype=wp.float32)  # [batch, quad]
+    bounds_of_quads: wp.array2d(dtype=wp.vec4)
+    bounds_of_runs: wp.array2d(dtype=wp.vec4)
+    count: int  # of nodes that are no quad's
+    merging_angle: float
+
+
 @functools.cache
-def merged_function(lanes: int) -> wp.Function:
+def _merged_function(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane = lane_type(lanes)
     BLEND2 = wp.constant(_BLEND**2)
@@ -153,19 +172,80 @@ def merged_function(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def merged_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`merged_function`: x = d/E, 1/E, m' m̄ → d̄, Ē.
-
-    X² = |d|²/E², so d̄ = 2 x X̄² / E and Ē = −2 |x|² X̄² / E, X̄² being m' m̄.
-    """
+def load_merged_function(lanes: int) -> wp.Function:
+    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
     Lane = lane_type(lanes)
+    find_merged = _merged_function(lanes)
 
     @wp.func
-    def adjoint(x: Lane, y: Lane, z: Lane, inverse: float, adj_distance2: Lane):
-        pull = 2.0 * inverse * adj_distance2
-        adj_x = wp.cw_mul(pull, x)
-        adj_y = wp.cw_mul(pull, y)
-        adj_z = wp.cw_mul(pull, z)
-        return adj_x, adj_y, adj_z, -(wp.cw_mul(adj_x, x) + wp.cw_mul(adj_y, y) + wp.cw_mul(adj_z, z))
+    def load_merged(
+        x: Lane,
+        y: Lane,
+        z: Lane,
+        batch: int,
+        quad: int,
+        spheres: Spheres,
+    ):
+        merged = Lane(0.0)
+        if quad < spheres.extents.shape[1]:
+            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+            center = spheres.centers[batch, spheres.count + quad]
+            share, _slope = find_merged(
+                inverse * (Lane(center[0]) - x),
+                inverse * (Lane(center[1]) - y),
+                inverse * (Lane(center[2]) - z),
+                spheres.merging_angle,
+            )
+            merged = share
+        return merged
+
+    return load_merged
+
+
+@functools.cache
+def merged_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`load_merged_function`: m̄ → that of the offset to a quad, which is added to its own.
+
+    With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
+    """
+    Lane = lane_type(lanes)
+    find_merged = _merged_function(lanes)
+    fn = lane_functions(lanes)
+    is_any_above, add_to_sphere, total = fn.is_any_above, fn.add_to_sphere, fn.total
+
+    @wp.func
+    def adjoint(
+        x: Lane,
+        y: Lane,
+        z: Lane,
+        batch: int,
+        quad: int,
+        adj_merged: Lane,
+        spheres: Spheres,
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+        adj_extents: wp.array2d(dtype=wp.float32),
+    ):
+        adj_x = Lane(0.0)
+        adj_y = Lane(0.0)
+        adj_z = Lane(0.0)
+        if quad < spheres.extents.shape[1]:
+            node = spheres.count + quad
+            center = spheres.centers[batch, node]
+            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+            x_ = inverse * (Lane(center[0]) - x)
+            y_ = inverse * (Lane(center[1]) - y)
+            z_ = inverse * (Lane(center[2]) - z)
+            _merged, slope = find_merged(x_, y_, z_, spheres.merging_angle)
+            if is_any_above(slope, 0.0):
+                pull = (2.0 * inverse) * wp.cw_mul(adj_merged, slope)
+                adj_x = wp.cw_mul(pull, x_)
+                adj_y = wp.cw_mul(pull, y_)
+                adj_z = wp.cw_mul(pull, z_)
+                add_to_sphere(adj_x, adj_y, adj_z, Lane(0.0), batch, node, adj_centers, adj_radii)
+                if adj_extents:
+                    along = wp.cw_mul(adj_x, x_) + wp.cw_mul(adj_y, y_) + wp.cw_mul(adj_z, z_)
+                    wp.atomic_add(adj_extents, batch, quad, -total(along))
+        return adj_x, adj_y, adj_z
 
     return adjoint
