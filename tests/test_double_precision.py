@@ -168,6 +168,32 @@ def test_log_visibility_without_a_horizon(double, device, check, spheres):
     check(lambda p, c, r: accumulate(p, None, c, r, order=3), spheres[0], *spheres[2:])
 
 
+@pytest.fixture
+def quad(double, monkeypatch):
+    """Receivers, normals, centers and radii, as arguments: five spheres, of which four merge while they are seen so."""
+    for module in ("directional", "log_sh"):
+        monkeypatch.setattr(double(f"visibility.{module}"), "MERGED_FROM", 4)
+    centers, radii = 4 * random(7, 5, 3), 3 + random(8, 5) ** 2
+    middle, _, extents = twins.merged_quads(centers, radii)
+    away = unit(random(9, 6, 3))
+    angles = np.array([0.36, 0.4, 0.43, 0.46, 0.49, 0.3])[:, None]  # of 0.5, where it begins, and 0.35, where it ends
+    normals = unit(random(10, 6, 3) - 3 * away)
+    dtypes = (wp.vec3d, wp.vec3d, wp.vec3d, wp.float64)
+    scene = (middle + extents / angles * away, normals, centers, radii)
+    return [(dtype, values[None]) for dtype, values in zip(dtypes, scene, strict=True)]
+
+
+def test_transmittance_of_spheres_that_merge(double, device, check, quad):
+    directions = double("directions").fibonacci(16)
+    transmittance = double("visibility.directional").transmittance
+    check(lambda p, c, r: transmittance(p, None, c, r, directions, merging=1.0), quad[0], *quad[2:])
+
+
+def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
+    accumulate = double("visibility.log_sh").accumulate
+    check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *quad)
+
+
 def logs(*sizes):
     """Log-visibility of one instance, of these norms."""
     rows = random(0, 1, len(sizes), 9)
