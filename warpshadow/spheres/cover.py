@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.directions import fibonacci
+from warpshadow.parallel import launch_slices
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
 
@@ -25,6 +26,9 @@ EDGE = 0.25
 
 SAMPLES = 32
 """Points of each sphere whose distance to the mesh tells how much of it is outside."""
+
+_QUERY_COST = 2000.0
+"""Nanoseconds that a signed distance takes."""
 
 SURFACE_POINTS = 1024
 RATE = 0.003
@@ -89,6 +93,8 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 
 @wp.kernel(enable_backward=False)
 def _outside_volume(
+    first_row: int,
+    worker: int,
     # in
     mesh: wp.uint64,
     spheres: wp.array[wp.vec4],
@@ -98,7 +104,8 @@ def _outside_volume(
     gradient: wp.array2d[wp.vec4],
 ):
     """Each thread owns a sphere and one sample of its inside, and with it a share of the sphere's volume."""
-    sphere, sample = wp.tid()
+    row, sample = wp.tid()
+    sphere = first_row + row
     ball = spheres[sphere]
     radius = ball[3]
     offset = radius * samples[sample]
@@ -165,7 +172,8 @@ def cover_energy(
     volumes = wp.empty(shape, dtype=wp.float32, device=device)
     by_volume = wp.empty(shape, dtype=wp.vec4, device=device)
     inputs = [mesh.mesh.id, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
-    wp.launch(_outside_volume, dim=shape, inputs=inputs, outputs=[volumes, by_volume], device=device)
+    outputs = [volumes, by_volume]
+    launch_slices(_outside_volume, dim=shape, cost=_QUERY_COST, inputs=inputs, outputs=outputs, device=device)
 
     gaps = wp.empty(len(points), dtype=wp.float32, device=device)
     nearest = wp.empty(len(points), dtype=wp.int32, device=device)

@@ -15,12 +15,19 @@ import numpy as np
 import warp as wp
 
 from warpshadow.lanes import lane_type
+from warpshadow.parallel import launch_slices
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.visibility.cones import cone_function
 
 LANES = 16
 """Directions that a thread handles at once."""
+
+_RAY_COST = 500.0
+"""Nanoseconds that a ray takes."""
+
+_PAIR_COST = 0.5
+"""Nanoseconds that a sphere costs for a receiver and a direction."""
 
 _Lane = lane_type(LANES)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
@@ -63,6 +70,8 @@ def _project_spheres(
 
 @wp.kernel(enable_backward=False)
 def _transmit(
+    first_row: int,
+    worker: int,
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[wp.vec3],
@@ -71,7 +80,8 @@ def _transmit(
     transmittance: wp.array2d[_Lane],
 ):
     """Each thread owns one receiver and a lane of directions."""
-    i, q = wp.tid()
+    row, q = wp.tid()
+    i = first_row + row
     x = directions[0, q]
     y = directions[1, q]
     z = directions[2, q]
@@ -134,6 +144,8 @@ def _edge_sums(
 
 @wp.kernel(enable_backward=False)
 def _transmit_backward(
+    first_row: int,
+    worker: int,
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[wp.vec3],
@@ -144,7 +156,8 @@ def _transmit_backward(
     by_edges: wp.array2d[wp.vec3],
 ):
     """Each thread owns a sphere as one receiver sees it."""
-    i, sphere = wp.tid()
+    row, sphere = wp.tid()
+    i = first_row + row
     edge = edges[i, sphere]
     by_axis = wp.vec3(0.0)
     by_edge = wp.vec3(0.0)
@@ -162,6 +175,8 @@ def _transmit_backward(
 
 @wp.kernel(enable_backward=False)
 def _trace_frames(
+    first_row: int,
+    worker: int,
     # in
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
@@ -171,7 +186,8 @@ def _trace_frames(
     visibility: wp.array2d[wp.uint8],
 ):
     """Each thread owns one ray: a receiver and a direction of its own frame."""
-    receiver, direction = wp.tid()
+    row, direction = wp.tid()
+    receiver = first_row + row
     frame = frames[receiver]
     start = points[receiver] + 1.0e-4 * frame[2]
     blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
@@ -249,9 +265,10 @@ class Refinement:
         self.directions = array(lanes, dtype=_Lane)
         visibility = wp.empty((len(points), self.DIRECTIONS), dtype=wp.uint8, device=self.device)
         rays = array(directions.astype(np.float32), dtype=wp.vec3)
-        wp.launch(
+        launch_slices(
             _trace_frames,
             dim=visibility.shape,
+            cost=_RAY_COST,
             inputs=[mesh.mesh.id, self.points, self.frames, rays],
             outputs=[visibility],
             device=self.device,
@@ -307,7 +324,14 @@ class Refinement:
     def _see_through(self, view: _View) -> np.ndarray:
         transmittance = wp.empty((len(view.chosen), self.directions.shape[1]), dtype=_Lane, device=self.device)
         inputs = [view.axes, view.edges, self.directions]
-        wp.launch(_transmit, dim=transmittance.shape, inputs=inputs, outputs=[transmittance], device=self.device)
+        launch_slices(
+            _transmit,
+            dim=transmittance.shape,
+            cost=_PAIR_COST * LANES * view.axes.shape[1],
+            inputs=inputs,
+            outputs=[transmittance],
+            device=self.device,
+        )
         return transmittance.numpy().reshape(len(view.chosen), -1)
 
     def transmittance(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
@@ -328,7 +352,14 @@ class Refinement:
         upstream = (by_transmittance * transmittance).astype(np.float32).reshape(len(chosen), -1, LANES)
         inputs = [view.axes, view.edges, self.directions, wp.array(upstream, dtype=_Lane, device=self.device)]
         by_view = [wp.empty_like(view.axes), wp.empty_like(view.edges)]
-        wp.launch(_transmit_backward, dim=view.axes.shape, inputs=inputs, outputs=by_view, device=self.device)
+        launch_slices(
+            _transmit_backward,
+            dim=view.axes.shape,
+            cost=_PAIR_COST * self.DIRECTIONS,
+            inputs=inputs,
+            outputs=by_view,
+            device=self.device,
+        )
         # every receiver has its own copy of the spheres: sums in a fixed order give the same bits on every run
         by_balls = wp.zeros_like(view.balls)
         wp.launch(
