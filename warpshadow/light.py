@@ -9,6 +9,7 @@ in a right-handed world with y up (Mitsuba's convention): the center of the map 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -183,14 +184,14 @@ class EnvironmentMap:
             raise ValueError("directions: expected at least one, all unit vectors")
         count, height = len(directions), len(self.radiance)
         split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
-        weights, columns = sh.pixel_solid_angles(height * split), directions.astype(np.float32).T
+        owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
+        weights = sh.pixel_solid_angles(height * split)
         integrals = np.zeros((6, count))
         for row, towards in enumerate(sh.equirectangular_directions(height * split)):
-            owner = np.argmax(towards.astype(np.float32) @ columns, axis=1)
             power = weights[row] * np.repeat(self.radiance[row // split], split, axis=0).astype(np.float64)
             values = np.concatenate([power, (power @ LUMINANCE)[:, None] * towards], axis=1)
             for integral, value in zip(integrals, values.T, strict=True):
-                integral += np.bincount(owner, value, minlength=count)
+                integral += np.bincount(owners[row], value, minlength=count)
         return integrals[:3].T, integrals[3:].T
 
     def statistics(self) -> dict[str, object]:
@@ -213,6 +214,14 @@ class EnvironmentMap:
             "brightest_direction": self.directions().reshape(-1, 3)[order[0]].tolist(),
             "brightest_percent_share": float(brightest / power[-1]) if power[-1] > 0 else 0.0,
         }
+
+
+@functools.lru_cache(maxsize=4)
+def _cells_of_pixels(height: int, directions: bytes) -> np.ndarray:
+    """Number of the direction, of float32 vectors, that is nearest to each pixel, int32 of shape [height, 2·height]."""
+    columns = np.frombuffer(directions, np.float32).reshape(-1, 3).T
+    towards = sh.equirectangular_directions(height)
+    return np.stack([np.argmax(row.astype(np.float32) @ columns, axis=1).astype(np.int32) for row in towards])
 
 
 def _check_aspect(pixels: np.ndarray) -> None:
