@@ -463,11 +463,15 @@ def _gather(
     crossings: wp.array(dtype=wp.vec4i),
     claims: wp.array(dtype=wp.int32),
     width: int,
+    has_all: bool,
     # out
     pixels: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
 ):
-    """A thread owns a crossing: it goes to the entries of its two pixels; pixels and edges are −1 before."""
+    """A thread owns a crossing: it goes to the entries of its two pixels; pixels and edges are −1 before.
+
+    If there is an entry for all pixels, it is the pixel's own.
+    """
     thread = wp.tid()
     if thread < crossing_count[0]:
         crossing = crossings[thread]
@@ -475,10 +479,12 @@ def _gather(
         edge = wp.vec2i(crossing[2], crossing[3])
         pixel = crossing[0]
         other = _neighbor(pixel, side, width)
-        pixels[claims[pixel]] = pixel
-        pixels[claims[other]] = other
-        edges[claims[pixel], side] = edge
-        edges[claims[other], side + 1] = edge
+        entry = wp.where(has_all, pixel, claims[pixel])
+        other_entry = wp.where(has_all, other, claims[other])
+        pixels[entry] = pixel
+        pixels[other_entry] = other
+        edges[entry, side] = edge
+        edges[other_entry, side + 1] = edge
 
 
 @wp.kernel(enable_backward=False)
@@ -536,7 +542,7 @@ def find_silhouettes(
 
     Returns:
         Silhouettes, for :func:`smooth_silhouettes`. They have as many entries as need be: the count is read back, which
-        waits for the device. While a CUDA graph is captured they have four a pixel instead, and nothing is read.
+        waits for the device. While a CUDA graph is captured they have one for each pixel instead, and nothing is read.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -571,13 +577,15 @@ def find_silhouettes(
             device=device,
             record_tape=False,
         )
-    most = crossings.size if device.is_capturing else int(crossing_count.numpy()[0])
-    pixels = wp.full(2 * most, -1, dtype=wp.int32, device=device)
-    edges = wp.full((2 * most, 4), wp.vec2i(_NOTHING, _NOTHING), dtype=wp.vec2i, device=device)
+    has_all = bool(device.is_capturing)
+    most = crossings.size if has_all else int(crossing_count.numpy()[0])
+    entry_count = face_ids.size if has_all else 2 * most
+    pixels = wp.full(entry_count, -1, dtype=wp.int32, device=device)
+    edges = wp.full((entry_count, 4), wp.vec2i(_NOTHING, _NOTHING), dtype=wp.vec2i, device=device)
     wp.launch(
         _gather,
         dim=most,
-        inputs=[crossing_count, crossings, claims, width],
+        inputs=[crossing_count, crossings, claims, width, has_all],
         outputs=[pixels, edges],
         device=device,
         record_tape=False,

@@ -11,6 +11,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from warpshadow.constants import constant
 from warpshadow.directions import bundle_cones
 from warpshadow.lanes import lane_functions, lane_type
 from warpshadow.visibility.cones import TINY_RADIUS
@@ -105,9 +106,9 @@ def make_cells(directions: np.ndarray, width: float, device: wp.Device) -> Cells
     """Put cells together with the cones around their bundles."""
     axes, cosine, sine = bundle_cones(directions, width)
     cells = Cells()
-    cells.directions = wp.array(directions, dtype=wp.vec3, device=device)
-    cells.axes = wp.array(axes, dtype=wp.vec3, device=device)
-    cells.edges = wp.array(np.stack([cosine, sine], axis=-1), dtype=wp.vec2, device=device)
+    cells.directions = constant(directions, wp.vec3, device)
+    cells.axes = constant(axes, wp.vec3, device)
+    cells.edges = constant(np.stack([cosine, sine], axis=-1), wp.vec2, device)
     cells.cos_width, cells.sin_width = float(np.cos(width)), float(np.sin(width))
     return cells
 
