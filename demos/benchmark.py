@@ -4,18 +4,17 @@
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
-Figures are medians of runs that take turns, so that a slow moment of the machine strikes all alike.
+Figures are medians of runs that take turns, so that a slow moment of the machine strikes all alike: on one thread, and
+on all cores (or what WARPSHADOW_NUM_THREADS says).
 """
 
 import argparse
 import dataclasses
 import itertools
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 
 import torch
@@ -24,6 +23,7 @@ from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
 from warpshadow import inverse
+from warpshadow.assembly import Geometry
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
@@ -32,6 +32,7 @@ from warpshadow.raster import interpolate, rasterize
 from warpshadow.renderer import Renderer
 from warpshadow.shading import shade
 from warpshadow.silhouette import find_silhouettes, smooth_silhouettes
+from warpshadow.timing import median_times
 from warpshadow.torch import TorchRenderer
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, log_sh
@@ -40,7 +41,7 @@ from warpshadow.visibility.exponential import exponentiate
 
 def main(device: str, runs: int) -> None:
     ws.quiet()
-    torch.set_num_threads(1)  # as Warp has; threads of two libraries wait for each other
+    torch.set_num_threads(1)  # what torch does here is little, and threads of two libraries wait for each other
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
     points, centers, radii = renderer.geometry
@@ -81,6 +82,9 @@ def main(device: str, runs: int) -> None:
     def draw() -> None:
         clip = to_clip(renderer.geometry.positions, clip_matrices)
         interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, shading)
+
+    def image_of_moved_geometry() -> None:
+        renderer.draw(view=renderer.view(Geometry(*map(wp.clone, renderer.geometry)), clip_matrices))
 
     def whole_image() -> None:
         Renderer(scene, device=device).render()
@@ -124,6 +128,7 @@ def main(device: str, runs: int) -> None:
         "log-SH, forward and backward": shade_log_sh_and_back,
         "project, rasterize and interpolate": draw,
         "rasterize, interpolate, smooth, forward and backward": draw_and_back,
+        "image of moved geometry, directional": image_of_moved_geometry,
         "whole image from the scene, directional": whole_image,
         "iteration of a light fit in torch": fit_light,
         "iteration of a texture fit in torch, 256 × 256 texels": fit_texture,
@@ -131,9 +136,14 @@ def main(device: str, runs: int) -> None:
         "iteration of 8 pose fits in a batch": fit_poses,
     }
     vertex_count, sphere_count = points.shape[1], radii.shape[1]
-    print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs}")
-    for label, milliseconds in in_turn(rows, runs).items():
-        print(f"  {label:54}{milliseconds:8.1f} ms")
+    print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs} [ms]")
+    counts = sorted({1, ws.thread_count()}) if renderer.device.is_cpu else [1]
+    functions = [on_threads(count, function) for function in rows.values() for count in counts]
+    times = iter(median_times(functions, runs))
+    ws.set_thread_count(None)
+    print(f"  {'threads':54}" + "".join(f"{count:8}" for count in counts))
+    for label in rows:
+        print(f"  {label:54}" + "".join(f"{next(times):8.1f}" for _ in counts))
 
 
 def time_fits(device: str) -> None:
@@ -152,22 +162,14 @@ def time_fits(device: str) -> None:
         print(f"  {f'iteration of inverse.fit: {label}':70}{1e3 * result.seconds:8.2f} ms", flush=True)
 
 
-def in_turn(rows: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
-    """Median milliseconds of each function, in turn.
+def on_threads(count: int, function: Callable[[], object]) -> Callable[[], object]:
+    """Make a function run on a number of threads."""
 
-    Each is called twice and timed the second time, as in a loop of its own: the first call pays for compilation, and
-    for memory that the function before gave back, 10 ms after a batch of eight.
-    """
-    times: dict[str, list[float]] = {label: [] for label in rows}
-    for _ in range(runs):
-        for label, function in rows.items():
-            function()
-            wp.synchronize()
-            start = time.perf_counter()
-            function()
-            wp.synchronize()
-            times[label].append(1e3 * (time.perf_counter() - start))
-    return {label: statistics.median(each) for label, each in times.items()}
+    def run() -> None:
+        ws.set_thread_count(count)
+        function()
+
+    return run
 
 
 def bunny_scene() -> ws.Scene:

@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from benchmark import bunny_scene, in_turn
+from benchmark import bunny_scene
 from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
@@ -41,6 +41,7 @@ from warpshadow.directions import fibonacci
 from warpshadow.mesh import vertex_normals
 from warpshadow.shading import shade
 from warpshadow.spheres import fit_spheres
+from warpshadow.timing import median_times
 from warpshadow.torch import TorchRenderer
 from warpshadow.transfer import directional_transfer
 from warpshadow.visibility import directional
@@ -179,9 +180,9 @@ def measure(curve: Curve, most: int, runs: int) -> dict[str, list[Point]]:
         for name, function in curve.prepare(size).items():
             memory[name, size] = added_mebibytes(function)
             functions[name, size] = function
-    times = in_turn(functions, runs)
+    times = median_times(list(functions.values()), runs)
     rows: dict[str, list[Point]] = {}
-    for (name, size), milliseconds in times.items():
+    for (name, size), milliseconds in zip(functions, times, strict=True):
         rows.setdefault(name, []).append(Point(size, milliseconds, memory[name, size]))
     return rows
 

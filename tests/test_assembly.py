@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
+from warpshadow import assembly as assembly_module
 from warpshadow.assembly import Assembly, Geometry
 from warpshadow.deform import Poses
 
@@ -42,6 +43,55 @@ def test_placed_bodies_are_where_the_scene_has_them(device):
     ]
     assert np.abs(geometry.centers - np.concatenate([part.centers for part in placed])).max() < 4 * FLOAT32
     assert np.abs(geometry.radii - np.concatenate([part.radii for part in placed])).max() < FLOAT32
+
+
+def test_fits_of_spheres_are_beside_the_tape(device, monkeypatch):
+    """A pose that requires a gradient is often what asks for the spheres first."""
+    assembly = two_bodies(device)
+    tapes = []
+
+    def fitted(scene, **options):
+        tapes.append(wp._src.context.runtime.tape)
+        return [body.blockers for body in scene.bodies]
+
+    monkeypatch.setattr(assembly_module, "scene_blockers", fitted)
+    with wp.Tape() as tape:
+        assembly.placed()
+        assert wp._src.context.runtime.tape is tape
+    assert tapes == [None]
+
+
+@pytest.mark.parametrize("moving", [[0], [1], [], [1, 0]])
+def test_bodies_that_do_not_move_stand_where_the_scene_has_them(device, moving, verified_tape):
+    assembly = two_bodies(device)
+    rng = np.random.default_rng(5)
+    arrays = rng.normal(size=(3, 2, 3, 3)), rng.normal(size=(3, 2, 3)), rng.uniform(0.5, 2, (3, 2))
+    dtypes = wp.mat33, wp.vec3, wp.float32
+    poses = Poses(
+        *(
+            wp.array(array, dtype=dtype, device=device, requires_grad=True)
+            for array, dtype in zip(arrays, dtypes, strict=True)
+        )
+    )
+    with wp.Tape() as tape:
+        placed = assembly.placed(poses, moving=moving)
+    assert placed.moving == tuple(sorted(moving))
+    starts = assembly.first_vertex, assembly.first_sphere, assembly.first_sphere
+    for got, all_moved, still, start in zip(placed, assembly.placed(poses), assembly.placed(), starts, strict=True):
+        for number in range(2):
+            place = np.s_[:, start[number] : start[number + 1]]
+            expected = all_moved if number in moving else still
+            np.testing.assert_array_equal(
+                got.numpy()[place], np.broadcast_to(expected.numpy()[place], got.numpy()[place].shape)
+            )
+    if moving:
+        weights = rng.normal(size=(*placed.positions.shape, 3)).astype(np.float32)
+        tape.backward(grads={placed.positions: wp.array(weights, dtype=wp.vec3, device=device)})
+        gradient = poses.translations.grad.numpy()
+        for number in range(2):
+            part = weights[:, assembly.first_vertex[number] : assembly.first_vertex[number + 1]].sum(axis=1)
+            expected = part if number in moving else np.zeros_like(part)
+            assert np.abs(gradient[:, number] - expected).max() < 50 * FLOAT32  # sums of some dozens
 
 
 def test_faces_belong_to_the_vertices_of_their_body(device):

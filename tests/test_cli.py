@@ -20,7 +20,7 @@ from warpshadow.image import auto_exposure
 
 # Half a step of 8-bit sRGB where it is steepest.
 EIGHT_BITS = 0.006
-COMMANDS = ("render", "fit", "spheres", "envmap", "warmup")
+COMMANDS = ("render", "tune", "fit", "spheres", "envmap", "warmup")
 
 SCENE = """
 [camera]
@@ -164,9 +164,9 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", ""])
-@pytest.mark.parametrize("command", ["render", "fit", "warmup"])
+@pytest.mark.parametrize("command", ["render", "tune", "fit", "warmup"])
 def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
-    arguments = () if command == "warmup" else (scene, "-o", tmp_path / "out.exr")
+    arguments = {"warmup": (), "tune": (scene, "--error", 0.1)}.get(command, (scene, "-o", tmp_path / "out.exr"))
     fails(command, *arguments, "--device", name, parts=(f"device: got '{name}'", "expected one of", "cpu"))
 
 
@@ -185,6 +185,89 @@ def test_a_wrong_option_is_status_2_with_its_name(arguments, part):
     result = run(*arguments)
     assert result.exit_code == 2
     assert part in re.sub(r"\x1b\[[0-9;]*m", "", result.output)
+
+
+# ---------------------------------------------------------------------------------------------- tune
+
+
+@pytest.fixture
+def quick_tuning(monkeypatch):
+    """Few settings, points and rays, so that a test takes no time."""
+    from warpshadow import tuning
+    from warpshadow.point_sample import PointSample
+
+    monkeypatch.setattr(tuning, "PointSample", functools.partial(PointSample, count=60, direction_count=64))
+    for name, values in (("DIRECTION_COUNTS", (16, 32)), ("ORDERS", (4,)), ("LOGS", ("eigen",))):
+        monkeypatch.setattr(tuning, name, values)
+
+
+def lines_to_put_in(text):
+    return text[text.index("[visibility]") :]
+
+
+def test_tune_prints_what_it_tried_and_lines_that_the_scene_file_takes(scene, tmp_path, quick_tuning):
+    result = run("tune", scene, "--error", "0.9")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith(f"{scene}: error of the shading at points of the image, against rays; time of a")
+    assert "warm image of 16 × 12" in result.stdout
+    for method in ("none", "directional 16", "directional 32", "log-sh eigen 4"):
+        assert re.search(rf"^[> ][* ]{method} .* vertex .*\d\.\d\d% +\d+\.\d\d ms$", result.stdout, re.M)
+    assert len(re.findall(r"^>", result.stdout, re.M)) == 1
+    lines = lines_to_put_in(result.stdout).split("\n\n")[0]
+    before, after = SCENE.split("[visibility]\ndirections = 32\n")
+    scene.write_text(f"{before}{lines}\n{after}")
+    method = re.search('method = "(.*)"', lines)[1]
+    assert ws.load_scene(scene).visibility.method == method
+
+
+def test_tune_chooses_by_time_as_well(scene, quick_tuning):
+    result = run("tune", scene, "--ms", "1e6")
+    assert result.exit_code == 0, result.output
+    errors = [float(error) for error in re.findall(r"(\d+\.\d+)% ", result.stdout)]
+    (chosen,) = re.findall(r"^>.* (\d+\.\d+)% ", result.stdout, re.M)
+    assert float(chosen) == min(errors)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "parts"),
+    [
+        ("--error", "1e-6", ("no setting reaches an error of 1e-06; nearest is ", ", with an error of ")),
+        ("--ms", "1e-6", ("no setting reaches 1e-06 ms; nearest is ", " ms")),
+    ],
+)
+def test_tune_says_what_comes_nearest_where_nothing_reaches_it(scene, quick_tuning, option, value, parts):
+    result = run("tune", scene, option, value)
+    assert result.exit_code == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("error: ") and all(part in last for part in parts)
+    assert re.search(r"^>", result.stdout, re.M) and "[visibility]" not in result.stdout
+
+
+@pytest.mark.parametrize(("options", "got"), [((), "neither"), (("--error", 0.1, "--ms", 9), "both")])
+def test_tune_takes_an_error_or_a_time(scene, options, got):
+    fails("tune", scene, *options, parts=(f"--error, --ms: got {got}, expected one of them",))
+
+
+@pytest.mark.parametrize(("option", "name"), [("--error", "error"), ("--ms", "milliseconds")])
+def test_tune_refuses_what_is_no_error_or_time(scene, option, name):
+    fails("tune", scene, option, -1, parts=(f"{name}: got -1.0, expected a positive number",))
+
+
+def test_render_makes_the_choice_that_a_scene_leaves_to_it(scene, tmp_path, quick_tuning):
+    scene.write_text(SCENE.replace("[visibility]", '[visibility]\nmethod = "auto"\nerror = 0.9'))
+    result = run("render", scene, "-o", tmp_path / "out.exr")
+    assert result.exit_code == 0, result.output
+    assert "auto: none, receivers vertex\n" in result.stdout and "out.exr: none, 16 × 12" in result.stdout
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "out.exr"), ws.render(ws.load_scene(scene)))
+
+
+def test_a_method_that_is_given_takes_the_place_of_auto_before_anything_is_tried(scene, tmp_path, monkeypatch):
+    from warpshadow import tuning
+
+    monkeypatch.setattr(tuning, "PointSample", None)
+    scene.write_text(SCENE.replace("[visibility]", '[visibility]\nmethod = "auto"'))
+    result = run("render", scene, "-o", tmp_path / "out.exr", "--method", "directional")
+    assert result.exit_code == 0, result.output
 
 
 # ---------------------------------------------------------------------------------------------- fit

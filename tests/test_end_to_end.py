@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow import film, texture
+from warpshadow import film, texture, views
 from warpshadow import renderer as renderer_module
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
 
@@ -320,7 +320,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
     for _ in range(2):
         (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
         results.append((renderer(textures=[None, image]).detach(), gradient))
-    ((_, level),) = renderer.renderer._kept_footprints.values()
+    ((_, level),) = renderer.renderer.scene_view.kept.footprints.values()
     assert level == coarsest
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
@@ -337,7 +337,7 @@ def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, 
     results, counts = {}, {}
     for name in ("seen", "every"):
         if name == "every":
-            monkeypatch.setattr(renderer_module, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
+            monkeypatch.setattr(views, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
         renderer = TorchRenderer(scene)
         counts[name] = renderer.renderer.scene_view.receivers.points.shape[1]
         rotations, translations, scales = renderer.scene_poses()

@@ -148,6 +148,31 @@ FREE = {
 # ---------------------------------------------------------------------------------------------- start and settle
 
 
+@pytest.mark.parametrize(
+    ("free", "expected"),
+    [
+        ([Pose(BALL)], (BALL,)),
+        ([Deformation(BALL)], (BALL,)),
+        ([Radii(BALL)], (BALL,)),
+        ([Pose(GROUND), Radii(BALL)], (BALL, GROUND)),
+        ([CameraPose(), Light()], None),
+    ],
+)
+def test_what_is_free_says_which_bodies_move(scene, free, expected, monkeypatch):
+    problem, setting, values = prepared(scene, free)
+    model = Model(problem, setting, Stage())
+    given = []
+    forward = model.renderer.forward
+
+    def recorded(*arguments, geometry, **options):
+        given.append(geometry)
+        return forward(*arguments, geometry=geometry, **options)
+
+    monkeypatch.setattr(model.renderer, "forward", recorded)
+    model.images(values)
+    assert [geometry and geometry.moving for geometry in given] == [expected]
+
+
 @pytest.mark.parametrize("case", FREE)
 def test_each_starts_where_the_scene_has_it(scene, dim_scene, case):
     in_cells = case == "light in cells"

@@ -8,7 +8,16 @@ from warpshadow import reference, sh
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
 from warpshadow.mesh import Mesh, icosphere
-from warpshadow.reference import SET_COUNT, sample_map, trace_shading, trace_transfer, trace_visibility
+from warpshadow.reference import (
+    SET_COUNT,
+    cell_samples,
+    even_samples,
+    sample_map,
+    trace_cells,
+    trace_shading,
+    trace_transfer,
+    trace_visibility,
+)
 
 SEED = 5
 
@@ -249,3 +258,42 @@ def test_no_receivers_are_no_work(device):
     none = wp.empty(0, dtype=wp.vec3, device=device)
     assert trace_shading(mesh, none, none, samples).shape == (0,)
     assert trace_transfer(mesh, none, none, HarmonicBasis(2), 16).shape == (0, 4)
+
+
+@pytest.mark.usefixtures("poisoned_outputs")
+def test_cells_add_up_to_shading_whoever_is_traced_together(device):
+    """The same rays, each in the cell that it belongs to; a receiver has its own by its number."""
+    ball = icosphere(1.0, 3)
+    mesh = warp_mesh(Mesh(ball.positions + [0, 1.5, 0], ball.faces), device)
+    rng = np.random.default_rng(SEED)
+    points = np.zeros((40, 3))
+    points[:, ::2] = rng.uniform(-2, 2, size=(40, 2))
+    places, normals = (
+        wp.array(values, dtype=wp.vec3, device=device) for values in (points, np.tile([0.0, 1.0, 0.0], (40, 1)))
+    )
+    radiance = rng.uniform(size=(8, 16, 3))
+    drawn, directions = sample_map(radiance, 200), fibonacci(32)
+    expected = trace_shading(mesh, places, normals, drawn).numpy()
+    samples = cell_samples(drawn, directions, device=device)
+    numbers = wp.array(np.arange(40), dtype=wp.int32, device=device)
+    light = trace_cells(mesh, places, normals, numbers, samples).numpy()
+    assert light.shape == (40, 3, 32)
+    rounding = 1e-5  # of sums of some hundred float32 terms
+    assert np.abs(light.sum(axis=2) - expected).max() < rounding * expected.max()
+    below = fibonacci(32)[:, 1] < -0.4  # whose cells end below the horizon
+    assert not light[:, :, below].any()
+    part = trace_cells(mesh, places[20:], normals[20:], numbers[20:], samples).numpy()
+    np.testing.assert_array_equal(part, light[20:])
+
+
+def test_cells_of_unit_light_are_transfer_to_them(device):
+    ball = icosphere(1.0, 3)
+    mesh = warp_mesh(Mesh(ball.positions + [0, 1.5, 0], ball.faces), device)
+    points = wp.array(np.random.default_rng(SEED).uniform(-2, 2, (30, 3)) * [1, 0, 1], dtype=wp.vec3, device=device)
+    normals = wp.array(np.tile([0.0, 1.0, 0.0], (30, 1)), dtype=wp.vec3, device=device)
+    directions = fibonacci(32)
+    samples = cell_samples(even_samples(512), directions, device=device)
+    numbers = wp.zeros(30, dtype=wp.int32, device=device)
+    light = trace_cells(mesh, points, normals, numbers, samples).numpy()[:, 0]
+    expected = trace_transfer(mesh, points, normals, CellBasis(directions), 512).numpy()
+    assert np.abs(light - expected).max() < 1e-6

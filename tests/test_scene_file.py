@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow import tables
-from warpshadow.scene_file import write_scene
+from warpshadow.scene_file import parse_scene, write_scene
 
 RANDOM = np.random.default_rng(0)
 LIGHTS = {
@@ -134,6 +134,29 @@ def test_tables_read_back_as_they_were_written(tmp_path):
     assert tables.read(path, "file") == written
     tables.write(path, {"loss": float("nan")})
     assert np.isnan(tables.read(path, "file")["loss"])
+
+
+# ---------------------------------------------------------------------------------------------- "auto"
+
+AUTO = '[visibility]\nmethod = "auto"\nerror = 0.9\n'
+
+
+def test_a_method_that_is_left_open_is_chosen_on_load(load, tmp_path):
+    scene = load(AUTO + TABLES + "blockers = 0\n")
+    assert (scene.visibility.method, scene.visibility.error) == ("none", 0.9)
+    assert parse_scene(tmp_path / "scene.toml").visibility.method == "auto"
+
+
+def test_a_scene_whose_method_is_open_is_written_as_such(load, tmp_path):
+    load(AUTO + TABLES + "blockers = 0\n")
+    path = write_scene(parse_scene(tmp_path / "scene.toml"), tmp_path / "again")[0]
+    again = parse_scene(path).visibility
+    assert (again.method, again.error) == ("auto", 0.9)
+
+
+@pytest.mark.parametrize("value", ["0", "-0.1", "nan", '"small"', "true"])
+def test_an_error_that_is_none_is_refused(refused, value):
+    refused(f"[visibility]\nerror = {value}\n{TABLES}", "[visibility]", "error: got", "expected a")
 
 
 # ---------------------------------------------------------------------------------------------- cameras

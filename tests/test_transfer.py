@@ -53,6 +53,38 @@ def test_unblocked_sh_transfer_is_the_cosine_and_that_of_full_visibility(order, 
     assert np.abs(sh_transfer(full, on_device, order=order).numpy() - free).max() < FLOAT32
 
 
+@pytest.mark.parametrize("is_shadowed", [True, False])
+@pytest.mark.parametrize("lanes", [16, 1])
+@pytest.mark.parametrize(("order", "bands"), [(2, 1), (5, 2), (8, 1), (8, 3), (8, 7)])
+def test_transfer_to_few_bands_is_the_start_of_that_to_all(order, bands, lanes, is_shadowed, monkeypatch, device):
+    """And its adjoint that of all, where nothing comes from the others."""
+    monkeypatch.setattr(transfer_module, "lane_count", lambda _: lanes)
+    rng = np.random.default_rng(order)
+    values = rng.normal(size=(2, 19, order**2)).astype(np.float32), unit_vectors(order, 2, 19)
+    seed = np.zeros((2, 19, order**2), np.float32)
+    seed[..., : bands**2] = rng.normal(size=(2, 19, bands**2))
+    results = []
+    for count in (bands, order):
+        visibility = wp.array(values[0], device=device, requires_grad=True) if is_shadowed else None
+        normals = wp.array(values[1], dtype=wp.vec3, device=device, requires_grad=True)
+        with wp.Tape() as tape:
+            transfer = sh_transfer(visibility, normals, order=order, bands=count)
+        assert transfer.shape == (2, 19, count**2)
+        seeds = np.ascontiguousarray(seed[..., : count**2])
+        tape.backward(grads={transfer: wp.array(seeds, device=device)})
+        gradients = [variable.grad.numpy() for variable in (visibility, normals) if variable is not None]
+        results.append([transfer.numpy()[..., : bands**2], *gradients])
+    for got, expected in zip(*results, strict=True):
+        assert np.abs(got - expected).max() <= FLOAT32 * max(np.abs(expected).max(), 1)
+
+
+def test_bands_that_visibility_does_not_have_are_refused(device):
+    normals = wp.zeros((1, 5), dtype=wp.vec3, device=device)
+    for bands in (0, 5):
+        with pytest.raises(ValueError, match=f"bands: got {bands}, expected one of 1, 2, 3, 4"):
+            sh_transfer(None, normals, order=4, bands=bands)
+
+
 @pytest.mark.parametrize("order", [2, 8])
 def test_white_under_unit_light_in_sh_is_one(order, device):
     """The white furnace: albedo 1, L = 1, nothing blocked."""

@@ -7,10 +7,12 @@ from warpshadow.camera import Camera
 from warpshadow.image import ImageError, read_image, write_image
 from warpshadow.light import EnvironmentMap, synthetic_sky
 from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane
+from warpshadow.parallel import set_thread_count, thread_count
 from warpshadow.renderer import Renderer, render
 from warpshadow.scene import Body, Scene, Visibility
 from warpshadow.scene_file import SceneError, load_scene, write_scene
 from warpshadow.spheres import Spheres, fit_spheres
+from warpshadow.tuning import Tuning, tune
 
 __version__ = "0.1.0"
 
@@ -27,6 +29,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "Spheres",
+    "Tuning",
     "Visibility",
     "fit_spheres",
     "icosphere",
@@ -36,7 +39,10 @@ __all__ = [
     "quiet",
     "read_image",
     "render",
+    "set_thread_count",
     "synthetic_sky",
+    "thread_count",
+    "tune",
     "write_image",
     "write_scene",
 ]

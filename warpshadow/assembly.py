@@ -1,6 +1,8 @@
 """Assembly: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
 
+import contextlib
 import functools
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,15 +13,33 @@ from warpshadow.batch import common_batch, concatenate
 from warpshadow.blockers import scene_blockers
 from warpshadow.deform import DeformationGraph, Poses
 from warpshadow.mesh import edge_neighbors
-from warpshadow.scene import Scene
+from warpshadow.scene import SPHERE_METHODS, Scene
 
 
-class Geometry(NamedTuple):
-    """What can move: the vertices of all bodies, and the spheres that stand in for them."""
-
+class _GeometryArrays(NamedTuple):
     positions: Any  # [batch, vertex] vec3
     centers: Any  # [batch, sphere] vec3
     radii: Any  # [batch, sphere] float32
+
+
+class Geometry(_GeometryArrays):
+    """What can move: the vertices of all bodies, and the spheres that stand in for them.
+
+    Args:
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        centers: Spheres' centers [scene units], vec3 of shape [batch, sphere].
+        radii: Spheres' radii [scene units], float32 of shape [batch, sphere].
+        moving: Bodies that differ from the scene's, from 0; None where any may. The others are the same in every
+            instance, and no gradient to them is asked for.
+    """
+
+    moving: tuple[int, ...] | None = None
+
+    def __new__(cls, positions: Any, centers: Any, radii: Any, *, moving: Iterable[int] | None = None) -> "Geometry":
+        """Make a tuple of the three arrays that remembers what moves."""
+        self = super().__new__(cls, positions, centers, radii)
+        self.moving = None if moving is None else tuple(sorted(set(moving)))
+        return self
 
 
 class Assembly:
@@ -41,6 +61,7 @@ class Assembly:
         self.scene = scene
         self.device = wp.get_device(device)
         self._progress = progress
+        self._faces_of: dict[tuple[int, int], wp.array] = {}
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
         uv_faces = [np.zeros_like(mesh.faces) if mesh.uv_faces is None else mesh.uv_faces for mesh in meshes]
@@ -54,6 +75,11 @@ class Assembly:
     def body_of_face(self) -> np.ndarray:
         """Body that each face belongs to, shape [face]."""
         return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face))
+
+    @functools.cached_property
+    def body_of_vertex(self) -> np.ndarray:
+        """Body that each vertex belongs to, shape [vertex]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex))
 
     @functools.cached_property
     def surfaces(self) -> wp.array | None:
@@ -72,7 +98,18 @@ class Assembly:
     @functools.cached_property
     def _spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
-        return scene_blockers(self.scene, device=self.device, progress=self._progress)
+        with _unrecorded():
+            return scene_blockers(self.scene, device=self.device, progress=self._progress)
+
+    @property
+    def sphere_counts(self) -> np.ndarray:
+        """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for."""
+        if "_spheres" in self.__dict__:
+            return np.diff(self.first_sphere)
+        if self.scene.visibility.method not in SPHERE_METHODS:
+            return np.zeros(len(self.scene.bodies), int)
+        blockers = [body.blockers for body in self.scene.bodies]
+        return np.array([count if isinstance(count, int) else len(count) for count in blockers])
 
     @functools.cached_property
     def first_sphere(self) -> np.ndarray:
@@ -89,6 +126,7 @@ class Assembly:
             self._array(positions[None], wp.vec3),
             self._array(centers[None], wp.vec3),
             self._array(radii[None], wp.float32),
+            moving=(),
         )
 
     @functools.cached_property
@@ -101,24 +139,69 @@ class Assembly:
             self._array(np.array([[body.scale for body in bodies]]), wp.float32),
         )
 
-    def placed(self, poses: Poses | None = None, rest: Geometry | None = None) -> Geometry:
+    @functools.cached_property
+    def scene_geometry(self) -> Geometry:
+        """Where the scene has its bodies and their spheres; the batch is 1."""
+        return self.placed()
+
+    def placed(
+        self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[int] | None = None
+    ) -> Geometry:
         """Place the bodies in the world.
 
         Args:
             poses: Of each body, by default the scene's.
             rest: The bodies in their own spaces, by default as their meshes are.
                 Either batch may be 1 and then serves every instance of the other.
+            moving: Bodies that ``poses`` move, from 0; None for any. The others stand where the scene has them, without
+                a gradient, unless ``rest`` is that of :meth:`deformed`: what it deforms is among those that move.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
 
         Differentiable: poses, rest.
         """
         poses = self.poses if poses is None else poses
         rest = self.rest if rest is None else rest
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
+        if moving is None or rest.moving is None:
+            return Geometry(
+                poses.points(rest.positions, self._vertex_bodies),
+                poses.points(rest.centers, self._sphere_bodies),
+                poses.radii(rest.radii, self._sphere_bodies),
+            )
+        bodies = {*moving, *rest.moving}
+        for number in bodies:
+            check.choice("moving", number, range(len(self.scene.bodies)))
+        vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
+        still = self.scene_geometry
         return Geometry(
-            poses.points(rest.positions, self._vertex_bodies),
-            poses.points(rest.centers, self._sphere_bodies),
-            poses.radii(rest.radii, self._sphere_bodies),
+            exchanged(
+                still.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
+            ),
+            exchanged(
+                still.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])
+            ),
+            exchanged(still.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            moving=bodies,
         )
+
+    @staticmethod
+    def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
+        """Where the items of some bodies begin and end, consecutive bodies together and those without items left out.
+
+        Args:
+            starts: Where each body's items begin, and the end of the last: :attr:`first_vertex`, :attr:`first_sphere`
+                or :attr:`first_face`.
+            bodies: The bodies, from 0.
+        """
+        runs: list[tuple[int, int]] = []
+        for first, end in ((int(starts[number]), int(starts[number + 1])) for number in sorted(bodies)):
+            if runs and runs[-1][1] == first:
+                runs[-1] = runs[-1][0], end
+            elif end > first:
+                runs.append((first, end))
+        return runs
 
     def graph(self, number: int, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
@@ -170,7 +253,16 @@ class Assembly:
             _spliced("positions", rest.positions, positions, first_vertex),
             _spliced("centers", rest.centers, centers, first_sphere),
             _spliced("radii", rest.radii, radii, first_sphere),
+            moving=None if rest.moving is None else {*rest.moving, number},
         )
+
+    def faces_of(self, first: int, end: int) -> wp.array:
+        """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
+        if (first, end) not in self._faces_of:
+            faces = self.faces.numpy()
+            own = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
+            self._faces_of[first, end] = self._array(own, wp.vec3i)
+        return self._faces_of[first, end]
 
     @functools.cached_property
     def _vertex_bodies(self) -> wp.array:
@@ -186,6 +278,21 @@ class Assembly:
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
+
+
+@contextlib.contextmanager
+def _unrecorded() -> Iterator[None]:
+    """Launch beside the tape that is recording, if one is."""
+    runtime = wp._src.context.runtime  # Warp has no public way to ask
+    tape = None if runtime is None else runtime.tape
+    if tape is None:
+        yield
+        return
+    runtime.tape = None
+    try:
+        yield
+    finally:
+        runtime.tape = tape
 
 
 def _starts(parts: list[np.ndarray]) -> np.ndarray:
@@ -204,7 +311,30 @@ def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarra
     first, end = place.tolist()
     check.shape(name, part.shape, ("batch", end - first))
     common_batch({"rest": whole, name: part})
-    before = [whole[:, :first]] if first else []
-    after = [whole[:, end:]] if end < whole.shape[1] else []
-    pieces = [*before, part, *after]
+    return exchanged(whole, [(first, end)], lambda *_: part)
+
+
+def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
+    """Exchange runs of items of a whole.
+
+    Args:
+        whole: Shape [batch, item].
+        runs: Where each begins and ends, rising.
+        part_of: Makes what comes in place of a run, shape [batch, item], given its begin and end.
+
+    Returns:
+        Shape [batch, item]; batches of 1 serve every instance of the others.
+
+    Differentiable: whole, where it is not exchanged, and parts.
+    """
+    if not runs:
+        return whole
+    pieces, last = [], 0
+    for first, end in runs:
+        pieces += [whole[:, last:first]] if first > last else []
+        pieces.append(part_of(first, end))
+        last = end
+    pieces += [whole[:, last:]] if last < whole.shape[1] else []
+    if len(pieces) == 1:
+        return pieces[0]
     return concatenate(pieces, [piece.shape[1] for piece in pieces])

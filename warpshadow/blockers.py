@@ -5,7 +5,7 @@ import warp as wp
 
 from warpshadow.mesh import Mesh
 from warpshadow.scene import SPHERE_METHODS, Body, Scene
-from warpshadow.spheres import Spheres, fit_spheres
+from warpshadow.spheres import Spheres, fit, fit_spheres
 
 
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
@@ -17,22 +17,54 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     """
     if scene.visibility.method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)
+    grounds = _ground_spheres(scene)
+    return [_body_spheres(body, ground, device, progress) for body, ground in zip(scene.bodies, grounds, strict=True)]
+
+
+def fitted_counts(scene: Scene) -> dict[int, int]:
+    """Find the bodies to whose meshes spheres are fitted: neither grounds, nor those with spheres of their own.
+
+    Returns:
+        Numbers of the bodies, from 0, and how many spheres each asks for.
+    """
+    grounds = _ground_spheres(scene)
+    return {
+        number: count for number, count in enumerate(map(_wanted, scene.bodies)) if count and grounds[number] is None
+    }
+
+
+def is_fitted(mesh: Mesh, count: int, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether the spheres of a mesh are kept from an earlier fit."""
+    positions, faces = np.asarray(mesh.positions, np.float64), np.asarray(mesh.faces, np.int32)
+    used, renumbered = np.unique(faces, return_inverse=True)
+    positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    scaled = (positions - (low + high) / 2) / float(np.linalg.norm(high - low))
+    normalized = (np.round(scaled * 2**18) / 2**18).astype(np.float32)
+    job = fit._Job(normalized, faces, 0, 2000, wp.get_device(device))
+    return (fit._cache_folder() / f"{job.key(count)}.npz").exists()
+
+
+def _wanted(body: Body) -> int:
+    """How many spheres a body asks for."""
+    return 0 if isinstance(body.blockers, Spheres) else body.blockers
+
+
+def _ground_spheres(scene: Scene) -> list[Spheres | None]:
+    """The sphere of each body that asks for some and is a ground."""
     meshes = [body.world_mesh() for body in scene.bodies]
-    spheres = []
-    for index, body in enumerate(scene.bodies):
-        others = [mesh.positions[np.unique(mesh.faces)] for k, mesh in enumerate(meshes) if k != index]
-        spheres.append(_body_spheres(body, meshes[index], others, device, progress))
-    return spheres
+    points = [mesh.positions[np.unique(mesh.faces)] for mesh in meshes]
+    return [
+        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]]) if _wanted(body) else None
+        for k, body in enumerate(scene.bodies)
+    ]
 
 
-def _body_spheres(
-    body: Body, world_mesh: Mesh, others: list[np.ndarray], device: wp.DeviceLike, progress: bool
-) -> Spheres:
+def _body_spheres(body: Body, ground: Spheres | None, device: wp.DeviceLike, progress: bool) -> Spheres:
     if isinstance(body.blockers, Spheres):
         return body.blockers
     if body.blockers == 0:
         return Spheres.concatenate([])
-    ground = _ground_sphere(world_mesh, others)
     if ground is not None:
         inverse = body.rotation_matrix().T
         return ground.transformed(

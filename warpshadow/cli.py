@@ -72,7 +72,7 @@ def render(
         typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
     ] = None,
     method: Annotated[
-        Optional[Literal["directional", "log-sh", "none", "ray-traced"]],
+        Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
     ] = None,
     samples: Annotated[Optional[int], typer.Option(help="Directions of the ray-traced method.", min=1)] = None,
@@ -81,20 +81,25 @@ def render(
     """Render a scene file to an image with soft shadows."""
     from warpshadow.image import auto_exposure, exposed, write_image
     from warpshadow.renderer import Renderer
-    from warpshadow.scene_file import load_scene
+    from warpshadow.scene import AUTO
+    from warpshadow.scene_file import parse_scene
+    from warpshadow.tuning import describe, resolved
 
     with _clear_errors():
         _check_output(output, ".exr")
         if png is not None:
             _check_output(png, ".png", ".jpg", ".jpeg")
-        loaded = load_scene(scene)
+        loaded = parse_scene(scene)
         visibility = loaded.visibility
         visibility = dataclasses.replace(
             visibility, method=method or visibility.method, samples=samples or visibility.samples
         )
-        loaded = dataclasses.replace(loaded, visibility=visibility)
+        where = _device(device)
+        loaded = resolved(dataclasses.replace(loaded, visibility=visibility), device=where, progress=True)
+        if visibility.method == AUTO:
+            typer.echo(f"auto: {describe(loaded)}")
         start = time.perf_counter()
-        image = Renderer(loaded, device=_device(device), progress=True).render()
+        image = Renderer(loaded, device=where, progress=True).render()
         seconds = time.perf_counter() - start
         write_image(output, image)
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
@@ -102,6 +107,45 @@ def render(
             stops = auto_exposure(image) if exposure is None else exposure
             write_image(png, exposed(image, stops))
             typer.echo(f"{png}: exposure {stops:+.2f} stops")
+
+
+@app.command()
+def tune(
+    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
+    error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
+    ms: Annotated[Optional[float], typer.Option(help="In place of --error: longest time of an image [ms].")] = None,
+    fit: Annotated[
+        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s each; they are kept for later.")
+    ] = False,
+    device: Device = "cpu",
+) -> None:
+    """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
+
+    Exit status 1: none reaches it; the one that comes nearest is named.
+    """
+    from warpshadow.scene_file import parse_scene
+    from warpshadow.timing import TIMED_RECEIVERS
+    from warpshadow.tuning import describe
+    from warpshadow.tuning import tune as tune_scene
+
+    with _clear_errors():
+        if (error is None) == (ms is None):
+            raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
+        loaded = parse_scene(scene)
+        tuning = tune_scene(loaded, error=error, milliseconds=ms, fits=fit, device=_device(device), progress=True)
+        typer.echo(
+            f"{scene}: error of the shading at points of the image, against rays; time of a warm image of "
+            f"{loaded.camera.width} × {loaded.camera.height},\nof which shadows are timed on {TIMED_RECEIVERS} "
+            "receivers and extrapolated to all"
+        )
+        typer.echo(f"{tuning.table()}\n* no other is both faster and more accurate    > chosen\n")
+        if not tuning.is_reached:
+            wanted = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
+            raise ValueError(
+                f"no setting reaches {wanted}; nearest is {describe(tuning.scene)}, "
+                f"with an error of {tuning.error:.3g} in {tuning.milliseconds:.3g} ms"
+            )
+        typer.echo(tuning.toml(), nl=False)
 
 
 def _device(name: str) -> wp.Device:

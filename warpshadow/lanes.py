@@ -69,7 +69,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
         is_above |= value.c[lane] > limit;
     return is_above;
     """)
-    def is_any_above(value: Lane, limit: float) -> bool: ...
+    def is_any_above(value: Lane, limit: float) -> bool: ...  # type: ignore[empty-body]
 
     @wp.func_native(f"""
     float part[{lanes}];
@@ -80,7 +80,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
             part[lane] += part[lane + half];
     return part[0];
     """)
-    def total(value: Lane) -> float: ...
+    def total(value: Lane) -> float: ...  # type: ignore[empty-body]
 
     @wp.func
     def find_group(row: int, vertex_count: int):

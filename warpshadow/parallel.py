@@ -17,7 +17,7 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -153,8 +153,8 @@ def _launch(
     kernel: wp.Kernel,
     dim: Sequence[int],
     cost: float,
-    arguments: dict[str, Sequence[Any]],
-    sums: dict[int, wp.array | None],
+    arguments: Mapping[str, Sequence[Any]],
+    sums: Mapping[int, wp.array | None],
     device: wp.Device,
 ) -> None:
     """Launch a kernel, or its adjoint if there are adjoint arguments; sums by their places among the arguments."""
@@ -163,7 +163,7 @@ def _launch(
     summed = {place: array for place, array in sums.items() if array is not None}
     most = _SLICES_PER_THREAD * thread_count()
     if summed:  # as many for any number of threads
-        most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(array.size for array in summed.values())))
+        most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
     if slice_count <= 1 or (not summed and thread_count() == 1):
@@ -172,7 +172,7 @@ def _launch(
     own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
     command = wp.launch(kernel, dim=dim, **arguments, **options, record_cmd=True)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
-    slices = collections.deque()
+    slices: collections.deque[wp.Launch] = collections.deque()
     for number, (first, end) in enumerate(itertools.pairwise(starts)):
         piece = copy.copy(command)
         for name in ("params", "fwd_args", "adj_args"):

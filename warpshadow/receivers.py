@@ -3,13 +3,13 @@
 They are the vertices of what is seen, and for bodies that want it the points that the samples see.
 """
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.batch import common_batch, rows
+from warpshadow.constants import constant
 from warpshadow.raster import Fragments
 from warpshadow.silhouette import Silhouettes
 from warpshadow.tape import launch
@@ -18,11 +18,12 @@ from warpshadow.tape import launch
 class Receivers(NamedTuple):
     """Receivers of every instance."""
 
-    points: wp.array  # [batch, receiver] vec3
-    normals: wp.array  # [batch, receiver] vec3
+    points: wp.array  # [batch, receiver − still] vec3
+    normals: wp.array  # [batch, receiver − still] vec3
     faces: wp.array  # [face + own] vec3i, indices of receivers
     of_vertices: wp.array  # [vertex] int32, -1 for none
     fragments: Fragments  # a sample with a receiver of its own sees one of the added faces, whose corners are all it
+    still: np.ndarray = np.empty(0, int)  # [still], vertices that are the first receivers; points are of those after
 
 
 @wp.kernel
@@ -90,6 +91,7 @@ def find_receivers(
     fragments: Fragments,
     keeps_vertex: np.ndarray,
     wants_samples: np.ndarray,
+    is_still: np.ndarray | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -101,6 +103,7 @@ def find_receivers(
         keeps_vertex: Which vertices are receivers, bool of shape [vertex]: all of those of a face that a sample sees,
             unless the face wants samples; see :func:`seen_vertices`.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
+        is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them.
@@ -109,20 +112,21 @@ def find_receivers(
     """
     device = positions.device
     has_own = wants_samples.any()
-    if not has_own and keeps_vertex.all():
-        return Receivers(positions, normals, faces, _every(len(keeps_vertex), str(device)), fragments)
-    vertices = np.flatnonzero(keeps_vertex)
+    if not has_own and keeps_vertex.all() and is_still is None:
+        return Receivers(positions, normals, faces, constant(np.arange(len(keeps_vertex)), wp.int32, device), fragments)
+    is_still = np.zeros_like(keeps_vertex) if is_still is None else is_still
+    still, vertices = np.flatnonzero(keeps_vertex & is_still), np.flatnonzero(keeps_vertex & ~is_still)
+    vertex_count = len(still) + len(vertices)
     samples = np.empty((len(fragments.face_ids), 0), int)
     batch_count = len(positions)
-    receiver_of_vertex = np.cumsum(keeps_vertex, dtype=np.int32) - 1
-    receiver_of_vertex[~keeps_vertex] = -1
+    receiver_of_vertex = np.full(len(keeps_vertex), -1, np.int32)
+    receiver_of_vertex[np.concatenate([still, vertices])] = np.arange(vertex_count)
     receiver_faces = receiver_of_vertex[faces.numpy()]
     receiver_fragments = fragments
     if has_own:
         batch_count = common_batch({"positions": positions, "fragments": fragments.face_ids})
         samples, receiver_fragments = _own_samples(fragments, wants_samples)
-        first = len(vertices)
-        own_faces = np.repeat(np.arange(first, first + samples.shape[1])[:, None], 3, axis=1)
+        own_faces = np.repeat(vertex_count + np.arange(samples.shape[1])[:, None], 3, axis=1)
         receiver_faces = np.concatenate([receiver_faces, own_faces])
     variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
     requires_grad = any(array.requires_grad for array in variables)
@@ -151,6 +155,7 @@ def find_receivers(
         wp.array(receiver_faces, dtype=wp.vec3i, device=device),
         wp.array(receiver_of_vertex, dtype=wp.int32, device=device),
         receiver_fragments,
+        still,
     )
 
 
@@ -172,12 +177,6 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     takes_part[faces[is_seen[:-1]]] = True
     takes_part[edges[edges >= 0]] = True
     return takes_part
-
-
-@functools.lru_cache(maxsize=8)
-def _every(count: int, device: str) -> wp.array:
-    """Numbers of as many receivers as there are vertices."""
-    return wp.array(np.arange(count), dtype=wp.int32, device=device)
 
 
 def _own_samples(fragments: Fragments, wants_samples: np.ndarray) -> tuple[np.ndarray, Fragments]:

@@ -249,6 +249,114 @@ def trace_transfer(
     return wp.array(transfer, device=points.device)
 
 
+@wp.kernel(enable_backward=False)
+def _trace_cells(
+    # in
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    numbers: wp.array[wp.int32],
+    offset: float,
+    directions: wp.array2d[wp.vec3],
+    cells: wp.array2d[wp.int32],
+    radiance: wp.array3d[wp.float32],
+    # out
+    light: wp.array3d[wp.float32],
+):
+    """A thread owns a receiver, whose cells are zero before."""
+    receiver = wp.tid()
+    chosen = int(wp.rand_init(17, numbers[receiver]) % wp.uint32(directions.shape[0]))
+    normal = normals[receiver]
+    start = points[receiver] + offset * normal
+    for sample in range(directions.shape[1]):
+        toward = directions[chosen, sample]
+        cosine = wp.dot(normal, toward) / wp.pi
+        if cosine > 0.0 and not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
+            cell = cells[chosen, sample]
+            for channel in range(light.shape[1]):
+                light[receiver, channel, cell] = (
+                    light[receiver, channel, cell] + cosine * radiance[chosen, sample, channel]
+                )
+
+
+class CellSamples(NamedTuple):
+    """Directions drawn from light on a device, and the cells that they belong to.
+
+    Args:
+        directions: Unit vectors, vec3 of shape [set, sample].
+        cells: Nearest cell of each, int32 of shape [set, sample].
+        radiance: Radiance over (probability density · number of samples), float32 of shape [set, sample, channel].
+        cell_count: Number of cells.
+    """
+
+    directions: wp.array
+    cells: wp.array
+    radiance: wp.array
+    cell_count: int
+
+
+def cell_samples(samples: LightSamples, directions: np.ndarray, *, device: wp.DeviceLike = None) -> CellSamples:
+    """Find the cell of each sample.
+
+    Args:
+        samples: Directions drawn from light, whose radiance may have any number of channels.
+        directions: Of the cells, unit vectors of shape [direction, 3].
+        device: Where they are wanted.
+    """
+    cells = np.argmax(samples.directions.astype(np.float32) @ directions.T.astype(np.float32), axis=-1)
+    return CellSamples(
+        wp.array(samples.directions, dtype=wp.vec3, device=device),
+        wp.array(cells.astype(np.int32), device=device),
+        wp.array(samples.radiance.astype(np.float32), device=device),
+        len(directions),
+    )
+
+
+def trace_cells(
+    mesh: wp.Mesh,
+    points: wp.array,
+    normals: wp.array,
+    numbers: wp.array,
+    samples: CellSamples,
+    *,
+    progress: bool = False,
+) -> wp.array:
+    """Trace how much light each cell of directions sends past a mesh: :func:`trace_shading`, apart for each cell.
+
+    Args:
+        mesh: What blocks the light.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        numbers: What tells the receivers apart, int32 of shape [receiver]: one gets the same rays whoever is with it.
+        samples: Directions drawn from the light.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        ∫ L V max(n·ω, 0) dω / π over each cell, float32 of shape [receiver, channel, cell].
+
+    Differentiable: no.
+    """
+    shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
+    light = wp.zeros(shape, dtype=wp.float32, device=points.device)
+    offset = ray_offset(mesh)
+    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+        wp.launch(
+            _trace_cells,
+            dim=part.stop - part.start,
+            inputs=[mesh.id, points[part], normals[part], numbers[part], offset, *samples[:3]],
+            outputs=[light[part]],
+            device=points.device,
+            record_tape=False,
+        )
+    return light
+
+
+def even_samples(count: int) -> LightSamples:
+    """Directions that are even over the sphere, one set, for light of radiance 1 in one channel."""
+    directions = fibonacci(-(-count // CHUNK) * CHUNK)
+    return LightSamples(directions[None], np.full((1, len(directions), 1), 4 * np.pi / len(directions)))
+
+
 def _parts(total: int, size: int, progress: bool) -> Iterator[slice]:
     """Cut a range into slices of at most ``size``, with a progress bar over them."""
     from tqdm import tqdm

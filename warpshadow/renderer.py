@@ -1,50 +1,32 @@
 """The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
 
 Geometry and cameras make a view, which has transfer vectors; they and light make shading; shading, albedo and textures
-make the image.
+make the image. What a call leaves out, and why, :meth:`Renderer.explain` says.
 """
 
 import functools
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpshadow import check, film, sh
+from warpshadow import film
 from warpshadow.assembly import Assembly, Geometry
-from warpshadow.basis import Basis, CellBasis, HarmonicBasis, conversion
-from warpshadow.batch import common_batch, concatenate, expand
-from warpshadow.camera import Camera, to_clip
-from warpshadow.directions import fibonacci
+from warpshadow.basis import Basis
+from warpshadow.camera import Camera
 from warpshadow.light import EnvironmentMap
-from warpshadow.mesh import vertex_normals
-from warpshadow.raster import Fragments, interpolate, rasterize
-from warpshadow.receivers import Receivers, find_receivers, seen_vertices
-from warpshadow.reference import sample_map, trace_shading, trace_transfer
-from warpshadow.scene import Scene
-from warpshadow.shading import shade
-from warpshadow.silhouette import Silhouettes, find_contrasts, find_silhouettes, smooth_silhouettes
-from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo, seen_texels
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, exponential, log_sh
+from warpshadow.lighting import Light, Lighting
+from warpshadow.plan import ALBEDO, LIGHT, TEXTURES, Explanation, ImagePlan, Ledger, ViewFacts, plan_image
+from warpshadow.raster import Fragments
+from warpshadow.reflectance import Reflectance
+from warpshadow.scene import AUTO, Scene
+from warpshadow.silhouette import find_contrasts, smooth_silhouettes
+from warpshadow.views import Prospect, View, Viewer
 
 COARSE_FACE = 400
 """Pixels of an average face beyond which shading at its corners draws a warning."""
-
-Light = EnvironmentMap | np.ndarray | wp.array
-"""A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
-
-
-class View(NamedTuple):
-    """What cameras see of a geometry: all that an image takes but light and reflectance."""
-
-    geometry: Geometry
-    receivers: Receivers
-    clip_positions: wp.array  # [batch, vertex] vec4
-    fragments: Fragments  # of the samples
-    silhouettes: Silhouettes
 
 
 class Renderer:
@@ -63,6 +45,7 @@ class Renderer:
         progress: Show progress where something takes longer than a second.
 
     Attributes:
+        scene: The scene; a method "auto" has been replaced by what was chosen.
         cameras: Those that see the scene.
         has_camera_batch: Whether they were given as a batch.
 
@@ -79,34 +62,39 @@ class Renderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
+        if scene.visibility.method == AUTO:
+            from warpshadow.tuning import resolved  # which renders to find out
+
+            scene = resolved(scene, device=device, progress=progress)
         self.scene = scene
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
         self.device = wp.get_device(device)
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
-        visibility = scene.visibility
-        is_cellular = visibility.method == "directional"
-        self._own_basis = (
-            CellBasis(fibonacci(visibility.directions)) if is_cellular else HarmonicBasis(visibility.order)
-        )
-        self.basis = self._own_basis if basis is None else basis
-        self._kept_footprints: dict[tuple, tuple[Footprints, int]] = {}  # with their coarsest level
+        self._ledger = Ledger()
+        self._viewer = Viewer(self.assembly, self.cameras, self._ledger, progress=progress)
+        self._lighting = Lighting(self.assembly, basis, self._ledger, progress=progress)
+        self._reflectance = Reflectance(self.assembly, self._ledger)
+        self.basis = self._lighting.basis
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
-    @functools.cached_property
+    @property
     def geometry(self) -> Geometry:
         """Where the scene has its bodies and their spheres; the batch is 1."""
-        return self.assembly.placed()
+        return self.assembly.scene_geometry
 
-    @functools.cached_property
+    @property
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
-        return self._array(np.stack([camera.clip_matrix() for camera in self.cameras]), wp.mat44)
+        return self._viewer.clip_matrices
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """See a geometry through cameras.
+        """See a geometry through cameras; the last view again if nothing that it depends on changed.
+
+        A view sees what it is given as it is now: arrays may change afterwards, unless they require a gradient. (On a
+        GPU values are not compared, since the host would have to wait for them: hold on to a view that stands.)
 
         Args:
             geometry: Instances of vertices and spheres, by default the scene's own.
@@ -118,34 +106,7 @@ class Renderer:
 
         Differentiable: geometry, clip_matrices.
         """
-        assembly, across = self.assembly, self.scene.supersampling
-        geometry = self.geometry if geometry is None else geometry
-        clip_positions = to_clip(geometry.positions, self.clip_matrices if clip_matrices is None else clip_matrices)
-        camera = self.cameras[0]
-        fragments = rasterize(clip_positions, assembly.faces, across * camera.width, across * camera.height)
-        silhouettes = find_silhouettes(fragments, assembly.faces, assembly.edges, clip_positions, assembly.surfaces)
-        keeps_vertex = self._vertices_receive
-        if self.device.is_cpu:  # a GPU would have to wait until the host knows what is seen, which no graph captures
-            keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(keeps_vertex))
-        receivers = find_receivers(
-            geometry.positions,
-            vertex_normals(geometry.positions, assembly.faces),
-            assembly.faces,
-            fragments,
-            keeps_vertex,
-            self._samples_receive[assembly.body_of_face],
-        )
-        return View(geometry, receivers, clip_positions, fragments, silhouettes)
-
-    @functools.cached_property
-    def _samples_receive(self) -> np.ndarray:
-        """Bodies on which every sample is a receiver."""
-        return np.array([self._is_traced or body.receivers == "pixel" for body in self.scene.bodies])
-
-    @functools.cached_property
-    def _vertices_receive(self) -> np.ndarray:
-        """Vertices of the other bodies."""
-        return np.repeat(~self._samples_receive, np.diff(self.assembly.first_vertex))
+        return self._viewer.see(geometry, clip_matrices)
 
     @functools.cached_property
     def scene_view(self) -> View:
@@ -171,7 +132,7 @@ class Renderer:
             face_counts += np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
         pixels_per_face = sample_counts / self.scene.supersampling**2 / np.maximum(face_counts, 1)
         for number, body in enumerate(bodies):
-            if body.receivers == "vertex" and not self._is_traced and pixels_per_face[number] > COARSE_FACE:
+            if body.receivers == "vertex" and not self._lighting.is_traced and pixels_per_face[number] > COARSE_FACE:
                 warnings.warn(
                     f"body number {number + 1} ({body.mesh.name!r}): a face covers {pixels_per_face[number]:.0f} "
                     "pixels on average, and light is evaluated at its corners alone; "
@@ -179,7 +140,7 @@ class Renderer:
                     stacklevel=2,
                 )
 
-    # ------------------------------------------------------------------------------------------ light
+    # ------------------------------------------------------------------------------------------ light and reflectance
 
     @functools.cached_property
     def transfer(self) -> wp.array:
@@ -187,52 +148,20 @@ class Renderer:
 
         Cameras share the receivers at vertices, for which there is one view.
         """
-        view = self.scene_view
-        if self._is_traced:
-            return self._trace_transfer(view)
-        own = self._own_transfer(view)
-        matrix = self._own_from_basis
-        return own if matrix is None else self._array(own.numpy() @ matrix, wp.float32)
+        return self._lighting.transfer(self.scene_view)
 
-    @functools.cached_property
-    def _own_from_basis(self) -> np.ndarray | None:
-        return conversion(self.basis, self._own_basis)
-
-    def _own_transfer(self, view: View, directions: np.ndarray | None = None) -> wp.array:
-        """Transfer vectors of a view's receivers to what the method computes in, or to other cells of directions."""
-        points, normals, *_ = view.receivers
-        visibility = self.scene.visibility
-        spheres = [view.geometry.centers, view.geometry.radii]
-        has_spheres = spheres[0].shape[1] > 0
-        if has_spheres:
-            count = common_batch({"points": points, "centers": spheres[0], "radii": spheres[1]})
-            points, normals, *spheres = (expand(array, count) for array in (points, normals, *spheres))
-        centers, radii = spheres
-        if isinstance(self._own_basis, CellBasis):
-            directions = self._own_basis.directions if directions is None else directions
-            if has_spheres:
-                softness = visibility.softness
-                seen = directional.transmittance(points, normals, centers, radii, directions, softness=softness)
-            else:
-                seen = wp.full((*points.shape, len(directions)), 1.0, dtype=wp.float32, device=self.device)
-            return directional_transfer(seen, normals, directions)
-        seen = None
-        if has_spheres:
-            log = log_sh.accumulate(points, normals, centers, radii, order=visibility.order, log=visibility.log)
-            seen = exponential.exponentiate(log, base=visibility.base)
-        return sh_transfer(seen, normals, order=visibility.order)
-
-    @functools.cached_property
+    @property
     def scene_shading(self) -> wp.array:
         """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [view, receiver]."""
-        return self._shade_known(self.scene_view, self.scene.light)
+        return self.shade()
 
     def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
-        """Light receivers, each as a white surface.
+        """Light the receivers of a view.
 
         Args:
-            light: By default the scene's. Known light is shaded as accurately as the method can; free light, an array
-                of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient], is differentiable.
+            light: Known light, as a map or SH coefficients, by default the scene's: it is shaded as accurately as the
+                method can. Free light, an array of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient],
+                is differentiable.
             view: By default the scene's own.
 
         Returns:
@@ -243,102 +172,12 @@ class Renderer:
 
         Differentiable: light, view.
         """
-        is_static = view is None or view is self.scene_view
-        view = self.scene_view if view is None else view
-        if not isinstance(light, wp.array):
-            if light is None and is_static:
-                return self.scene_shading
-            return self._shade_known(view, self.scene.light if light is None else light)
-        if is_static:
-            return shade(self.transfer, light)
-        if self._is_traced:
-            raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")
-        if self._own_from_basis is not None:
-            matrix = self._array(self._own_from_basis[None], wp.float32)
-            light = shade(matrix, light)
-        return shade(self._own_transfer(view), light)
-
-    def _shade_known(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
-        if self._is_traced:
-            return self._trace(view, light)
-        coefficients, directions = self._scene_light if light is self.scene.light else self._express(light)
-        return shade(self._own_transfer(view, directions), coefficients)
-
-    @functools.cached_property
-    def _scene_light(self) -> tuple[wp.array, np.ndarray | None]:
-        return self._express(self.scene.light)
-
-    def _express(self, light: EnvironmentMap | np.ndarray) -> tuple[wp.array, np.ndarray | None]:
-        """Known light in what the method computes in, vec3 of shape [1, coefficient], and where its cells look."""
-        if isinstance(self._own_basis, CellBasis) and isinstance(light, EnvironmentMap):
-            # a cell looks to where its light comes from: a sun is rarely in the middle
-            coefficients, directions, _ = light.cells(self._own_basis.directions)
-        else:
-            coefficients, directions = self._own_basis.coefficients(light), None
-        return self._array(coefficients[None], wp.vec3), directions
-
-    def _trace_transfer(self, view: View) -> wp.array:
-        """Transfer vectors of what a view of the scene's geometry shows."""
-        points, normals, *_ = view.receivers
-        mesh, count = self._ray_mesh(view, 0), self.scene.visibility.samples
-        transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=self.device)
-        for instance in range(points.shape[0] if points.size else 0):
-            traced = trace_transfer(
-                mesh, points[instance], normals[instance], self.basis, count, progress=self.progress
-            )
-            wp.copy(transfer[instance], traced)
-        return transfer
-
-    def _trace(self, view: View, light: EnvironmentMap | np.ndarray) -> wp.array:
-        points, normals, *_ = view.receivers
-        if points.requires_grad:
-            raise ValueError(
-                "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
-            )
-        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
-        count = max(1, self.scene.visibility.samples // self.scene.supersampling**2)
-        samples = sample_map(radiance, count)
-        traced = wp.empty(points.shape, dtype=wp.vec3, device=self.device)
-        for instance in range(points.shape[0] if points.size else 0):
-            if instance < view.geometry.positions.shape[0]:
-                mesh = self._ray_mesh(view, instance)
-            lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
-            wp.copy(traced[instance], lit)
-        return traced
-
-    def _ray_mesh(self, view: View, instance: int) -> wp.Mesh:
-        points = wp.clone(view.geometry.positions[instance], requires_grad=False)
-        return wp.Mesh(points=points, indices=self.assembly.faces.view(wp.int32).flatten())
+        return self._lighting.shade(self.scene_view if view is None else view, light)
 
     @property
-    def _is_traced(self) -> bool:
-        return self.scene.visibility.method == "ray-traced"
-
-    # ------------------------------------------------------------------------------------------ reflectance
-
-    @functools.cached_property
     def albedo(self) -> wp.array:
         """Reflectance that the scene's samples see, vec3 of shape [camera, height, width]."""
-        return self._reflect(self.scene_view, self._body_albedo, self._body_textures)
-
-    @functools.cached_property
-    def _body_albedo(self) -> list[wp.array]:
-        """Reflectance of each body in the scene, vec3 of shape [1, 1] or [1, vertex]."""
-        return [self._array(np.atleast_2d(body.albedo)[None], wp.vec3) for body in self.scene.bodies]
-
-    @functools.cached_property
-    def _body_textures(self) -> list[wp.array | None]:
-        """Texture of each body in the scene, vec3 of shape [1, height, width]."""
-        images = (body.texture for body in self.scene.bodies)
-        return [None if image is None else self._array(image[None], wp.vec3) for image in images]
-
-    @functools.cached_property
-    def _scene_vertex_albedo(self) -> wp.array:
-        return self._join(self._body_albedo)
-
-    @functools.cached_property
-    def _scene_pyramids(self) -> Textures:
-        return mip_pyramids([image for image in self._body_textures if image is not None])
+        return self.reflect()
 
     def reflect(
         self,
@@ -361,47 +200,7 @@ class Renderer:
 
         Differentiable: albedo, textures, view.
         """
-        is_scenes = not any(given is not None for given in (*(albedo or ()), *(textures or ())))
-        if is_scenes and (view is None or view is self.scene_view):
-            return self.albedo
-        bodies = self.scene.bodies
-        colors, images = list(self._body_albedo), list(self._body_textures)
-        for name, given in (("albedo", albedo), ("textures", textures)):
-            if given is not None and len(given) != len(bodies):
-                raise ValueError(f"{name}: got {len(given)} items, expected {len(bodies)}, one for each body")
-        for number, color in enumerate(albedo or ()):
-            if color is not None:
-                vertex_count = bodies[number].mesh.vertex_count
-                check.shape(f"albedo[{number}]", color.shape, ("batch", 1 if color.shape[1:] == (1,) else vertex_count))
-                check.finite_arrays({f"albedo[{number}]": color}, most=check.LARGEST)
-                colors[number], images[number] = color, None
-        for number, image in enumerate(textures or ()):
-            if image is not None:
-                check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
-                if bodies[number].mesh.uvs is None:
-                    raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None")
-                if albedo is not None and albedo[number] is not None:
-                    raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
-                check.finite_arrays({f"textures[{number}]": image}, most=check.LARGEST)
-                images[number] = image
-        return self._reflect(self.scene_view if view is None else view, colors, images)
-
-    def _reflect(self, view: View, colors: list[wp.array], images: list[wp.array | None]) -> wp.array:
-        faces = self.assembly.faces
-        vertex_albedo = self._scene_vertex_albedo if _same(colors, self._body_albedo) else self._join(colors)
-        present = [image for image in images if image is not None]
-        if not present:
-            return interpolate(view.fragments, faces, vertex_albedo)
-        sizes = tuple(None if image is None else image.shape[1:] for image in images)
-        is_static = view is self.scene_view
-        footprints, coarsest = self._kept_footprints.get(sizes, (None, None)) if is_static else (None, None)
-        is_kept = _same(images, self._body_textures)
-        pyramids = self._scene_pyramids if is_kept else mip_pyramids(present, coarsest=coarsest)
-        if footprints is None:
-            footprints = self._find_footprints(view, pyramids, sizes)
-            if is_static:
-                self._kept_footprints = {sizes: (footprints, footprints.coarsest_level())}
-        return sample_albedo(view.fragments, faces, vertex_albedo, pyramids, footprints)
+        return self._reflectance.find(self.scene_view if view is None else view, albedo, textures)
 
     def seen_texels(self, number: int) -> np.ndarray:
         """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
@@ -416,30 +215,7 @@ class Renderer:
         Raises:
             ValueError: for a body without a texture.
         """
-        has_texture = [image is not None for image in self._body_textures]
-        check.choice("number", number, [body for body, has in enumerate(has_texture) if has])
-        sizes = tuple(None if image is None else image.shape[1:] for image in self._body_textures)
-        footprints = self._find_footprints(self.scene_view, self._scene_pyramids, sizes)
-        return seen_texels(self._scene_pyramids, footprints)[sum(has_texture[:number])].sum(axis=0)
-
-    def _join(self, colors: list[wp.array]) -> wp.array:
-        """Reflectance of all vertices."""
-        return concatenate(colors, np.diff(self.assembly.first_vertex).tolist())
-
-    def _find_footprints(self, view: View, pyramids: Textures, sizes: tuple) -> Footprints:
-        """What each sample covers of its texture; sizes are those of the bodies' textures, None without one."""
-        assembly = self.assembly
-        has_texture = np.array([size is not None for size in sizes])
-        texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
-        return find_footprints(
-            view.fragments,
-            assembly.faces,
-            view.clip_positions,
-            assembly.uvs,
-            assembly.uv_faces,
-            self._array(texture_of_body[assembly.body_of_face], wp.int32),
-            pyramids,
-        )
+        return self._reflectance.seen_texels(self.scene_view, number)
 
     # ------------------------------------------------------------------------------------------ image
 
@@ -468,16 +244,23 @@ class Renderer:
 
         Differentiable: light, albedo, textures, view.
         """
+        view = self.scene_view if view is None else view
         lit = self.shade(light, view)
         reflected = self.reflect(albedo, textures, view)
-        view = self.scene_view if view is None else view
+        plan, timed = self._plan_image(view.facts, light, albedo, textures), self._ledger.timed
         receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
-        samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
+        with timed(plan.exposure, [lit, reflected, clip_positions]):
+            samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
         contrasts = None
-        if clip_positions.requires_grad:
-            contrasts = find_contrasts(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
-        smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, contrasts)
-        return film.average(smoothed, self.scene.supersampling)
+        if plan.contrasts:
+            with timed(plan.contrasts):
+                contrasts = find_contrasts(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
+        with timed(plan.smoothing, [samples, clip_positions]):
+            smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, contrasts)
+        if not plan.averaging:
+            return smoothed
+        with timed(plan.averaging, [smoothed]):
+            return film.average(smoothed, self.scene.supersampling)
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -492,13 +275,79 @@ class Renderer:
         images = self.draw(light).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
-    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
-        return wp.array(values, dtype=dtype, device=self.device)
+    # ------------------------------------------------------------------------------------------ what runs
+
+    def explain(
+        self,
+        light: Any = None,
+        *,
+        albedo: Sequence[Any] | None = None,
+        textures: Sequence[Any] | None = None,
+        view: View | None = None,
+        geometry: Geometry | None = None,
+        clip_matrices: Any = None,
+    ) -> Explanation:
+        """Say what the next call computes, stage by stage, and what it leaves out, and why.
+
+        Args:
+            light: As for :meth:`draw`, or a tensor, as for :class:`warpshadow.torch.TorchRenderer`; so all others.
+            albedo: As for :meth:`draw`.
+            textures: As for :meth:`draw`.
+            view: As for :meth:`draw`: then only what comes after it is explained.
+            geometry: As for :meth:`view`, which is explained with it.
+            clip_matrices: As for :meth:`view`.
+
+        Returns:
+            The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
+            it does or does not run; then the same of the adjoints. Nothing is computed.
+        """
+        if not isinstance(light, EnvironmentMap | np.ndarray):
+            light = _as_array(light, wp.vec3, 2)
+        colors, images = (
+            None if given is None else [_as_array(item, wp.vec3, ndim) for item in given]
+            for given, ndim in ((albedo, 2), (textures, 3))
+        )
+        if view is None:
+            if geometry is not None:
+                dtypes = wp.vec3, wp.vec3, wp.float32
+                arrays = (_as_array(array, dtype, 2) for array, dtype in zip(geometry, dtypes, strict=True))
+                geometry = Geometry(*arrays, moving=geometry.moving)
+            prospect = self._viewer.plan(geometry, _as_array(clip_matrices, wp.mat44, 1))
+        else:
+            prospect = Prospect(None, view.facts, view, view.still)
+        _, facts, view, still = prospect
+        plans = [
+            prospect.plan,
+            self._lighting.plan(facts, light, view=view, still=still),
+            self._reflectance.plan(facts, colors, images, None if view is None else view.kept),
+            self._plan_image(facts, light, colors, images),
+        ]
+        stages = [stage for plan in plans if plan is not None for stage in plan.stages()]
+        return Explanation(stages, self._ledger.timings, is_host=self.device.is_cpu)
+
+    def _plan_image(
+        self,
+        view: ViewFacts,
+        light: Light | None,
+        albedo: Sequence[wp.array | None] | None,
+        textures: Sequence[wp.array | None] | None,
+    ) -> ImagePlan:
+        """What it takes to make an image of what a view's samples receive and reflect."""
+        given = {LIGHT: [light], ALBEDO: albedo or (), TEXTURES: textures or ()}
+        varying = [
+            name for name, arrays in given.items() if any(getattr(array, "requires_grad", False) for array in arrays)
+        ]
+        return plan_image(view, [*view.varying, *varying], supersampling=self.scene.supersampling)
 
 
-def _same(arrays: Sequence[wp.array | None], others: Sequence[wp.array | None]) -> bool:
-    """Whether arrays are the same objects."""
-    return all(array is other for array, other in zip(arrays, others, strict=True))
+def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
+    """An array, or a tensor as one, with the batch dimension that it may lack; None stays None."""
+    if given is None or isinstance(given, wp.array):
+        return given
+    tensor = given.detach()
+    while tensor.ndim < ndim + len(getattr(dtype, "_shape_", ())):
+        tensor = tensor[None]
+    return wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

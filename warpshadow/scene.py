@@ -16,6 +16,7 @@ from warpshadow.visibility.zonal_logs import LOGS
 
 SPHERE_METHODS = ("directional", "log-sh")
 METHODS = (*SPHERE_METHODS, "none", "ray-traced")
+AUTO = "auto"
 RECEIVERS = ("vertex", "pixel")
 
 
@@ -25,13 +26,14 @@ class Visibility:
 
     Args:
         method: "directional" transmittance of spheres, "log-sh" of spheres, "none" (no shadows), or "ray-traced"
-            visibility of the meshes, the reference.
+            visibility of the meshes, the reference. "auto" leaves the choice to :func:`warpshadow.tuning.resolved`.
         directions: Number of direction cells of "directional", a multiple of 16.
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
         order: Number of SH bands, 2 to 8: of "log-sh", and of the light that "none" shades with.
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
         samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
+        error: Largest relative error of shading that "auto" is to accept.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -44,10 +46,11 @@ class Visibility:
     log: str = "eigen"
     base: str = "quadratic"
     samples: int = 1024
+    error: float = 0.05
 
     def __post_init__(self) -> None:
         """Validate."""
-        check.choice("method", self.method, METHODS)
+        check.choice("method", self.method, (*METHODS, AUTO))
         check_count("directions", self.directions)
         sh.check_order(self.order)
         check.choice("log", self.log, LOGS)
@@ -58,6 +61,8 @@ class Visibility:
                 raise ValueError(f"{name}: got {value!r}, expected a whole number")
         if self.samples < 1:
             raise ValueError(f"samples: got {self.samples!r}, expected a positive number of directions")
+        if not (np.isfinite(self.error) and self.error > 0):
+            raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05")
         edge_width(self.softness, self.directions)
 
 

@@ -15,12 +15,13 @@ from warpshadow.mesh import Mesh, icosphere, load_mesh, plane
 from warpshadow.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.tables import Table
+from warpshadow.tuning import resolved
 
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale")
-_VISIBILITY_KEYS = ("method", "directions", "softness", "order", "log", "base", "samples")
+_VISIBILITY_KEYS = ("method", "directions", "softness", "order", "log", "base", "samples", "error")
 _PLACE_KEYS = ("albedo", "texture", "blockers", "spheres", "rotation", "translation", "scale", "receivers")
 _PRIMITIVES: dict[str, tuple[Callable[..., Mesh], tuple[str, ...]]] = {
     "plane": (plane, ("size", "segments")),
@@ -32,16 +33,22 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: str | Path) -> Scene:
-    """Read a scene file.
+def load_scene(path: str | Path, *, progress: bool = False) -> Scene:
+    """Read a scene file; where it leaves the method to "auto", choose one: :func:`warpshadow.tuning.resolved`.
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
+        progress: Show progress where a choice takes longer than a second.
 
     Raises:
         SceneError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
         FileNotFoundError: for a file that is not there.
     """
+    return resolved(parse_scene(path), progress=progress)
+
+
+def parse_scene(path: str | Path) -> Scene:
+    """Read a scene file as :func:`load_scene` does, but leave "auto" as it is."""
     path = Path(path)
     with tables.located(str(path), SceneError):
         return _scene(tables.read(path, "scene file"), path.parent)
@@ -146,7 +153,8 @@ def parse_visibility(table: Table) -> Visibility:
     check.known_keys("key", table, _VISIBILITY_KEYS)
     for key in ("directions", "order", "samples"):
         tables.check_integer(table, key)
-    tables.number(table, "softness", 1.0)
+    for key in ("softness", "error"):
+        tables.number(table, key, 1.0)
     return Visibility(**table)
 
 

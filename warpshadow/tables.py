@@ -38,10 +38,15 @@ def write(path: Path, tables: Mapping[str, Any]) -> None:
     blocks = [_lines(plain)] if plain else []
     for name, value in tables.items():
         if _is_table(value):
-            blocks.append(f"[{name}]\n{_lines(value)}")
+            blocks.append(block(f"[{name}]", value))
         elif _is_tables(value):
-            blocks += [f"[[{name}]]\n{_lines(table)}" for table in value]
+            blocks += [block(f"[[{name}]]", table) for table in value]
     path.write_text("\n".join(blocks), encoding="utf-8")
+
+
+def block(header: str, table: Mapping[str, Any]) -> str:
+    """A table as lines of a TOML file, under its header."""
+    return f"{header}\n{_lines(table)}"
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ While geometry and camera stand still, visibility and rasterization are computed
 mesh included; an iteration is then a matrix product and a gather.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -116,9 +116,9 @@ class TorchRenderer(torch.nn.Module):
             images = [given.get(f"textures[{number}]") for number in range(len(bodies))]
             view = None
             if geometry is not None or clip_matrices is not None:
-                moved = (
-                    None if geometry is None else Geometry(*(given[f"geometry.{name}"] for name in Geometry._fields))
-                )
+                moved = None
+                if geometry is not None:
+                    moved = Geometry(*(given[f"geometry.{name}"] for name in Geometry._fields), moving=geometry.moving)
                 view = renderer.view(moved, given.get("clip_matrices"))
             return renderer.draw(given.get("light", light), albedo=colors, textures=images, view=view)
 
@@ -131,6 +131,7 @@ class TorchRenderer(torch.nn.Module):
         scales: torch.Tensor | None = None,
         *,
         rest: Geometry | None = None,
+        moving: Iterable[int] | None = None,
     ) -> Geometry:
         """Place the bodies in the world: x → s R x + t.
 
@@ -139,6 +140,9 @@ class TorchRenderer(torch.nn.Module):
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
+            moving: Bodies that the poses move, from 0; None for any. The others stand where the scene has them, without
+                a gradient, and what is found out about them once is kept: so the shadows that they cast on one another
+                are those of their meshes. What ``rest`` deforms is among those that move.
 
         Returns:
             Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one.
@@ -158,10 +162,15 @@ class TorchRenderer(torch.nn.Module):
         for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
             arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
 
-        def place(rotations: wp.array, translations: wp.array, scales: wp.array, *parts: wp.array) -> Geometry:
-            return assembly.placed(Poses(rotations, translations, scales), Geometry(*parts) if parts else None)
+        bodies: list[tuple[int, ...] | None] = []
 
-        return Geometry(*arguments.apply(place))
+        def place(rotations: wp.array, translations: wp.array, scales: wp.array, *parts: wp.array) -> Geometry:
+            whole = None if rest is None else Geometry(*parts, moving=rest.moving)
+            placed = assembly.placed(Poses(rotations, translations, scales), whole, moving=moving)
+            bodies.append(placed.moving)
+            return placed
+
+        return Geometry(*arguments.apply(place), moving=bodies[0])
 
     def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotations [body, 3, 3], translations [body, 3] and scales [body] of the scene's bodies, as copies."""
@@ -206,10 +215,13 @@ class TorchRenderer(torch.nn.Module):
 
         def exchange(*arrays: wp.array) -> Geometry:
             given = dict(zip(arguments.names, arrays, strict=True))
-            whole = Geometry(*(given[f"rest.{name}"] for name in Geometry._fields)) if rest else None
+            whole = None
+            if rest is not None:
+                whole = Geometry(*(given[f"rest.{name}"] for name in Geometry._fields), moving=rest.moving)
             return assembly.deformed(number, *(given.get(name) for name in parts), rest=whole)
 
-        return Geometry(*arguments.apply(exchange))
+        before: tuple[int, ...] | None = () if rest is None else rest.moving
+        return Geometry(*arguments.apply(exchange), moving=None if before is None else (*before, number))
 
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
@@ -303,7 +315,7 @@ def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: 
     check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape)
     if tensor.numel() == 0 and 0 not in shape:
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
-    if not np.isfinite(float(tensor.detach().sum())):
+    if not _is_capturing(device) and not np.isfinite(float(tensor.detach().sum())):
         check.finite(name, tensor.detach().cpu().numpy())
 
 
@@ -380,6 +392,12 @@ class _WarpFunction(torch.autograd.Function):
 
 
 def _current_stream(device: torch.device) -> wp.ScopedStream:
-    """Launch on torch's current stream."""
+    """Launch on torch's current stream, which while it is captured must not wait for streams that are not."""
     is_cuda = device.type == "cuda"
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None)
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None
+    return wp.ScopedStream(stream, sync_enter=not _is_capturing(device))
+
+
+def _is_capturing(device: torch.device) -> bool:
+    """Whether torch captures a CUDA graph on its current stream."""
+    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()

@@ -12,9 +12,17 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check, sh
+from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
 from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
-from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
+from warpshadow.sh_kernels import (
+    ProductTable,
+    add_rotated_zonal,
+    multiply,
+    product_table,
+    rotated_zonal_adjoint,
+    zonal_type,
+)
 from warpshadow.tape import record_adjoint
 
 
@@ -97,13 +105,15 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
+        for i in range(adj_transfer.shape[2], wp.static(order**2)):
+            adj_row[i] = Lane(0.0)
         load_rows(adj_transfer[batch], group, adj_row)
         if wp.static(is_shadowed):
             if adj_visibility:
                 for i in range(wp.static(order**2)):
                     factor[i] = Lane(0.0)
                 add_rotated_zonal_(x, y, z, zonal, factor)
-                multiply_(adj_row, factor, first, pairs, values, product)
+                multiply_(factor, adj_row, first, pairs, values, product)
                 add_rows(product, group, adj_visibility[batch])
             load_rows(visibility[batch], group, factor)
             multiply_(factor, adj_row, first, pairs, values, product)
@@ -116,20 +126,34 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
     return transfer_sh_adjoint
 
 
-def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int) -> wp.array:
+@functools.cache
+def _first_bands(order: int, device: str, bands: int) -> ProductTable:
+    """Products of which the first bands are wanted: no pairs for the others."""
+    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
+    table = product_table(order, device, bands_of_j=lit_bands)
+    first = table.first.numpy()
+    return table._replace(first=wp.array(np.minimum(first, first[bands**2]), device=device))
+
+
+def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, bands: int | None = None) -> wp.array:
     """Transfer vectors to light in spherical harmonics: (V * H_n)_k / π, H_n the clamped cosine around the normal.
 
     Args:
         visibility: SH visibility, float32 of shape [batch, vertex, order²]; None where nothing blocks.
         normals: Unit normals, vec3 of shape [batch, vertex].
         order: Number of SH bands, 2 to 8.
+        bands: Number of bands that the light has, all of them by default; of others no product is computed.
 
     Returns:
-        Transfer vectors, float32 of shape [batch, vertex, order²].
+        Transfer vectors, float32 of shape [batch, vertex, bands²].
 
     Differentiable: visibility, normals.
     """
     sh.check_order(order)
+    bands = order if bands is None else bands
+    check.choice("bands", bands, range(1, order + 1))
+    if visibility is None:
+        order = max(bands, 2)  # the first bands of a cosine are the same in any order
     device = normals.device
     lanes = lane_count(device)
     batch_count, vertex_count = normals.shape
@@ -138,24 +162,23 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int) -
     groups = group_count(vertex_count, lanes)
     variables = [visibility, normals]
     transfer = wp.empty(
-        (batch_count, vertex_count, order**2),
+        (batch_count, vertex_count, bands**2),
         dtype=wp.float32,
         device=device,
         requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
     )
-    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)
     scratch = wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device)
     wp.launch(
         _sh_transfer_kernel(order, visibility is not None, lanes),
         dim=(batch_count, groups),
-        inputs=[*variables, *product_table(order, str(device), bands_of_j=lit_bands), scratch],
+        inputs=[*variables, *_first_bands(order, str(device), bands), scratch],
         outputs=[transfer],
         device=device,
         record_tape=False,
     )
 
     def adjoint() -> None:
-        table = product_table(order, str(device))
+        table = product_table(order, str(device), bands_of_j=tuple(range(bands)))
         wp.launch(
             _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
             dim=(batch_count, groups),
@@ -241,7 +264,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
     seen = as_chunks(transmittance.contiguous())
     variables = [transmittance, normals]
-    towards = wp.array(directions.T.reshape(3, -1, CHUNK), dtype=Chunk, device=device)
+    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
     transfer = wp.empty(
         transmittance.shape,
         dtype=wp.float32,

@@ -399,7 +399,7 @@ class Pose(Free):
         world.rotations[self.body] = rotation
         world.translations[self.body] = translation
         world.scales[self.body] = scale
-        world.moves = True
+        world.moving.add(self.body)
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Move the body."""
@@ -474,7 +474,7 @@ class Deformation(Free):
         points, centers = self._deformed(values, setting)
         has_spheres = len(setting.spheres(self.body)) > 0  # without shadows there are nodes, but no spheres
         world.rest = world.renderer.deformed(self.body, points, centers if has_spheres else None, rest=world.rest)
-        world.moves = True
+        world.moving.add(self.body)
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Differences between where neighboring nodes take each other, and stretches."""
@@ -528,7 +528,7 @@ class Radii(Free):
         """Swell and shrink the spheres."""
         radii = setting.tensor(setting.spheres(self.body).radii) * values["log"].exp()
         world.rest = world.renderer.deformed(self.body, radii=radii, rest=world.rest)
-        world.moves = True
+        world.moving.add(self.body)
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Logarithms of the factors."""

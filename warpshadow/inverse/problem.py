@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from warpshadow import check
 from warpshadow.basis import Basis
 from warpshadow.blockers import scene_blockers
 from warpshadow.camera import Camera
@@ -17,7 +18,7 @@ from warpshadow.inverse.free import Free, Light, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene import SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene import AUTO, METHODS, SPHERE_METHODS, Scene, Visibility
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,12 @@ class Problem:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(f"free: got {twice[0]} twice, expected it once")
+        if self.still is not None:
+            check.choice("still.method", self.still.method, METHODS)
+        if self.scene.visibility.method == AUTO:
+            from warpshadow.tuning import resolved  # which renders to find out
+
+            object.__setattr__(self, "scene", resolved(self.scene))
         if self.moves and self.scene.visibility.method == "ray-traced":
             raise ValueError(
                 'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '

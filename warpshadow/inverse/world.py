@@ -101,6 +101,7 @@ class World:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
         rotations, translations, scales: Of each body.
         rest: The bodies in their own spaces, None for the scene's.
+        moving: Bodies that do not stand where the scene has them.
         clip_matrices: Of the views, [view, 4, 4], None for the scene's.
         exposures: Factors of the views' colors, [view], None for 1.
     """
@@ -116,16 +117,16 @@ class World:
         arrays = poses.rotations, poses.translations, poses.scales
         self.rotations, self.translations, self.scales = (list(wp.to_torch(array)[0].unbind()) for array in arrays)
         self.rest: Geometry | None = None
-        self.moves = False
+        self.moving: set[int] = set()
         self.clip_matrices: torch.Tensor | None = None
         self.exposures: torch.Tensor | None = None
 
     def images(self) -> torch.Tensor:
         """Render the views: premultiplied linear RGB and coverage, [view, height, width, 4]."""
         geometry = None
-        if self.moves:
+        if self.moving:
             poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
-            geometry = self.renderer.placed(*poses, rest=self.rest)
+            geometry = self.renderer.placed(*poses, rest=self.rest, moving=self.moving)
         images = self.renderer(
             self.light,
             albedo=self.albedo,

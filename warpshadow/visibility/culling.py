@@ -146,7 +146,7 @@ def rise_function(lanes: int) -> wp.Function:
     def rises(ux: Lane, uy: Lane, uz: Lane, cosine: Lane, sine: Lane, nx: Lane, ny: Lane, nz: Lane):
         # u·n > cos(90° + θ + w), which a cone wider than 90° does anyway
         height = wp.cw_mul(ux, nx) + wp.cw_mul(uy, ny) + wp.cw_mul(uz, nz)
-        return is_any_above(height + sine + 1.0e9 * wp.max(-cosine, Lane(0.0)), 0.0)
+        return is_any_above(height + sine + 1.0e9 * wp.max(Lane(0.0) - cosine, Lane(0.0)), 0.0)
 
     return rises
 

@@ -1,0 +1,435 @@
+"""Bodies that stand still among moving ones: what is found out about them once is kept.
+
+Where the spheres of moving bodies let the share T_q of the light of a cell pass, a receiver on a still body gets
+
+    B = Σ_q T_q S_q,  S_q = ∫_{cell q} L(ω) V(ω) max(n·ω, 0) dω / π,
+
+V the visibility past the meshes of the still bodies. S stands, so rays find it, and the shadows of still bodies on
+still ones are exact. In log-SH space what stands is the sum over the spheres of the still bodies.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import sh
+from warpshadow.assembly import Assembly, Geometry
+from warpshadow.batch import concatenate
+from warpshadow.camera import to_clip
+from warpshadow.graph import is_readable
+from warpshadow.lanes import Chunk, as_chunks
+from warpshadow.light import EnvironmentMap
+from warpshadow.mesh import vertex_normals
+from warpshadow.reference import CellSamples, LightSamples, cell_samples, even_samples, sample_map, trace_cells
+from warpshadow.tape import record_adjoint
+from warpshadow.visibility import log_sh
+
+LOG_SUMS, CELLS, LIT_CELLS = "log sums", "cells", "lit cells"
+"""What is kept: of the still spheres in log-SH space, of what still bodies let pass of unit light, of known light."""
+
+
+class KeptRows(NamedTuple):
+    """Rows of numbers, and which of them each receiver has."""
+
+    rows: wp.array  # [row, channel, item] float32
+    index: wp.array  # [receiver] int32
+
+
+class Still:
+    """The bodies of a geometry that stand still, and what was found out about them.
+
+    Args:
+        assembly: The bodies.
+        geometry: Has them; what moves in it does not matter.
+        progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        moving: The other bodies, from 0.
+        is_still: Whether each vertex stands, bool of shape [vertex].
+
+    Raises:
+        ValueError: where the still bodies of the instances differ.
+    """
+
+    def __init__(self, assembly: Assembly, geometry: Geometry, *, progress: bool = False):
+        assert geometry.moving is not None
+        self.moving = geometry.moving
+        self._assembly = assembly
+        self._progress = progress
+        self._bodies = [number for number in range(len(assembly.scene.bodies)) if number not in geometry.moving]
+        self.is_still = np.isin(assembly.body_of_vertex, self._bodies)
+        positions, centers, radii = map(_first_instance, geometry)
+        self._geometry = Geometry(positions, centers, radii)
+        if not self.holds(geometry):
+            raise ValueError(
+                f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
+                "name all that do"
+            )
+        self._seen = np.empty(0, int)
+        self._rows: dict[str, _Rows] = {}
+        self._drawn: dict[str, CellSamples] = {}
+        self._clip: tuple[np.ndarray, wp.array] | None = None
+
+    def holds(self, geometry: Geometry) -> bool:
+        """Whether the still bodies of another geometry are these; on a GPU that is taken on trust."""
+        if geometry.moving != self.moving:
+            return False
+        if not is_readable(self._assembly.device):
+            return True
+        starts = self._assembly.first_vertex, self._assembly.first_sphere, self._assembly.first_sphere
+        return all(
+            (array.numpy()[:, first:end] == own.numpy()[:, first:end]).all()
+            for array, own, start in zip(geometry, self._geometry, starts, strict=True)
+            for first, end in self._assembly.runs(start, self._bodies)
+        )
+
+    # ------------------------------------------------------------------------------------------ vertices
+
+    @functools.cached_property
+    def normals(self) -> wp.array:
+        """Of all vertices, vec3 of shape [1, vertex]; those of moving ones mean nothing."""
+        return vertex_normals(self._geometry.positions, self._assembly.faces)
+
+    def clip_positions(self, clip_matrices: wp.array) -> wp.array:
+        """Of all vertices, vec4 of shape [camera, vertex]; those of moving ones mean nothing."""
+        if not is_readable(self._assembly.device):
+            return to_clip(self._geometry.positions, clip_matrices)
+        matrices = clip_matrices.numpy()
+        if self._clip is None or not np.array_equal(self._clip[0], matrices):
+            self._clip = matrices.copy(), to_clip(self._geometry.positions, clip_matrices)
+        return self._clip[1]
+
+    def receivers(self, vertices: np.ndarray) -> tuple[wp.array, wp.array]:
+        """Points and normals of some vertices, vec3 of shape [1, receiver]."""
+        if not np.array_equal(vertices, self._seen):
+            self._seen = vertices
+            self.__dict__.pop("_receivers", None)
+        return self._receivers
+
+    @functools.cached_property
+    def _receivers(self) -> tuple[wp.array, wp.array]:
+        return self._gathered(self._seen)
+
+    def _gathered(self, vertices: np.ndarray) -> tuple[wp.array, wp.array]:
+        points, normals = (
+            wp.array(array.numpy()[:, vertices], dtype=wp.vec3, device=array.device)
+            for array in (self._geometry.positions, self.normals)
+        )
+        return points, normals
+
+    # ------------------------------------------------------------------------------------------ spheres
+
+    def moving_spheres(self, geometry: Geometry) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of what moves in a geometry. Differentiable: geometry."""
+        return _runs_of(geometry, self._assembly.runs(self._assembly.first_sphere, self.moving))
+
+    @functools.cached_property
+    def _still_spheres(self) -> tuple[wp.array, wp.array]:
+        return _runs_of(self._geometry, self._assembly.runs(self._assembly.first_sphere, self._bodies))
+
+    @property
+    def blocks(self) -> bool:
+        """Whether still bodies block light."""
+        return self._still_spheres[1].shape[1] > 0
+
+    def missing(self, kind: str, vertices: np.ndarray | None = None) -> int:
+        """Number of still vertices, all or some, of which something is not kept yet."""
+        if kind in self._rows:
+            return self._rows[kind].missing(vertices)
+        return int(self.is_still.sum()) if vertices is None else len(vertices)
+
+    # ------------------------------------------------------------------------------------------ what is kept
+
+    def cells(
+        self, vertices: np.ndarray, light: EnvironmentMap | np.ndarray | None, directions: np.ndarray, samples: int
+    ) -> KeptRows:
+        """The light S_q that still bodies let pass to some vertices: of shape [row, 3, direction].
+
+        Args:
+            vertices: The vertices; those that come for the first time are traced.
+            light: The same in all calls; None for light of 1, of which there is one channel instead of 3.
+            directions: Of the cells, NumPy of shape [direction, 3].
+            samples: Number of rays of a vertex.
+        """
+        kind = CELLS if light is None else LIT_CELLS
+
+        def trace(found: np.ndarray) -> wp.array:
+            points, normals = self._gathered(found)
+            numbers = wp.array(found, dtype=wp.int32, device=points.device)
+            if kind not in self._drawn:
+                self._drawn[kind] = cell_samples(_samples(light, samples), directions, device=points.device)
+            drawn = self._drawn[kind]
+            return trace_cells(self._blockers, points[0], normals[0], numbers, drawn, progress=self._progress)
+
+        return self._kept(kind, vertices, trace)
+
+    def log_sums(self, vertices: np.ndarray, *, order: int, log: str) -> KeptRows:
+        """The log-visibility of the still spheres at some vertices: of shape [row, 1, order²]."""
+
+        def accumulate(found: np.ndarray) -> wp.array:
+            points, normals = self._gathered(found)
+            logs = log_sh.accumulate(points, normals, *self._still_spheres, order=order, log=log)
+            return logs.reshape((len(found), 1, order**2))
+
+        return self._kept(LOG_SUMS, vertices, accumulate)
+
+    def _kept(self, kind: str, vertices: np.ndarray, find: Callable[[np.ndarray], wp.array]) -> KeptRows:
+        if kind not in self._rows:
+            self._rows[kind] = _Rows(self.is_still)
+        return self._rows[kind].of(vertices, find)
+
+    @functools.cached_property
+    def _blockers(self) -> wp.Mesh:
+        """The meshes of the still bodies that block light."""
+        assembly = self._assembly
+        blocking = [
+            number for number in self._bodies if assembly.first_sphere[number] < assembly.first_sphere[number + 1]
+        ]
+        faces = assembly.faces.numpy()[np.isin(assembly.body_of_face, blocking)]
+        used, indices = np.unique(faces, return_inverse=True)
+        points = self._geometry.positions.numpy()[0, used]
+        device = assembly.device
+        return wp.Mesh(
+            points=wp.array(points, dtype=wp.vec3, device=device),
+            indices=wp.array(indices.ravel(), dtype=wp.int32, device=device),
+        )
+
+
+def _first_instance(array: wp.array) -> wp.array:
+    """A copy of the first instance, which is there even where it is empty."""
+    first = wp.empty((1, *array.shape[1:]), dtype=array.dtype, device=array.device)
+    if array.size:
+        wp.copy(first, array[:1])
+    return first
+
+
+def _samples(light: EnvironmentMap | np.ndarray | None, count: int) -> LightSamples:
+    if light is None:
+        return even_samples(count)
+    return sample_map(light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64), count)
+
+
+def _runs_of(geometry: Geometry, runs: list[tuple[int, int]]) -> tuple[wp.array, wp.array]:
+    """Centers and radii of some spheres, in runs of consecutive ones."""
+    if not runs:
+        device = geometry.radii.device
+        return wp.empty((1, 0), dtype=wp.vec3, device=device), wp.empty((1, 0), dtype=wp.float32, device=device)
+    if runs == [(0, geometry.radii.shape[1])]:
+        return geometry.centers, geometry.radii
+    counts = [end - first for first, end in runs]
+    centers, radii = (
+        concatenate([array[:, first:end] for first, end in runs], counts)
+        for array in (geometry.centers, geometry.radii)
+    )
+    return centers, radii
+
+
+class _Rows:
+    """Rows that vertices get when they are first asked for; room for them doubles."""
+
+    def __init__(self, wanted: np.ndarray):
+        self._most = int(wanted.sum())
+        self._row_of_vertex = np.full(len(wanted), -1, np.int32)
+        self._count = 0
+        self._rows: wp.array | None = None
+        self._vertices = np.empty(0, int)
+        self._index: wp.array | None = None
+
+    def missing(self, vertices: np.ndarray | None = None) -> int:
+        """Number of vertices, all or some, without a row."""
+        if vertices is None:
+            return self._most - self._count
+        return int((self._row_of_vertex[vertices] < 0).sum())
+
+    def of(self, vertices: np.ndarray, find: Callable[[np.ndarray], wp.array]) -> KeptRows:
+        """Rows of some vertices; ``find`` makes those of vertices that have none."""
+        new = vertices[self._row_of_vertex[vertices] < 0]
+        if len(new):
+            self._append(find(new))
+            self._row_of_vertex[new] = np.arange(self._count - len(new), self._count)
+        assert self._rows is not None
+        if self._index is None or not np.array_equal(vertices, self._vertices):
+            self._vertices = vertices
+            self._index = wp.array(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
+        return KeptRows(self._rows, self._index)
+
+    def _append(self, rows: wp.array) -> None:
+        count = self._count + rows.shape[0]
+        if self._rows is None or self._rows.shape[0] < count:
+            room = min(max(2 * self._count, count), self._most)
+            larger = wp.empty((room, *rows.shape[1:]), dtype=wp.float32, device=rows.device)
+            if self._rows is not None:
+                wp.copy(larger[: self._count], self._rows[: self._count])
+            self._rows = larger
+        wp.copy(self._rows[self._count : count], rows)
+        self._count = count
+
+
+# ---------------------------------------------------------------------------------------------- joined with what moves
+
+
+@wp.kernel(enable_backward=False)
+def _light_cells(
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    # out
+    shading: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  B = Σ_q T_q S_q."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    total = wp.vec3()
+    for chunk in range(cells.shape[2]):
+        t = transmittance[batch, receiver, chunk]
+        total += wp.vec3(
+            wp.dot(t, cells[row, 0, chunk]), wp.dot(t, cells[row, 1, chunk]), wp.dot(t, cells[row, 2, chunk])
+        )
+    shading[batch, receiver] = total
+
+
+@wp.kernel(enable_backward=False)
+def _light_cells_adjoint(
+    # in
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver:  T̄_q += S_q · B̄."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    adj = adj_shading[batch, receiver]
+    for chunk in range(cells.shape[2]):
+        adj_transmittance[batch, receiver, chunk] = (
+            adj_transmittance[batch, receiver, chunk]
+            + adj[0] * cells[row, 0, chunk]
+            + adj[1] * cells[row, 1, chunk]
+            + adj[2] * cells[row, 2, chunk]
+        )
+
+
+def light_cells(transmittance: wp.array, kept: KeptRows) -> wp.array:
+    """Light receivers on still bodies by what still bodies let pass of known light and moving ones of that.
+
+    Args:
+        transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
+        kept: Light of the cells, [row, 3, direction].
+
+    Returns:
+        Shading, vec3 of shape [batch, receiver].
+
+    Differentiable: transmittance.
+    """
+    device, requires_grad = transmittance.device, transmittance.requires_grad
+    shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device, requires_grad=requires_grad)
+    factors = [kept.index, as_chunks(kept.rows)]
+    wp.launch(
+        _light_cells,
+        dim=shading.shape,
+        inputs=[as_chunks(transmittance), *factors],
+        outputs=[shading],
+        device=device,
+        record_tape=False,
+    )
+
+    def adjoint() -> None:
+        wp.launch(
+            _light_cells_adjoint,
+            dim=shading.shape,
+            inputs=[*factors, shading.grad],
+            outputs=[as_chunks(transmittance.grad)],
+            device=device,
+            record_tape=False,
+        )
+
+    record_adjoint(adjoint, [transmittance, shading])
+    return shading
+
+
+@wp.kernel(enable_backward=False)
+def _multiply_cells(
+    # in
+    factors: wp.array3d(dtype=Chunk),
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    # out
+    products: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver, to whose products it adds."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    for chunk in range(cells.shape[2]):
+        products[batch, receiver, chunk] = products[batch, receiver, chunk] + wp.cw_mul(
+            factors[batch, receiver, chunk], cells[row, 0, chunk]
+        )
+
+
+def cell_transfer(transmittance: wp.array, kept: KeptRows) -> wp.array:
+    """Transfer vectors of receivers on still bodies: what still bodies let pass times what moving ones do.
+
+    Args:
+        transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
+        kept: What of light of 1 the still bodies let pass, [row, 1, direction].
+
+    Returns:
+        Transfer vectors, float32 of shape [batch, receiver, direction].
+
+    Differentiable: transmittance.
+    """
+    device, requires_grad = transmittance.device, transmittance.requires_grad
+    transfer = wp.zeros(transmittance.shape, dtype=wp.float32, device=device, requires_grad=requires_grad)
+    factors = [kept.index, as_chunks(kept.rows)]
+
+    def multiply(values: wp.array, products: wp.array) -> None:
+        wp.launch(
+            _multiply_cells,
+            dim=transmittance.shape[:2],
+            inputs=[as_chunks(values), *factors],
+            outputs=[as_chunks(products)],
+            device=device,
+            record_tape=False,
+        )
+
+    multiply(transmittance, transfer)
+    record_adjoint(lambda: multiply(transfer.grad, transmittance.grad), [transmittance, transfer])
+    return transfer
+
+
+@wp.kernel(enable_backward=False)
+def _add_rows(
+    # in
+    index: wp.array(dtype=wp.int32),
+    rows: wp.array3d(dtype=wp.float32),
+    # out
+    sums: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver, to whose sums it adds."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    for item in range(rows.shape[2]):
+        sums[batch, receiver, item] = sums[batch, receiver, item] + rows[row, 0, item]
+
+
+def add_rows(kept: KeptRows, sums: wp.array) -> None:
+    """Add what stands to sums over what moves, in place.
+
+    No adjoint is needed: a constant leaves the gradient as it is.
+
+    Args:
+        kept: Of shape [row, 1, item].
+        sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
+    """
+    wp.launch(
+        _add_rows,
+        dim=sums.shape[:2],
+        inputs=[kept.index, kept.rows],
+        outputs=[sums],
+        device=sums.device,
+        record_tape=False,
+    )
