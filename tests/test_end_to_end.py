@@ -17,6 +17,9 @@ SMOOTH = 1e-2
 # Silhouettes are sampled by pixels, whose colors stand for those at the edge.
 SILHOUETTE = 5e-2
 
+# Gradients are summed up in slices, whose number follows the size of the launch.
+SUMS = {"rtol": 1e-4, "atol": 1e-4}
+
 METHODS = ("directional", "log-sh", "none")
 
 
@@ -234,7 +237,7 @@ def test_a_batch_is_its_instances_one_by_one(method, receivers):
         assert torch.equal(image[0], images[instance])
         (image[0] * weights[instance]).sum().backward()
         for name, value in alone.items():
-            torch.testing.assert_close(value.grad[0], together[name].grad[instance])
+            torch.testing.assert_close(value.grad[0], together[name].grad[instance], **SUMS)
 
 
 @pytest.mark.parametrize("name", ["turns", "clip_matrices", "light", "albedo", "textures"])
@@ -296,8 +299,9 @@ def test_it_does_not_matter_whether_a_thread_owns_a_row_of_samples_or_one(monkey
         weights = torch.randn(images.shape, generator=torch.Generator().manual_seed(6))
         (images * weights).sum().backward()
         results.append([images.detach(), *(value.grad for value in values.values())])
-    for of_rows, of_samples in zip(*results, strict=True):
-        assert torch.equal(of_rows, of_samples)
+    assert torch.equal(results[0][0], results[1][0])
+    for of_rows, of_samples in zip(results[0][1:], results[1][1:], strict=True):
+        torch.testing.assert_close(of_rows, of_samples, **SUMS)
 
 
 def test_geometry_that_does_not_move_gives_the_scenes_image():

@@ -125,7 +125,7 @@ def squared_difference(image, target):
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, scene, device, monkeypatch):
     """As on a GPU, all vertices are receivers."""
-    monkeypatch.setattr(views, "seen_vertices", lambda fragments, silhouettes, count: np.ones(count, bool))
+    monkeypatch.setattr(views, "is_readable", lambda device: False)  # as on a GPU
     scene = ws.Scene(scene.bodies, scene.light, scene.camera, ws.Visibility(method, directions=32, order=3))
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
     target = wp.clone(pose.draw(), requires_grad=False).flatten()
@@ -146,7 +146,7 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, sc
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, scene, monkeypatch):
     """A graph would copy from memory that the host has long given to others."""
-    monkeypatch.setattr(views, "seen_vertices", lambda fragments, silhouettes, count: np.ones(count, bool))
+    monkeypatch.setattr(views, "is_readable", lambda device: False)  # as on a GPU
     ground = ws.Body(ws.plane(4, 8), texture=np.full((4, 4, 3), 0.5))
     visibility = ws.Visibility(method, directions=32, order=3)
     pose = warp_loop.FreePose(

@@ -13,6 +13,7 @@ from warpshadow.batch import common_batch, concatenate
 from warpshadow.blockers import scene_blockers
 from warpshadow.deform import DeformationGraph, Poses
 from warpshadow.mesh import edge_neighbors
+from warpshadow.order import z_order
 from warpshadow.scene import SPHERE_METHODS, Scene
 
 
@@ -70,6 +71,12 @@ class Assembly:
         self.faces = self._array(_stacked_faces([mesh.faces for mesh in meshes], self.first_vertex), wp.vec3i)
         self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
         self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
+
+    @functools.cached_property
+    def vertex_order(self) -> np.ndarray:
+        """Order in which neighboring vertices of a body follow each other, shape [vertex]."""
+        orders = [z_order(body.mesh.positions.astype(np.float64)) for body in self.scene.bodies]
+        return np.concatenate([first + order for first, order in zip(self.first_vertex[:-1], orders, strict=True)])
 
     @functools.cached_property
     def body_of_face(self) -> np.ndarray:

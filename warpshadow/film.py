@@ -8,7 +8,6 @@ from warpshadow.parallel import launch_slices
 from warpshadow.raster import Fragments, run_length
 from warpshadow.tape import launch, record_adjoint
 
-
 _SAMPLE_COST = 5.0
 """Nanoseconds that a sample takes."""
 

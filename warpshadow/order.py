@@ -23,3 +23,33 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
     middle = -(-count // unit) // 2 * unit
     halves = along[:middle], along[middle:]
     return np.concatenate([half[compact_order(points[half], runs=runs)] for half in halves])
+
+
+def z_order(points: np.ndarray) -> np.ndarray:
+    """Order points along a space-filling curve: in hardly any time, if not as compactly (Morton 1966).
+
+    Args:
+        points: Shape [point, 3].
+
+    Returns:
+        Indices [point].
+    """
+    if not len(points):
+        return np.arange(0)
+    low, high = points.min(axis=0), points.max(axis=0)
+    cells = (points - low) * ((2**21 - 1) / max(float((high - low).max()), np.finfo(np.float32).tiny))
+    codes = sum(_spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis) for axis in range(3))
+    return np.argsort(codes, kind="stable")
+
+
+def _spread(numbers: np.ndarray) -> np.ndarray:
+    """Put two zeros between all bits of numbers of 21 bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        numbers = (numbers | (numbers << np.uint64(shift))) & np.uint64(mask)
+    return numbers

@@ -92,6 +92,7 @@ def find_receivers(
     keeps_vertex: np.ndarray,
     wants_samples: np.ndarray,
     is_still: np.ndarray | None = None,
+    order: np.ndarray | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -104,6 +105,8 @@ def find_receivers(
             unless the face wants samples; see :func:`seen_vertices`.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
         is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
+        order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
+            side. None for their own.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them.
@@ -112,10 +115,11 @@ def find_receivers(
     """
     device = positions.device
     has_own = wants_samples.any()
-    if not has_own and keeps_vertex.all() and is_still is None:
+    if not has_own and keeps_vertex.all() and is_still is None and order is None:
         return Receivers(positions, normals, faces, constant(np.arange(len(keeps_vertex)), wp.int32, device), fragments)
     is_still = np.zeros_like(keeps_vertex) if is_still is None else is_still
-    still, vertices = np.flatnonzero(keeps_vertex & is_still), np.flatnonzero(keeps_vertex & ~is_still)
+    order = np.arange(len(keeps_vertex)) if order is None else order
+    still, vertices = order[(keeps_vertex & is_still)[order]], order[(keeps_vertex & ~is_still)[order]]
     vertex_count = len(still) + len(vertices)
     samples = np.empty((len(fragments.face_ids), 0), int)
     batch_count = len(positions)

@@ -11,6 +11,7 @@ import warp as wp
 from warpshadow import check, sh
 from warpshadow.basis import Basis
 from warpshadow.directions import CHUNK, fibonacci
+from warpshadow.parallel import launch_slices
 
 
 def ray_offset(mesh: wp.Mesh) -> float:
@@ -19,8 +20,14 @@ def ray_offset(mesh: wp.Mesh) -> float:
     return 1e-4 * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
 
 
+_RAY_COST = 200.0
+"""Nanoseconds that a ray takes."""
+
+
 @wp.kernel(enable_backward=False)
 def _trace_visibility(
+    first_row: int,
+    worker: int,
     # in
     mesh: wp.uint64,
     points: wp.array2d[wp.vec3],
@@ -31,7 +38,9 @@ def _trace_visibility(
     visibility: wp.array3d[wp.uint8],
 ):
     """Each thread owns one ray: a receiver and a direction."""
-    batch, vertex, direction = wp.tid()
+    row, direction = wp.tid()
+    batch = (first_row + row) // points.shape[1]
+    vertex = first_row + row - batch * points.shape[1]
     normal = normals[batch, vertex]
     toward = directions[direction]
     escapes = wp.uint8(0)
@@ -79,13 +88,13 @@ def trace_visibility(
     if not (np.isfinite(offset) and offset >= 0.0):
         raise ValueError(f"offset: got {offset!r}, expected a finite length that is not negative")
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
-    wp.launch(
+    launch_slices(
         _trace_visibility,
-        dim=visibility.shape,
+        dim=(points.size, *directions.shape),
+        cost=_RAY_COST,
         inputs=[mesh.id, points, normals, directions, float(offset)],
         outputs=[visibility],
         device=points.device,
-        record_tape=False,
     )
     return visibility
 
@@ -155,6 +164,8 @@ def _map_directions(rows: np.ndarray, v: np.ndarray, columns: np.ndarray, height
 
 @wp.kernel(enable_backward=False)
 def _trace_shading(
+    first_row: int,
+    worker: int,
     # in
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
@@ -166,7 +177,7 @@ def _trace_shading(
     shading: wp.array[wp.vec3],
 ):
     """A thread owns a receiver."""
-    receiver = wp.tid()
+    receiver = first_row + wp.tid()
     chosen = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
     normal = normals[receiver]
     start = points[receiver] + offset * normal
@@ -202,13 +213,13 @@ def trace_shading(
     shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
     offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
-        wp.launch(
+        launch_slices(
             _trace_shading,
-            dim=part.stop - part.start,
+            dim=[part.stop - part.start],
+            cost=_RAY_COST * directions.shape[1],
             inputs=[mesh.id, points[part], normals[part], offset, directions, radiance],
             outputs=[shading[part]],
             device=device,
-            record_tape=False,
         )
     return shading
 
@@ -251,6 +262,8 @@ def trace_transfer(
 
 @wp.kernel(enable_backward=False)
 def _trace_cells(
+    first_row: int,
+    worker: int,
     # in
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
@@ -264,7 +277,7 @@ def _trace_cells(
     light: wp.array3d[wp.float32],
 ):
     """A thread owns a receiver, whose cells are zero before."""
-    receiver = wp.tid()
+    receiver = first_row + wp.tid()
     chosen = int(wp.rand_init(17, numbers[receiver]) % wp.uint32(directions.shape[0]))
     normal = normals[receiver]
     start = points[receiver] + offset * normal
@@ -340,13 +353,13 @@ def trace_cells(
     light = wp.zeros(shape, dtype=wp.float32, device=points.device)
     offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
-        wp.launch(
+        launch_slices(
             _trace_cells,
-            dim=part.stop - part.start,
+            dim=[part.stop - part.start],
+            cost=_RAY_COST * samples.directions.shape[1],
             inputs=[mesh.id, points[part], normals[part], numbers[part], offset, *samples[:3]],
             outputs=[light[part]],
             device=points.device,
-            record_tape=False,
         )
     return light
 

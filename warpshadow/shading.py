@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.directions import CHUNK
-from warpshadow.lanes import Chunk, as_chunks
+from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks
 from warpshadow.parallel import launch_slices
 from warpshadow.tape import record_adjoint
 
@@ -14,6 +14,9 @@ _SLAB = 256
 
 _COEFFICIENT_COST = 1.0
 """Nanoseconds that a coefficient of a receiver takes."""
+
+
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.kernel(enable_backward=False)

@@ -15,6 +15,7 @@ from warpshadow import check, sh
 from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
 from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
+from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import (
     ProductTable,
     add_rotated_zonal,
@@ -25,17 +26,27 @@ from warpshadow.sh_kernels import (
 )
 from warpshadow.tape import record_adjoint
 
+_PRODUCT_COST = 0.05
+"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
+
+_CELL_COST = 0.5
+"""Nanoseconds that a cell of a receiver takes."""
+
+wp.set_module_options(MODULE_OPTIONS)
+
 
 @functools.cache
 def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = lane_functions(lanes)
-    load, load_rows, store_rows = fn.load, fn.load_rows, fn.store_rows
+    find_group, load, load_rows, store_rows = fn.find_group, fn.load, fn.load_rows, fn.store_rows
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transfer_sh(
+        first_row: int,
+        worker: int,
         # in
         visibility: wp.array3d(dtype=wp.float32),
         normals: wp.array2d(dtype=wp.vec3),
@@ -43,13 +54,15 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         pairs: wp.array(dtype=wp.vec2i),
         values: wp.array(dtype=wp.float32),
         # scratch
-        scratch: wp.array4d(dtype=Lane),
+        scratch: wp.array3d(dtype=Lane),
         # out
         transfer: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers: the SH product of their visibility and clamped cosine."""
-        batch, group = wp.tid()
-        cosine = scratch[batch, group, 0]
+        row = first_row + wp.tid()
+        batch, group = find_group(row, normals.shape[1])
+        place = scratch_place(worker, row)
+        cosine = scratch[place, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
         x, y, z = load(normals[batch], group)
@@ -60,8 +73,8 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
             zonal[band] = COSINE[band] * is_there
         add_rotated_zonal_(x, y, z, zonal, cosine)
         if wp.static(is_shadowed):
-            factor = scratch[batch, group, 1]
-            product = scratch[batch, group, 2]
+            factor = scratch[place, 1]
+            product = scratch[place, 2]
             load_rows(visibility[batch], group, factor)
             multiply_(factor, cosine, first, pairs, values, product)
             store_rows(product, group, transfer[batch])
@@ -75,13 +88,16 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
 def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = lane_functions(lanes)
-    load, load_rows, add_rows, add_vectors = fn.load, fn.load_rows, fn.add_rows, fn.add_vectors
+    find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
+    add_rows, add_vectors = fn.add_rows, fn.add_vectors
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
     def transfer_sh_adjoint(
+        first_row: int,
+        worker: int,
         # in
         visibility: wp.array3d(dtype=wp.float32),
         normals: wp.array2d(dtype=wp.vec3),
@@ -90,16 +106,18 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         values: wp.array(dtype=wp.float32),
         adj_transfer: wp.array3d(dtype=wp.float32),
         # scratch
-        scratch: wp.array4d(dtype=Lane),
+        scratch: wp.array3d(dtype=Lane),
         # out
         adj_visibility: wp.array3d(dtype=wp.float32),
         adj_normals: wp.array2d(dtype=wp.vec3),
     ):
         """A thread owns a group of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
-        batch, group = wp.tid()
-        adj_row = scratch[batch, group, 0]
-        factor = scratch[batch, group, 1]
-        product = scratch[batch, group, 2]
+        row = first_row + wp.tid()
+        batch, group = find_group(row, normals.shape[1])
+        place = scratch_place(worker, row)
+        adj_row = scratch[place, 0]
+        factor = scratch[place, 1]
+        product = scratch[place, 2]
         x, y, z = load(normals[batch], group)
         is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
         zonal = Zonal()
@@ -159,7 +177,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     batch_count, vertex_count = normals.shape
     if visibility is not None:
         check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
-    groups = group_count(vertex_count, lanes)
+    row_count = batch_count * group_count(vertex_count, lanes)
     variables = [visibility, normals]
     transfer = wp.empty(
         (batch_count, vertex_count, bands**2),
@@ -167,25 +185,26 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         device=device,
         requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
     )
-    scratch = wp.empty((batch_count, groups, 3, order**2), dtype=lane_type(lanes), device=device)
-    wp.launch(
+    scratch = empty_scratch(row_count, (3, order**2), lane_type(lanes), device)
+    cost = _PRODUCT_COST * lanes * order**2 * bands**2
+    launch_slices(
         _sh_transfer_kernel(order, visibility is not None, lanes),
-        dim=(batch_count, groups),
+        dim=[row_count],
+        cost=cost,
         inputs=[*variables, *_first_bands(order, str(device), bands), scratch],
         outputs=[transfer],
         device=device,
-        record_tape=False,
     )
 
     def adjoint() -> None:
         table = product_table(order, str(device), bands_of_j=tuple(range(bands)))
-        wp.launch(
+        launch_slices(
             _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
-            dim=(batch_count, groups),
+            dim=[row_count],
+            cost=2 * cost,
             inputs=[*variables, *table, transfer.grad, scratch],
             outputs=[None if variable is None else variable.grad for variable in variables],
             device=device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, transfer])
@@ -194,6 +213,8 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
 
 @wp.kernel(enable_backward=False)
 def _transfer_directions(
+    first_row: int,
+    worker: int,
     # in
     transmittance: wp.array3d(dtype=Chunk),
     normals: wp.array2d(dtype=wp.vec3),
@@ -203,7 +224,9 @@ def _transfer_directions(
     transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
-    batch, vertex = wp.tid()
+    row = first_row + wp.tid()
+    batch = row // normals.shape[1]
+    vertex = row - batch * normals.shape[1]
     n = normals[batch, vertex]
     for chunk in range(directions.shape[1]):
         cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
@@ -213,6 +236,8 @@ def _transfer_directions(
 
 @wp.kernel(enable_backward=False)
 def _transfer_directions_adjoint(
+    first_row: int,
+    worker: int,
     # in
     transmittance: wp.array3d(dtype=Chunk),
     normals: wp.array2d(dtype=wp.vec3),
@@ -224,7 +249,9 @@ def _transfer_directions_adjoint(
     adj_normals: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
-    batch, vertex = wp.tid()
+    row = first_row + wp.tid()
+    batch = row // normals.shape[1]
+    vertex = row - batch * normals.shape[1]
     n = normals[batch, vertex]
     total = wp.vec3()
     for chunk in range(directions.shape[1]):
@@ -271,23 +298,24 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         device=device,
         requires_grad=any(variable.requires_grad for variable in variables),
     )
-    wp.launch(
+    cost = _CELL_COST * count
+    launch_slices(
         _transfer_directions,
-        dim=normals.shape,
+        dim=[normals.size],
+        cost=cost,
         inputs=[seen, normals, towards, 4.0 / count],
         outputs=[as_chunks(transfer)],
         device=device,
-        record_tape=False,
     )
 
     def adjoint() -> None:
-        wp.launch(
+        launch_slices(
             _transfer_directions_adjoint,
-            dim=normals.shape,
+            dim=[normals.size],
+            cost=2 * cost,
             inputs=[seen, normals, towards, 4.0 / count, as_chunks(transfer.grad)],
             outputs=[as_chunks(transmittance.grad), normals.grad],
             device=device,
-            record_tape=False,
         )
 
     record_adjoint(adjoint, [*variables, transfer])

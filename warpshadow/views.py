@@ -10,8 +10,8 @@ import warp as wp
 
 from warpshadow.assembly import Assembly, Geometry, exchanged
 from warpshadow.camera import Camera, to_clip
-from warpshadow.light import EnvironmentMap
 from warpshadow.graph import is_readable
+from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.plan import CAMERAS, SPHERES, VERTICES, Decision, Ledger, ViewFacts, ViewPlan, plan_view
 from warpshadow.raster import Fragments, rasterize
@@ -257,9 +257,10 @@ class Viewer:
         with timed(plan.normals, [geometry.positions]):
             normals = self._normals(geometry, still)
         with timed(plan.receivers, [geometry.positions, fragments.barycentrics]):
-            keeps_vertex = np.repeat(~self.samples_receive, np.diff(assembly.first_vertex))
+            keeps_vertex, order = np.repeat(~self.samples_receive, np.diff(assembly.first_vertex)), None
             if is_readable(assembly.device):  # a GPU would have to wait until the host knows what is seen
                 keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(keeps_vertex))
+                order = assembly.vertex_order
             receivers = find_receivers(
                 geometry.positions,
                 normals,
@@ -268,6 +269,7 @@ class Viewer:
                 keeps_vertex,
                 self.samples_receive[assembly.body_of_face],
                 None if still is None else still.is_still,
+                order,
             )
         return View(geometry, receivers, clip_positions, fragments, silhouettes, varying, still)
 
