@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow import sh
+from warpshadow import lighting, sh
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
 from warpshadow.renderer import Renderer
@@ -419,3 +419,29 @@ def test_a_coarse_face_in_one_view_of_two_is_as_coarse_as_in_one_alone():
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a face covers 330 pixels of either image
         Renderer(scene, cameras=[camera, camera]).render()
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
+def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
+    """In parts, transfer vectors take memory for those alone that are lit at once."""
+    ball = ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE, translation=(0, 1, 0))
+    scene = ws.Scene((ball, ws.Body(ws.plane(4, 16), blockers=0)), dome(), CAMERA, ws.Visibility(method))
+    whole = Renderer(scene).render()
+    monkeypatch.setattr(lighting, "PART", 37)
+    renderer = Renderer(scene)
+    np.testing.assert_array_equal(renderer.render(), whole)
+    assert "transfer" in str(renderer.explain())
+
+
+def test_parts_of_receivers_need_little_memory(monkeypatch):
+    """What is shaded at once is seen by its largest transfer vectors."""
+    monkeypatch.setattr(lighting, "PART", 64)
+    sizes = []
+    shade = lighting.shade
+    monkeypatch.setattr(
+        lighting, "shade", lambda transfer, light: sizes.append(transfer.shape[1]) or shade(transfer, light)
+    )
+    scene = ws.Scene((ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE),), dome(), CAMERA)
+    Renderer(scene).render()
+    assert len(sizes) > 2
+    assert max(sizes) <= 64

@@ -27,6 +27,10 @@ Light = KnownLight | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 
+PART = 1 << 16
+"""Receivers that are lit at once where no gradient is asked for."""
+
+
 class _Terms(NamedTuple):
     """What light is expressed in while receivers are lit: cells of directions, or bands of spherical harmonics."""
 
@@ -151,16 +155,33 @@ class Lighting:
     def _shade_known(self, plan: LightingPlan, view: View, light: KnownLight) -> wp.array:
         terms = self._scene_terms if light is self._scene.light else self._known_terms(light)
         groups = self._groups(plan, view, terms)
-        transfers = self._transfers(plan, groups, terms)
-        with self._ledger.timed(plan.shading, transfers):
-            return _joined(
-                [
-                    light_cells(transfer, group.kept)
-                    if terms.kept == LIT_CELLS and group.kept is not None
-                    else shade(transfer, terms.coefficients)
-                    for transfer, group in zip(transfers, groups, strict=True)
-                ]
-            )
+        if any(array.requires_grad for group in groups for array in group[1:5]):
+            transfers = self._transfers(plan, groups, terms)
+            with self._ledger.timed(plan.shading, transfers):
+                pairs = zip(groups, transfers, strict=True)
+                return _joined([_lit(group, transfer, terms) for group, transfer in pairs])
+        shadings = []
+        for number, part in enumerate(self._parts(groups)):  # transfer vectors of all at once would fill the memory
+            (transfer,) = self._transfers(plan, [part], terms, continues=number > 0)
+            with self._ledger.timed(plan.shading, continues=number > 0):
+                shadings.append(_lit(part, transfer, terms))
+        return _joined(shadings)
+
+    def _parts(self, groups: list[_Group]) -> Iterator[_Group]:
+        """Cut groups into parts of at most PART receivers, with a progress bar over them; those with kept rows stay."""
+        from tqdm import tqdm
+
+        total = sum(group.points.shape[1] for group in groups)
+        with tqdm(total=total, desc="shading", unit="receiver", delay=1, disable=not self._progress) as bar:
+            for group in groups:
+                count = group.points.shape[1]
+                size = PART if group.kept is None and count else max(count, 1)
+                for start in range(0, max(count, 1), size):
+                    end = min(start + size, count)
+                    is_whole = end - start == count
+                    points, normals = (a if is_whole else a[:, start:end].contiguous() for a in group[1:3])
+                    yield group._replace(points=points, normals=normals)
+                    bar.update(end - start)
 
     # ------------------------------------------------------------------------------------------ terms
 
@@ -255,14 +276,16 @@ class Lighting:
         on_still = _Group(plan.still_visibility, points, normals, *still.moving_spheres(geometry), kept)
         return [on_still, others] if receivers.points.shape[1] else [on_still]
 
-    def _transfers(self, plan: LightingPlan, groups: list[_Group], terms: _Terms) -> list[wp.array]:
+    def _transfers(
+        self, plan: LightingPlan, groups: list[_Group], terms: _Terms, *, continues: bool = False
+    ) -> list[wp.array]:
         """Transfer vectors of groups in some terms; where kept cells have the light in them, what moves lets pass."""
         groups = [_in_step(group) for group in groups]
         seen = []
         for group in groups:
-            with self._ledger.timed(group.stage, group[1:5]):
+            with self._ledger.timed(group.stage, group[1:5], continues=continues):
                 seen.append(self._visibility(group, terms))
-        with self._ledger.timed(plan.transfer, [*seen, *(group.normals for group in groups)]):
+        with self._ledger.timed(plan.transfer, [*seen, *(group.normals for group in groups)], continues=continues):
             return [self._transfer(group, part, terms) for group, part in zip(groups, seen, strict=True)]
 
     def _visibility(self, group: _Group, terms: _Terms) -> wp.array | None:
@@ -344,6 +367,13 @@ class Lighting:
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self._assembly.device)
+
+
+def _lit(group: _Group, transfer: wp.array, terms: _Terms) -> wp.array:
+    """Shading of a group in known light."""
+    if terms.kept == LIT_CELLS and group.kept is not None:
+        return light_cells(transfer, group.kept)
+    return shade(transfer, terms.coefficients)
 
 
 def _in_step(group: _Group) -> _Group:

@@ -37,7 +37,8 @@ def z_order(points: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.arange(0)
     low, high = points.min(axis=0), points.max(axis=0)
-    cells = (points - low) * ((2**21 - 1) / max(float((high - low).max()), np.finfo(np.float32).tiny))
+    size = np.maximum((high - low).max(), np.finfo(np.float32).tiny)
+    cells = (points - low) * ((2**21 - 1) / size)
     codes = sum(_spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis) for axis in range(3))
     return np.argsort(codes, kind="stable")
 

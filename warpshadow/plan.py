@@ -340,12 +340,13 @@ class Ledger:
         self.timings: dict[str, Timing] = {}
 
     @contextlib.contextmanager
-    def timed(self, stage: Stage, inputs: Iterable[wp.array | None] = ()) -> Iterator[None]:
+    def timed(self, stage: Stage, inputs: Iterable[wp.array | None] = (), *, continues: bool = False) -> Iterator[None]:
         """Time a stage that runs, and its adjoint when the tape that is recording, if one is, plays it back.
 
         Args:
             stage: The stage.
             inputs: Its inputs, some of which require a gradient if it has an adjoint.
+            continues: Whether this is a further part of what was timed last, to which it adds.
         """
         if not stage:
             yield
@@ -365,6 +366,8 @@ class Ledger:
         yield
         record_adjoint(start_adjoint, inputs)
         timing.forward = time.perf_counter() - start
+        if continues and stage.name in self.timings:
+            timing.forward += self.timings[stage.name].forward
         self.timings[stage.name] = timing
 
 
