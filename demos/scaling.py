@@ -37,14 +37,13 @@ from benchmark import bunny_scene
 from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
+from warpshadow.assembly import Geometry
 from warpshadow.directions import fibonacci
 from warpshadow.mesh import vertex_normals
-from warpshadow.shading import shade
+from warpshadow.point_sample import at_receivers
 from warpshadow.spheres import fit_spheres
 from warpshadow.timing import median_times
 from warpshadow.torch import TorchRenderer
-from warpshadow.transfer import directional_transfer
-from warpshadow.visibility import directional
 
 Timed = dict[str, Callable[[], object]]
 
@@ -95,24 +94,25 @@ def bunny_with(spheres: ws.Spheres, size: int = 256) -> ws.Scene:
 def shading(scene: ws.Scene) -> Timed:
     """Visibility and shading of all vertices, by themselves and with all gradients."""
     renderer = ws.Renderer(scene)
-    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces)
-    variables = [renderer.geometry.positions, normals, renderer.geometry.centers, renderer.geometry.radii]
-    free = [wp.clone(array, requires_grad=True) for array in variables]
-    directions = fibonacci(scene.visibility.directions)
-    light = wp.array(renderer.basis.coefficients(scene.light)[None], dtype=wp.vec3)
-
-    def lit(points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
-        seen = directional.transmittance(points, normals, centers, radii, directions)
-        return shade(directional_transfer(seen, normals, directions), light)
+    order = renderer.assembly.vertex_order  # in which renderers light them
+    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces).numpy()[:, order]
+    points = renderer.geometry.positions.numpy()[:, order]
+    view = at_receivers(renderer.scene_view, renderer, points, normals)
+    free = [wp.clone(array, requires_grad=True) for array in (*view.receivers[:2], *renderer.geometry[1:])]
 
     def forward_and_backward() -> None:
+        receivers = view.receivers._replace(points=free[0], normals=free[1])
+        geometry = Geometry(renderer.geometry.positions, *free[2:])
         with wp.Tape() as tape:
-            result = lit(*free)
+            result = renderer.shade(view=view._replace(receivers=receivers, geometry=geometry))
         result.grad.fill_(1.0)
         tape.backward()
         tape.zero()
 
-    return {"visibility and shading": lambda: lit(*variables), "… and back": forward_and_backward}
+    return {
+        "visibility and shading": lambda: renderer.shade(view=view._replace()),
+        "… and back": forward_and_backward,
+    }
 
 
 def image(scene: ws.Scene) -> Timed:
