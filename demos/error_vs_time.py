@@ -41,6 +41,7 @@ from warpshadow.transfer import sh_transfer
 from warpshadow.tuning import pareto_front
 from warpshadow.visibility import log_sh
 from warpshadow.visibility.exponential import exponentiate
+from warpshadow.visibility.merging import MERGED_FROM
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
@@ -218,6 +219,12 @@ def settings(scene: ws.Scene, sphere_counts: Sequence[int]) -> list[Setting]:
             for directions in (64, 128, 256)
         ]
         found.append(Setting("log-SH eigen", 8, f"{spheres}pixel", with_visibility(pixels, method="log-sh")))
+    for count in (count for count in sphere_counts if count >= MERGED_FROM):
+        apart = with_spheres(scene, count)
+        found += [
+            Setting(f"{method}, merging 0", size, f"{count} spheres", with_visibility(apart, merging=0.0, **options))
+            for method, size, options in (("directional", 128, {}), ("log-SH eigen", 8, {"method": "log-sh"}))
+        ]
     found += [
         Setting("ray-traced", count, "", with_visibility(scene, method="ray-traced", samples=count))
         for count in RAY_COUNTS

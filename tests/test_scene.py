@@ -50,6 +50,7 @@ def test_every_key_has_the_documented_default_but_camera_light_and_a_body(load):
     np.testing.assert_array_equal(scene.camera.clip_matrix(), expected.clip_matrix())
     visibility = scene.visibility
     assert (visibility.method, visibility.directions, visibility.softness) == ("directional", 128, 0.35)
+    assert visibility.merging == 0.75
     assert (visibility.order, visibility.log, visibility.base) == (8, "eigen", "quadratic")
     (body,) = scene.bodies
     assert (body.blockers, body.scale, body.receivers, body.texture) == (64, 1.0, "vertex", None)
@@ -72,10 +73,11 @@ def test_every_key_of_the_camera_is_read(load):
 def test_every_key_of_visibility_is_read(load):
     visibility = load(
         MINIMAL + '[visibility]\nmethod = "log-sh"\ndirections = 64\nsoftness = 1\norder = 4\nlog = "cap"\n'
-        'base = "optimal_linear"\nsamples = 33\n'
+        'base = "optimal_linear"\nsamples = 33\nmerging = 0.5\nerror = 0.02\n'
     ).visibility
     assert (visibility.method, visibility.directions, visibility.softness, visibility.order) == ("log-sh", 64, 1, 4)
     assert (visibility.log, visibility.base, visibility.samples) == ("cap", "optimal_linear", 33)
+    assert (visibility.merging, visibility.error) == (0.5, 0.02)
 
 
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none", "ray-traced"])
@@ -213,6 +215,7 @@ NOT_POSITIVE = ("0", "-1")
         ("visibility", "method", ('"rays"', "3", '["none"]')),
         ("visibility", "directions", (*NOT_WHOLE, *NOT_POSITIVE, "100")),
         ("visibility", "softness", (*NOT_A_NUMBER, *NOT_POSITIVE)),
+        ("visibility", "merging", (*NOT_A_NUMBER, "-0.1", "1.5")),
         ("visibility", "order", (*NOT_WHOLE, "1", "9")),
         ("visibility", "log", ('"egen"', "3")),
         ("visibility", "base", ('"cubic"', "3")),

@@ -42,7 +42,7 @@ def make_scene(light, camera=None):
         ws.Body(tile, texture=RANDOM.uniform(size=(4, 6, 3)), blockers=7, scale=1.1, receivers="pixel"),
     )
     camera = camera or ws.Camera.look_at((0.1, 2, 4), (0, 1 / 3, 0), fov_y=33, size=(16, 12), near=0.02)
-    visibility = ws.Visibility(directions=32, softness=0.7, order=4, log="cap", base="linear", samples=9)
+    visibility = ws.Visibility(directions=32, softness=0.7, merging=0.3, order=4, log="cap", base="linear", samples=9)
     return ws.Scene(bodies, light, camera, visibility, supersampling=1)
 
 

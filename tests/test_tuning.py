@@ -161,12 +161,12 @@ def test_only_spheres_that_were_fitted_before_are_tried_unless_fits_are_wanted(i
 def test_a_fit_that_is_kept_is_known_to_be(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     mesh = ws.icosphere(1.0, 1)
-    assert not blockers.is_fitted(mesh, 2)
+    assert not ws.spheres.is_fitted(mesh, 2)
     monkeypatch.setattr("warpshadow.spheres.fit.Refinement.run", lambda self, spheres, balls, steps: [spheres])
     ws.fit_spheres(mesh, 2)
-    assert blockers.is_fitted(mesh, 2)
-    assert blockers.is_fitted(mesh.transformed(scale=3.0), 2)
-    assert not blockers.is_fitted(mesh, 3)
+    assert ws.spheres.is_fitted(mesh, 2)
+    assert ws.spheres.is_fitted(mesh.transformed(scale=3.0), 2)
+    assert not ws.spheres.is_fitted(mesh, 3)
 
 
 def test_grounds_and_given_spheres_are_not_fitted():

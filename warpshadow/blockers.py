@@ -5,7 +5,7 @@ import warp as wp
 
 from warpshadow.mesh import Mesh
 from warpshadow.scene import SPHERE_METHODS, Body, Scene
-from warpshadow.spheres import Spheres, fit, fit_spheres
+from warpshadow.spheres import Spheres, fit_spheres
 
 
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
@@ -31,18 +31,6 @@ def fitted_counts(scene: Scene) -> dict[int, int]:
     return {
         number: count for number, count in enumerate(map(_wanted, scene.bodies)) if count and grounds[number] is None
     }
-
-
-def is_fitted(mesh: Mesh, count: int, *, device: wp.DeviceLike = "cpu") -> bool:
-    """Whether the spheres of a mesh are kept from an earlier fit."""
-    positions, faces = np.asarray(mesh.positions, np.float64), np.asarray(mesh.faces, np.int32)
-    used, renumbered = np.unique(faces, return_inverse=True)
-    positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    scaled = (positions - (low + high) / 2) / float(np.linalg.norm(high - low))
-    normalized = (np.round(scaled * 2**18) / 2**18).astype(np.float32)
-    job = fit._Job(normalized, faces, 0, 2000, wp.get_device(device))
-    return (fit._cache_folder() / f"{job.key(count)}.npz").exists()
 
 
 def _wanted(body: Body) -> int:

@@ -154,9 +154,16 @@ class EnvironmentMap:
             order: Number of bands n.
 
         Returns:
-            Coefficients, index l² + l + m, float32, shape [order², 3].
+            Coefficients, index l² + l + m, float32, shape [order², 3], not writable.
         """
-        return sh.project_map(self.radiance, order).astype(np.float32)
+        if order not in self._kept_sh:
+            self._kept_sh[order] = sh.project_map(self.radiance, order).astype(np.float32)
+            self._kept_sh[order].setflags(write=False)
+        return self._kept_sh[order]
+
+    @functools.cached_property
+    def _kept_sh(self) -> dict[int, np.ndarray]:
+        return {}
 
     def cells(self, directions: np.ndarray) -> CellLight:
         """Gather the light of the cells around directions: every pixel belongs to the nearest one.
@@ -166,7 +173,22 @@ class EnvironmentMap:
 
         Args:
             directions: Unit vectors, shape [direction, 3].
+
+        Returns:
+            The cells; the arrays are not writable.
         """
+        key = np.asarray(directions, np.float64).tobytes()
+        if key not in self._kept_cells:
+            self._kept_cells[key] = self._gathered(directions)
+            for array in self._kept_cells[key]:
+                array.setflags(write=False)
+        return self._kept_cells[key]
+
+    @functools.cached_property
+    def _kept_cells(self) -> dict[bytes, CellLight]:
+        return {}
+
+    def _gathered(self, directions: np.ndarray) -> CellLight:
         energy, moment = self._cell_integrals(directions)
         power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
         lit = length > 0

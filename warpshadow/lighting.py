@@ -268,7 +268,9 @@ class Lighting:
         if still.blocks:
             with self._ledger.timed(plan.still_shadows):
                 if terms.kept == LOG_SUMS:
-                    kept = still.log_sums(receivers.still, order=visibility.order, log=visibility.log)
+                    kept = still.log_sums(
+                        receivers.still, order=visibility.order, log=visibility.log, merging=visibility.merging
+                    )
                 else:
                     light = self._scene.light if terms.kept == LIT_CELLS else None
                     kept = still.cells(receivers.still, light, self._own_directions, visibility.samples)
@@ -297,11 +299,15 @@ class Lighting:
             if not stage:
                 shape = *points.shape, len(directions)
                 return wp.full(shape, 1.0, dtype=wp.float32, device=points.device)
-            return directional.transmittance(points, normals, centers, radii, directions, softness=visibility.softness)
+            softness, merging = visibility.softness, visibility.merging
+            return directional.transmittance(
+                points, normals, centers, radii, directions, softness=softness, merging=merging
+            )
         if not stage:
             return None
         if radii.shape[1]:
-            log = log_sh.accumulate(points, normals, centers, radii, order=visibility.order, log=visibility.log)
+            order, kind, merging = visibility.order, visibility.log, visibility.merging
+            log = log_sh.accumulate(points, normals, centers, radii, order=order, log=kind, merging=merging)
         else:
             log = wp.zeros((*points.shape, visibility.order**2), dtype=wp.float32, device=points.device)
         if kept is not None:

@@ -12,6 +12,7 @@ from warpshadow.mesh import Mesh
 from warpshadow.spheres import Spheres
 from warpshadow.visibility.directional import SOFTNESS
 from warpshadow.visibility.exponential import THRESHOLDS
+from warpshadow.visibility.merging import MERGING, check_merging
 from warpshadow.visibility.zonal_logs import LOGS
 
 SPHERE_METHODS = ("directional", "log-sh")
@@ -29,6 +30,8 @@ class Visibility:
             visibility of the meshes, the reference. "auto" leaves the choice to :func:`warpshadow.tuning.resolved`.
         directions: Number of direction cells of "directional", a multiple of 16.
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
+        merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
+            ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
         order: Number of SH bands, 2 to 8: of "log-sh", and of the light that "none" shades with.
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
@@ -42,6 +45,7 @@ class Visibility:
     method: str = "directional"
     directions: int = 128
     softness: float = SOFTNESS
+    merging: float = MERGING
     order: int = 8
     log: str = "eigen"
     base: str = "quadratic"
@@ -64,6 +68,7 @@ class Visibility:
         if not (np.isfinite(self.error) and self.error > 0):
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05")
         edge_width(self.softness, self.directions)
+        check_merging(self.merging)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale")
-_VISIBILITY_KEYS = ("method", "directions", "softness", "order", "log", "base", "samples", "error")
+_VISIBILITY_KEYS = ("method", "directions", "softness", "merging", "order", "log", "base", "samples", "error")
 _PLACE_KEYS = ("albedo", "texture", "blockers", "spheres", "rotation", "translation", "scale", "receivers")
 _PRIMITIVES: dict[str, tuple[Callable[..., Mesh], tuple[str, ...]]] = {
     "plane": (plane, ("size", "segments")),
@@ -153,7 +153,7 @@ def parse_visibility(table: Table) -> Visibility:
     check.known_keys("key", table, _VISIBILITY_KEYS)
     for key in ("directions", "order", "samples"):
         tables.check_integer(table, key)
-    for key in ("softness", "error"):
+    for key in ("softness", "merging", "error"):
         tables.number(table, key, 1.0)
     return Visibility(**table)
 

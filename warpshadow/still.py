@@ -166,12 +166,12 @@ class Still:
 
         return self._kept(kind, vertices, trace)
 
-    def log_sums(self, vertices: np.ndarray, *, order: int, log: str) -> KeptRows:
+    def log_sums(self, vertices: np.ndarray, *, order: int, log: str, merging: float) -> KeptRows:
         """The log-visibility of the still spheres at some vertices: of shape [row, 1, order²]."""
 
         def accumulate(found: np.ndarray) -> wp.array:
             points, normals = self._gathered(found)
-            logs = log_sh.accumulate(points, normals, *self._still_spheres, order=order, log=log)
+            logs = log_sh.accumulate(points, normals, *self._still_spheres, order=order, log=log, merging=merging)
             return logs.reshape((len(found), 1, order**2))
 
         return self._kept(LOG_SUMS, vertices, accumulate)

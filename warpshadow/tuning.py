@@ -16,10 +16,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow import tables
-from warpshadow.blockers import fitted_counts, is_fitted
+from warpshadow.blockers import fitted_counts
 from warpshadow.point_sample import PointSample
 from warpshadow.scene import AUTO, SPHERE_METHODS, Scene, Visibility
-from warpshadow.spheres import Spheres
+from warpshadow.spheres import Spheres, is_fitted
 from warpshadow.timing import image_times
 from warpshadow.visibility.zonal_logs import LOGS
 

@@ -36,6 +36,9 @@ COVER_STEPS = 200
 COVER_STEPS_FIRST = 100
 """Steps of stage 1 before stage 2."""
 
+STEPS = 2000
+"""Steps of stage 2."""
+
 MOST_SPHERES = 1024
 """The search for an error ends here."""
 
@@ -54,7 +57,7 @@ def fit_spheres(
     error: float | None = None,
     seed: int = 0,
     refine: bool = True,
-    steps: int = 2000,
+    steps: int = STEPS,
     device: wp.DeviceLike = "cpu",
     cache: bool = True,
     progress: bool = True,
@@ -90,6 +93,22 @@ def fit_spheres(
             raise ValueError(f"{name}: got {value!r}, expected an integer of at least {least}")
     if error is not None and not (np.isfinite(error) and error > 0):
         raise ValueError(f"error: got {error!r}, expected a positive number such as 0.05, or None")
+    job, middle, diagonal = _job(mesh, seed, steps if refine else 0, wp.get_device(device))
+    fit = partial(_cached_fit if cache else _fit, job, progress)
+    balls, report = fit(int(count)) if error is None else _search(fit, error)
+    balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
+    spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
+    return SphereFit(spheres, report)
+
+
+def is_fitted(mesh: Mesh, count: int, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether the cache has what :func:`fit_spheres` finds for a mesh and a count."""
+    job, *_ = _job(mesh, 0, STEPS, wp.get_device(device))
+    return (_cache_folder() / f"{job.key(count)}.npz").exists()
+
+
+def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_Job, np.ndarray, float]:
+    """What decides a fit of a mesh; the middle of its bounds and their diagonal."""
     positions = np.asarray(mesh.positions, np.float64)
     faces = np.asarray(mesh.faces, np.int32)
     check.shape("mesh.positions", positions.shape, ("vertex", 3))
@@ -107,12 +126,7 @@ def fit_spheres(
 
     # the grid makes the normalized mesh, and so the fit and its cache key, independent of float32 rounding
     normalized = (np.round((positions - middle) / diagonal * 2**18) / 2**18).astype(np.float32)
-    job = _Job(normalized, faces, seed, steps if refine else 0, wp.get_device(device))
-    fit = partial(_cached_fit if cache else _fit, job, progress)
-    balls, report = fit(int(count)) if error is None else _search(fit, error)
-    balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
-    spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
-    return SphereFit(spheres, report)
+    return _Job(normalized, faces, seed, steps, device), middle, diagonal
 
 
 def _search(fit: Callable[[int], tuple[np.ndarray, FitReport]], error: float) -> tuple[np.ndarray, FitReport]:
