@@ -23,7 +23,6 @@ from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
 from warpshadow import inverse
-from warpshadow.assembly import Geometry
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.camera import to_clip
 from warpshadow.directions import fibonacci
@@ -32,7 +31,7 @@ from warpshadow.raster import interpolate, rasterize
 from warpshadow.renderer import Renderer
 from warpshadow.shading import shade
 from warpshadow.silhouette import find_silhouettes, smooth_silhouettes
-from warpshadow.timing import median_times
+from warpshadow.timing import median_times, whole_image
 from warpshadow.torch import TorchRenderer
 from warpshadow.transfer import directional_transfer, sh_transfer
 from warpshadow.visibility import directional, log_sh
@@ -44,8 +43,10 @@ def main(device: str, runs: int) -> None:
     torch.set_num_threads(1)  # what torch does here is little, and threads of two libraries wait for each other
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
-    points, centers, radii = renderer.geometry
-    normals = vertex_normals(points, renderer.assembly.faces)  # of all vertices, also those that no sample sees
+    positions, centers, radii = renderer.geometry
+    order = renderer.assembly.vertex_order  # in which renderers light them; all, also those that no sample sees
+    normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
+    points, normals = (wp.array(a, dtype=wp.vec3, device=device) for a in (positions.numpy()[:, order], normals))
     cells = CellBasis(fibonacci(128))
     cell_light = wp.array(cells.coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     sh_light = wp.array(HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
@@ -56,7 +57,7 @@ def main(device: str, runs: int) -> None:
         seen = directional.transmittance(points, normals, centers, radii, cells.directions)
         return shade(directional_transfer(seen, normals, cells.directions), cell_light)
 
-    shading = shade_directional()
+    colors = shade_directional()
 
     def shade_log_sh() -> None:
         log = log_sh.accumulate(points, normals, centers, radii, order=8)
@@ -81,12 +82,9 @@ def main(device: str, runs: int) -> None:
 
     def draw() -> None:
         clip = to_clip(renderer.geometry.positions, clip_matrices)
-        interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, shading)
+        interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, colors)
 
-    def image_of_moved_geometry() -> None:
-        renderer.draw(view=renderer.view(Geometry(*map(wp.clone, renderer.geometry)), clip_matrices))
-
-    def whole_image() -> None:
+    def from_scratch() -> None:
         Renderer(scene, device=device).render()
 
     torch_renderer = TorchRenderer(scene, device=device)
@@ -116,7 +114,7 @@ def main(device: str, runs: int) -> None:
             clip = to_clip(renderer.geometry.positions, free_matrices)
             fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
             found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.surfaces)
-            image = smooth_silhouettes(interpolate(fragments, faces, shading), found, clip)
+            image = smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)
         image.grad.fill_(1.0)
         tape.backward()
         tape.zero()
@@ -128,8 +126,8 @@ def main(device: str, runs: int) -> None:
         "log-SH, forward and backward": shade_log_sh_and_back,
         "project, rasterize and interpolate": draw,
         "rasterize, interpolate, smooth, forward and backward": draw_and_back,
-        "image of moved geometry, directional": image_of_moved_geometry,
-        "whole image from the scene, directional": whole_image,
+        "image of bodies that have moved, directional": whole_image(renderer),
+        "image from the scene, set-up included": from_scratch,
         "iteration of a light fit in torch": fit_light,
         "iteration of a texture fit in torch, 256 × 256 texels": fit_texture,
         "iteration of a pose fit in torch": fit_pose,

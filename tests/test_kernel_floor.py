@@ -76,7 +76,7 @@ def test_the_scene_is_measured():
 
 def test_the_launches_of_the_stages_are_those_of_a_captured_pose_iteration(monkeypatch):
     """Captured on the CPU, whose graphs count what they hold; all vertices are receivers, as on a GPU."""
-    monkeypatch.setattr(views, "seen_vertices", lambda fragments, silhouettes, count: np.ones(count, bool))
+    monkeypatch.setattr(views, "is_readable", lambda device: False)  # as on a GPU
     ball = ws.Body(ws.icosphere(0.5, 1), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 0.5, 0))
     camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(8, 8))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 4))), ws.synthetic_sky(height=16), camera, supersampling=1)

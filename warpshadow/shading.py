@@ -12,7 +12,7 @@ from warpshadow.tape import record_adjoint
 _SLAB = 256
 """Receivers whose gradients to light a thread sums before it adds them to the others'."""
 
-_COEFFICIENT_COST = 1.0
+_COEFFICIENT_COST = 0.4
 """Nanoseconds that a coefficient of a receiver takes."""
 
 

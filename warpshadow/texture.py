@@ -26,7 +26,7 @@ from warpshadow.parallel import launch_slices
 from warpshadow.raster import Fragments, _instance, _relative, _volumes, run_length
 from warpshadow.tape import launch, record_adjoint
 
-_SAMPLE_COST = 15.0
+_SAMPLE_COST = 10.0
 """Nanoseconds that a sample takes."""
 
 MAX_PROBES = 7

@@ -26,10 +26,10 @@ from warpshadow.sh_kernels import (
 )
 from warpshadow.tape import record_adjoint
 
-_PRODUCT_COST = 0.05
+_PRODUCT_COST = 0.1
 """Nanoseconds that a product takes for a receiver and a pair of coefficients."""
 
-_CELL_COST = 0.5
+_CELL_COST = 0.3
 """Nanoseconds that a cell of a receiver takes."""
 
 wp.set_module_options(MODULE_OPTIONS)

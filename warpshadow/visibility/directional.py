@@ -50,7 +50,7 @@ SOFTNESS = 0.35
 
 _OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
-_PAIR_COST = 3.0e-3
+_PAIR_COST = 0.15
 """Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
 
 

@@ -69,7 +69,7 @@ LOUD = 24.0
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
-_SQUARING_COST = 0.05
+_SQUARING_COST = 0.5
 """Nanoseconds that exponentiation takes for a receiver and a pair of coefficients."""
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
