@@ -28,7 +28,7 @@ from warpshadow.tape import record_adjoint
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
 _LEAST_WORK = 4.0e5
-"""Nanoseconds of work that a slice has at least: it takes a tenth of that to wake a thread and to fetch what it reads."""
+"""Nanoseconds of work that a slice has at least: waking a thread and fetching what it reads take a tenth of that."""
 
 _SLICES_PER_THREAD = 4
 """Rows differ in how long they take; threads that are done early take what slices are left."""
