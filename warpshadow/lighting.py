@@ -27,7 +27,7 @@ Light = KnownLight | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 
-PART = 1 << 16
+PART = 1 << 13
 """Receivers that are lit at once where no gradient is asked for."""
 
 
