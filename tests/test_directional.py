@@ -81,6 +81,31 @@ def test_transmittance_is_within_0_and_1(seed, sphere_count, scale):
         assert got.min() >= 0 and got.max() <= 1
 
 
+@pytest.mark.parametrize("count", [64, 256])
+@pytest.mark.parametrize("distance", [1.0, 1.003, 1.009, 1.02])
+def test_a_lone_sphere_at_its_surface_is_not_culled_where_its_cone_is_wider_than_the_sphere(count, distance, device):
+    """From 1.01 radii on inwards a cone is blended over to a hemisphere."""
+    rng = np.random.default_rng(3)
+    directions = cells.fibonacci(count)
+    away = rng.normal(size=(200, 3))
+    points = distance * away / np.linalg.norm(away, axis=1, keepdims=True)
+    one, unit = np.zeros((1, 3)), np.ones(1)
+    alone = np.stack([transmittance(point[None], None, one, unit, directions, device)[0] for point in points])
+    expected = twins.transmittance(points.astype(np.float32).astype(float), one, unit, directions)
+    assert np.abs(alone - expected).max() < 5 * FLOAT32[count]  # steeper where the cone is blended
+
+
+def test_directions_that_coincide_block_light_like_any(device):
+    """As the cells of a tiny sun may look: the cone around four of them has no width."""
+    directions = np.repeat(np.random.default_rng(1).normal(size=(4, 3)), 4, axis=0).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert not any(np.isnan(part).any() for part in cells.bundle_cones(directions))
+    points, _, centers, radii = twins.random_scene(6)
+    got = transmittance(points, None, centers, radii, directions, device)
+    expected = twins.transmittance(*wide(points, centers, radii), directions.astype(float))
+    assert np.abs(got - expected).max() < FLOAT32[16] + OPAQUE
+
+
 def test_culling_below_the_horizon_changes_nothing_above_it(device):
     points, normals, centers, radii = twins.random_scene(4, vertex_count=64)
     normals[:] = np.repeat(normals[::16], 16, axis=0)  # groups that face one way, so that whole bundles are culled

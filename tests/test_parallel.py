@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow import parallel
 from warpshadow.directions import fibonacci
 from warpshadow.mesh import icosphere
-from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.raster import interpolate, rasterize
 from warpshadow.shading import shade
 from warpshadow.transfer import directional_transfer, sh_transfer
@@ -62,7 +62,8 @@ def spread(values, *, wants_total=True, cost=1e4):
         _spread,
         dim=[count],
         cost=cost,
-        inputs=[wp.array(values, dtype=wp.float32, device=device), empty_scratch(count, (1,), wp.float32, device)],
+        inputs=[wp.array(values, dtype=wp.float32, device=device)],
+        scratch=[Scratch((1,), wp.float32)],
         outputs=[squares, workers],
         sums=[total],
         device=device,
@@ -118,7 +119,7 @@ def test_launches_from_several_python_threads_do_not_meet():
     assert not failures
 
 
-def shaded_with_gradients(method):
+def shaded_with_gradients(method, forward=None, backward=None):
     """Shading of 3000 receivers in a batch of two, and its gradients, as bytes."""
     parts = [twins.random_scene(seed, vertex_count=3000, sphere_count=40) for seed in (0, 1)]
     dtypes = (wp.vec3, wp.vec3, wp.vec3, wp.float32)
@@ -130,6 +131,8 @@ def shaded_with_gradients(method):
     rng = np.random.default_rng(2)
     size = 128 if method == "directional" else 64
     light = wp.array(rng.uniform(size=(2, size, 3)), dtype=wp.vec3, device="cpu", requires_grad=True)
+    if forward is not None:
+        parallel.set_thread_count(forward)
     with wp.Tape() as tape:
         if method == "directional":
             seen = directional.transmittance(points, normals, centers, radii, directions)
@@ -188,6 +191,13 @@ def test_kernels_that_warp_differentiates_are_divided_both_ways(monkeypatch):
     for divided, expected in zip(results[0][1:], whole[1:], strict=True):
         np.testing.assert_allclose(divided, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
         assert not np.array_equal(divided, expected)  # or nothing was divided
+
+
+def test_more_threads_may_go_back_than_went_forward():
+    results = []
+    for forward, backward in ((1, 1), (1, 6), (6, 1)):
+        results.append(shaded_with_gradients("directional", forward, backward))
+    assert results[0] == results[1] == results[2]
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, "2", True])

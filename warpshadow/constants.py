@@ -1,6 +1,8 @@
 """Constants of kernels: values of the host that a device is given once."""
 
+import contextlib
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
@@ -22,7 +24,24 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
             by the graph alone, and cannot be kept.
     """
     values = np.ascontiguousarray(values)
-    return _constant(values.tobytes(), values.dtype.str, values.shape, dtype, str(device))
+    array = _constant(values.tobytes(), values.dtype.str, values.shape, dtype, str(device))
+    for arrays in _collections:
+        arrays.append(array)
+    return array
+
+
+_collections: list[list[wp.array]] = []
+
+
+@contextlib.contextmanager
+def collected() -> Iterator[list[wp.array]]:
+    """Collect the constants that are asked for meanwhile: who reads them later, as a graph does, has to hold them."""
+    arrays: list[wp.array] = []
+    _collections.append(arrays)
+    try:
+        yield arrays
+    finally:
+        _collections.remove(arrays)
 
 
 @functools.lru_cache(maxsize=256)

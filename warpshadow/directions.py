@@ -80,7 +80,7 @@ def bundle_cones(directions: np.ndarray, width: float = 0.0) -> BundleCones:
     bundles = directions.reshape(-1, BUNDLE, 3)
     axes = bundles.mean(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
-    cosine = np.einsum("bqx,bx->bq", bundles, axes).min(axis=1)
+    cosine = np.minimum(np.einsum("bqx,bx->bq", bundles, axes).min(axis=1), 1.0)
     is_wide = cosine < max(np.cos(np.radians(80)), np.sin(width))
     cosine = np.where(is_wide, 0.0, cosine)
     return BundleCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))

@@ -23,6 +23,8 @@ from typing import Generic, TypeVar
 
 import warp as wp
 
+from warpshadow.constants import collected
+
 Result = TypeVar("Result")
 
 
@@ -57,7 +59,7 @@ class Captured(Generic[Result]):
         self._function = function
         self._device = wp.get_device(device)
         self._has_run = False
-        self._captured: tuple[wp.Graph, Result] | None = None
+        self._captured: tuple[wp.Graph, Result, list[wp.array]] | None = None
 
     def __call__(self) -> Result:
         """Call or replay it; the captured call's result is written anew by each replay."""
@@ -67,16 +69,16 @@ class Captured(Generic[Result]):
             return result
         if self._captured is None:
             self._captured = self._capture()
-        graph, result = self._captured
+        graph, result, _constants = self._captured
         wp.capture_launch(graph)
         return result
 
-    def _capture(self) -> tuple[wp.Graph, Result]:
+    def _capture(self) -> tuple[wp.Graph, Result, list[wp.array]]:
         if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
             raise RuntimeError(f"{self._device}: a capture that allocates needs wp.set_mempool_enabled")
-        with wp.ScopedCapture(device=self._device) as capture:
+        with collected() as constants, wp.ScopedCapture(device=self._device) as capture:
             result = self._function()
-        return capture.graph, result
+        return capture.graph, result, constants
 
 
 def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) -> Callable[[], wp.array]:

@@ -161,9 +161,10 @@ class Lighting:
                 pairs = zip(groups, transfers, strict=True)
                 return _joined([_lit(group, transfer, terms) for group, transfer in pairs])
         shadings = []
-        for number, part in enumerate(self._parts(groups)):  # transfer vectors of all at once would fill the memory
-            (transfer,) = self._transfers(plan, [part], terms, continues=number > 0)
-            with self._ledger.timed(plan.shading, continues=number > 0):
+        self._ledger.forget([*(group.stage for group in groups), plan.transfer, plan.shading])
+        for part in self._parts(groups):  # transfer vectors of all at once would fill the memory
+            (transfer,) = self._transfers(plan, [part], terms, continues=True)
+            with self._ledger.timed(plan.shading, continues=True):
                 shadings.append(_lit(part, transfer, terms))
         return _joined(shadings)
 
@@ -300,8 +301,10 @@ class Lighting:
                 shape = *points.shape, len(directions)
                 return wp.full(shape, 1.0, dtype=wp.float32, device=points.device)
             softness, merging = visibility.softness, visibility.merging
+            # what is kept has light of cells whose middles are below the horizon
+            facing = normals if kept is None else None
             return directional.transmittance(
-                points, normals, centers, radii, directions, softness=softness, merging=merging
+                points, facing, centers, radii, directions, softness=softness, merging=merging
             )
         if not stage:
             return None

@@ -19,7 +19,7 @@ import math
 import os
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -87,9 +87,11 @@ def scratch_place(worker: int, row: int):
     return place
 
 
-def empty_scratch(row_count: int, shape: Sequence[int], dtype: type, device: wp.Device) -> wp.array:
-    """Scratch memory, [*shape] for each worker on a CPU, and for each row on a GPU."""
-    return wp.empty((thread_count() if device.is_cpu else row_count, *shape), dtype=dtype, device=device)
+class Scratch(NamedTuple):
+    """Memory that a kernel's thread writes to and nobody reads later, an array's row [*shape] for each."""
+
+    shape: tuple[int, ...]
+    dtype: type
 
 
 def launch_slices(
@@ -99,22 +101,28 @@ def launch_slices(
     cost: float,
     inputs: Sequence[Any],
     outputs: Sequence[wp.array | None],
+    scratch: Sequence[Scratch] = (),
     sums: Sequence[wp.array | None] = (),
     device: wp.Device,
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share.
 
     Args:
-        kernel: Its arguments are ``first_row`` and ``worker``, then inputs, outputs and sums.
+        kernel: Its arguments are ``first_row`` and ``worker``, then inputs, scratch memory, outputs and sums.
         dim: Threads in Warp's sense; the first dimension is that of rows, which write to different places.
         cost: Roughly how long one of these threads takes [ns], which decides whether slices are worth it.
         inputs, outputs: Arguments.
+        scratch: Memory for the launch: a row for each worker on a CPU, and for each thread on a GPU.
         sums: Arrays that all rows add to; None for those that are not wanted.
         device: Where to launch.
     """
-    arguments = {"inputs": [0, _worker(device), *inputs], "outputs": [*outputs, *sums]}
-    first_sum = 2 + len(inputs) + len(outputs)
-    _launch(kernel, dim, cost, arguments, {first_sum + k: array for k, array in enumerate(sums)}, device)
+    workers = thread_count()
+    rows = workers if device.is_cpu else math.prod(dim)
+    places = [wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch]
+    arguments = {"inputs": [0, _worker(device), *inputs, *places], "outputs": [*outputs, *sums]}
+    first_sum = 2 + len(inputs) + len(places) + len(outputs)
+    sums_at = {first_sum + k: array for k, array in enumerate(sums)}
+    _launch(kernel, dim, cost, arguments, sums_at, device, workers)
 
 
 def launch_differentiable(
@@ -135,12 +143,12 @@ def launch_differentiable(
         gathered: Which of the inputs are read anywhere, so that all rows add to their gradients; counted from 0.
     """
     arguments = {"inputs": [0, _worker(device), *inputs], "outputs": [*outputs]}
-    _launch(kernel, dim, cost, arguments, {}, device)
+    _launch(kernel, dim, cost, arguments, {}, device, thread_count())
 
     def adjoint() -> None:
         adjoints = [value.grad if isinstance(value, wp.array) else value for value in arguments["inputs"]]
         both = {**arguments, "adj_inputs": adjoints, "adj_outputs": [output.grad for output in outputs]}
-        _launch(kernel, dim, 2 * cost, both, {2 + k: inputs[k].grad for k in gathered}, device)
+        _launch(kernel, dim, 2 * cost, both, {2 + k: inputs[k].grad for k in gathered}, device, thread_count())
 
     record_adjoint(adjoint, [*(value for value in inputs if isinstance(value, wp.array)), *outputs])
 
@@ -156,17 +164,18 @@ def _launch(
     arguments: Mapping[str, Sequence[Any]],
     sums: Mapping[int, wp.array | None],
     device: wp.Device,
+    workers: int,
 ) -> None:
     """Launch a kernel, or its adjoint if there are adjoint arguments; sums by their places among the arguments."""
     options = {"device": device, "record_tape": False, "adjoint": "adj_inputs" in arguments}
     total = math.prod(dim)
     summed = {place: array for place, array in sums.items() if array is not None}
-    most = _SLICES_PER_THREAD * thread_count()
+    most = _SLICES_PER_THREAD * workers
     if summed:  # as many for any number of threads
         most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
-    if slice_count <= 1 or (not summed and thread_count() == 1):
+    if slice_count <= 1 or (not summed and workers == 1):
         wp.launch(kernel, dim=dim, **arguments, **options)
         return
     own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
@@ -182,18 +191,18 @@ def _launch(
         for place, parts in own.items():
             piece.set_param_at_index(place, parts[number], adjoint=options["adjoint"])
         slices.append(piece)
-    _share(slices)
+    _share(slices, workers)
     for place, parts in own.items():
         summed[place].numpy()[...] += parts.numpy().sum(axis=0)
 
 
-def _share(slices: Sequence[wp.Launch]) -> None:
+def _share(slices: Sequence[wp.Launch], workers: int) -> None:
     """Run slices on the calling thread and those of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
     kernel to kernel; one that is done takes over from the end of another's part.
     """
-    count = min(thread_count(), len(slices))
+    count = min(workers, len(slices))
     bounds = [len(slices) * worker // count for worker in range(count + 1)]
     parts = [collections.deque(slices[first:end]) for first, end in itertools.pairwise(bounds)]
 
@@ -208,7 +217,7 @@ def _share(slices: Sequence[wp.Launch]) -> None:
                 piece.set_param_at_index(1, worker)
                 piece.launch()
 
-    others = [_pool(thread_count()).submit(work, worker) for worker in range(1, count)]
+    others = [_pool(workers).submit(work, worker) for worker in range(1, count)]
     try:
         work(0)
     finally:

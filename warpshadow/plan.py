@@ -346,7 +346,7 @@ class Ledger:
         Args:
             stage: The stage.
             inputs: Its inputs, some of which require a gradient if it has an adjoint.
-            continues: Whether this is a further part of what was timed last, to which it adds.
+            continues: Whether this is a part of what was timed since :meth:`forget`, to which it adds.
         """
         if not stage:
             yield
@@ -369,6 +369,12 @@ class Ledger:
         if continues and stage.name in self.timings:
             timing.forward += self.timings[stage.name].forward
         self.timings[stage.name] = timing
+
+    def forget(self, stages: Iterable[Stage]) -> None:
+        """Forget how long stages took that are about to run in parts."""
+        for stage in stages:
+            if stage:
+                self.timings.pop(stage.name, None)
 
 
 class Explanation:

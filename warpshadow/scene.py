@@ -112,6 +112,7 @@ class Body:
             raise ValueError(
                 f"albedo: got values from {albedo.min()} to {albedo.max()}, expected reflectances in [0, 1]"
             )
+        albedo.setflags(write=False)
         object.__setattr__(self, "albedo", albedo)
         if self.texture is not None:
             if self.mesh.uvs is None:
@@ -123,6 +124,7 @@ class Body:
             if texture.size == 0:
                 raise ValueError(f"texture: got shape {texture.shape}, expected at least one texel")
             check.finite("texture", texture)
+            texture.setflags(write=False)
             object.__setattr__(self, "texture", texture)
         if not isinstance(self.blockers, Spheres):
             is_count = isinstance(self.blockers, (int, np.integer)) and not isinstance(self.blockers, bool)
@@ -187,6 +189,7 @@ class Scene:
             check.shape("light", light.shape, ("order²", 3))
             check.finite("light", light)
             sh.check_order(sh.order_of("light", light))
+            light.setflags(write=False)
             object.__setattr__(self, "light", light)
         if isinstance(self.supersampling, bool) or self.supersampling not in range(1, 17):
             raise ValueError(f"supersampling: got {self.supersampling!r}, expected a whole number from 1 to 16")

@@ -102,9 +102,8 @@ def _neighborhoods(points: np.ndarray) -> np.ndarray:
     """Draw TIMED_RECEIVERS of points [point, 3], those nearest to a few of them: what is near is culled together."""
     size = min(NEIGHBORS, len(points))
     middles = np.random.default_rng(0).choice(points, min(TIMED_RECEIVERS, len(points)) // size, replace=False)
-    return np.concatenate(
-        [np.argpartition(((points - middle) ** 2).sum(axis=1), size - 1)[:size] for middle in middles]
-    )
+    nearest = [np.argpartition(((points - middle) ** 2).sum(axis=1), size - 1)[:size] for middle in middles]
+    return np.sort(nearest, axis=1).ravel()  # in the order of receivers
 
 
 def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
@@ -112,11 +111,13 @@ def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
 
     Each call has the bodies in another of two places, a hair's breadth from where the scene has them.
     """
-    poses, shift = renderer.assembly.poses, 1e-5 * np.linalg.norm(renderer.scene.camera.eye)
+    poses = renderer.assembly.poses
+    extent = np.abs(renderer.geometry.positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
     places = itertools.cycle(
         replace(
-            poses, translations=wp.array(poses.translations.numpy() + offset, dtype=wp.vec3, device=renderer.device)
+            poses,
+            translations=wp.array(poses.translations.numpy() + shift * extent, dtype=wp.vec3, device=renderer.device),
         )
-        for offset in (shift, 2 * shift)
+        for shift in (1e-5, 2e-5)
     )
     return lambda: renderer.draw(view=renderer.view(renderer.assembly.placed(next(places))))

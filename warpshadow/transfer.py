@@ -15,7 +15,7 @@ from warpshadow import check, sh
 from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
 from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
-from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import (
     ProductTable,
     add_rotated_zonal,
@@ -185,13 +185,14 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         device=device,
         requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
     )
-    scratch = empty_scratch(row_count, (3, order**2), lane_type(lanes), device)
+    scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = _PRODUCT_COST * lanes * order**2 * bands**2
     launch_slices(
         _sh_transfer_kernel(order, visibility is not None, lanes),
         dim=[row_count],
         cost=cost,
-        inputs=[*variables, *_first_bands(order, str(device), bands), scratch],
+        inputs=[*variables, *_first_bands(order, str(device), bands)],
+        scratch=scratch,
         outputs=[transfer],
         device=device,
     )
@@ -202,7 +203,8 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
             _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
             dim=[row_count],
             cost=2 * cost,
-            inputs=[*variables, *table, transfer.grad, scratch],
+            inputs=[*variables, *table, transfer.grad],
+            scratch=scratch,
             outputs=[None if variable is None else variable.grad for variable in variables],
             device=device,
         )

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.assembly import Assembly, Geometry, exchanged
 from warpshadow.camera import Camera, to_clip
 from warpshadow.graph import is_readable
@@ -121,7 +122,7 @@ class Viewer:
         self._progress = progress
         self._scene_view: View | None = None
         self._last: tuple[View, np.ndarray] | None = None  # with its cameras
-        self._still: Still | None = None
+        self._stills: dict[tuple[int, ...] | None, Still] = {}  # by what moves
 
     @functools.cached_property
     def clip_matrices(self) -> wp.array:
@@ -140,7 +141,7 @@ class Viewer:
         if not {VERTICES, SPHERES} & set(facts.varying):
             geometry = Geometry(*map(wp.clone, geometry), moving=geometry.moving)
         if still is None and self._stands(geometry).any():
-            still = self._still = Still(self.assembly, geometry, progress=self._progress)
+            still = self._stills[geometry.moving] = Still(self.assembly, geometry, progress=self._progress)
         view = self._made(plan, facts.varying, geometry, clip_matrices, still)
         if is_scenes:
             self._scene_view = view
@@ -163,8 +164,9 @@ class Viewer:
             faces=len(self.assembly.body_of_face),
         )
         still = None
-        if geometry is not None and stands.any() and self._still is not None and self._still.holds(geometry):
-            still = self._still
+        known = None if geometry is None else self._stills.get(geometry.moving)
+        if geometry is not None and stands.any() and known is not None and known.holds(geometry):
+            still = known
         return Prospect(plan, facts, view, still)
 
     def _change(self, geometry: Geometry | None, clip_matrices: wp.array | None) -> tuple[View | None, Decision]:
@@ -195,6 +197,9 @@ class Viewer:
         return view, Decision(False, "kept: geometry and cameras are those of the last view")
 
     def _given(self, geometry: Geometry | None, clip_matrices: wp.array | None) -> tuple[Geometry, wp.array]:
+        if geometry is not None:
+            for name, array, own in zip(Geometry._fields, geometry, self.assembly.rest, strict=True):
+                check.shape(f"geometry.{name}", array.shape, ("batch", *own.shape[1:]))
         return (
             self.assembly.scene_geometry if geometry is None else geometry,
             self.clip_matrices if clip_matrices is None else clip_matrices,

@@ -14,8 +14,11 @@ import warp as wp
 from warpshadow.constants import constant
 from warpshadow.directions import bundle_cones
 from warpshadow.lanes import lane_functions, lane_type
-from warpshadow.visibility.cones import TINY_RADIUS
+from warpshadow.visibility.cones import BLEND, TINY_RADIUS
 from warpshadow.visibility.merging import ITEMS, QUAD, Nodes, Spheres
+
+_REACH = 1.001 + BLEND
+"""Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
 
 QUADS = 4
 """Quads that make up a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
@@ -178,7 +181,7 @@ def find_bundles_function(has_horizon: bool, lanes: int) -> wp.Function:
         """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
         count = int(0)
         if bound[3] > 0.0:
-            reach = 1.001 * bound[3]  # rounding included
+            reach = _REACH * bound[3]
             dx = Lane(bound[0]) - x
             dy = Lane(bound[1]) - y
             dz = Lane(bound[2]) - z

@@ -18,7 +18,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.directions import BUNDLE, CHUNK, cell_radius, check_count, edge_width
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
-from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 from warpshadow.visibility.culling import (
@@ -512,8 +512,8 @@ def transmittance(
     row_count = batch_count * group_count(vertex_count, lanes)
     dim = row_count, span_count
     scratch = [
-        empty_scratch(row_count * span_count, (bundle_count * BUNDLE,), lane_type(lanes), device),
-        empty_scratch(row_count * span_count, (3, bundle_count), wp.int32, device),
+        Scratch((bundle_count * BUNDLE,), lane_type(lanes)),
+        Scratch((3, bundle_count), wp.int32),
     ]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
     variables = [points, *nodes]
@@ -528,7 +528,8 @@ def transmittance(
         _transmit_kernel(normals is not None, lanes),
         dim=dim,
         cost=cost,
-        inputs=[points, normals, spheres, cells, *scratch],
+        inputs=[points, normals, spheres, cells],
+        scratch=scratch,
         outputs=[ends, result],
         device=device,
     )
@@ -538,7 +539,8 @@ def transmittance(
             _transmit_adjoint_kernel(normals is not None, lanes),
             dim=dim,
             cost=2 * cost,
-            inputs=[points, normals, spheres, cells, ends, result, result.grad, *scratch],
+            inputs=[points, normals, spheres, cells, ends, result, result.grad],
+            scratch=scratch,
             outputs=[points.grad],
             sums=[array.grad for array in nodes],
             device=device,

@@ -32,7 +32,7 @@ import warp as wp
 
 from warpshadow import check, sh
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
-from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import multiply, product_table
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.zonal_logs import zonal_eigen_log
@@ -519,7 +519,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     powers_shape = (batch_count, groups, MOST_SQUARINGS + 1, order**2)
     powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if needs_gradient else None
     row_count = batch_count * groups
-    scratch = empty_scratch(row_count, (4, order**2), lane_type(lanes), device)
+    scratch = [Scratch((4, order**2), lane_type(lanes))]
     visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = wp.zeros(2, dtype=wp.int32, device=device)
@@ -528,7 +528,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         _exponentiate_kernel(order, base, needs_gradient, lanes),
         dim=[row_count],
         cost=cost,
-        inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal, scratch],
+        inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal],
+        scratch=scratch,
         outputs=[powers, visibility],
         sums=[faults],
         device=device,
@@ -550,7 +551,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             _exponentiate_adjoint_kernel(order, base, lanes),
             dim=[row_count],
             cost=2 * cost,
-            inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad, scratch],
+            inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad],
+            scratch=scratch,
             outputs=[log_sh.grad],
             device=device,
         )

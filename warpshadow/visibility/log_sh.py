@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow import check, sh
 from warpshadow.directions import cell_radius
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
-from warpshadow.parallel import empty_scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
@@ -324,7 +324,7 @@ def accumulate(
     spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(order**2))
     variables = [points, normals, *nodes]
     table = zonal_table(order, log, str(device))
-    scratch = empty_scratch(row_count, (order**2,), lane_type(lanes), device)
+    scratch = [Scratch((order**2,), lane_type(lanes))]
     log_sh = wp.empty(
         (batch_count, vertex_count, order**2),
         dtype=wp.float32,
@@ -336,7 +336,8 @@ def accumulate(
         _accumulate_kernel(order, normals is not None, lanes),
         dim=[row_count],
         cost=cost,
-        inputs=[points, normals, spheres, table, scratch],
+        inputs=[points, normals, spheres, table],
+        scratch=scratch,
         outputs=[log_sh],
         device=device,
     )
@@ -346,7 +347,8 @@ def accumulate(
             _accumulate_adjoint_kernel(order, normals is not None, lanes),
             dim=[row_count],
             cost=2 * cost,
-            inputs=[points, normals, spheres, table, log_sh.grad, scratch],
+            inputs=[points, normals, spheres, table, log_sh.grad],
+            scratch=scratch,
             outputs=[points.grad, None if normals is None else normals.grad],
             sums=[array.grad for array in nodes],
             device=device,
@@ -458,8 +460,8 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
             radii,
             zonal_table(order, "indicator", str(device)),
             *product_table(order, str(device)),
-            empty_scratch(row_count, (3, order**2), lane_type(lanes), device),
         ],
+        scratch=[Scratch((3, order**2), lane_type(lanes))],
         outputs=[visibility],
         device=device,
     )
