@@ -6,7 +6,7 @@ import twins
 
 from warpshadow import directions as cells
 from warpshadow.basis import CellBasis, HarmonicBasis
-from warpshadow.light import EnvironmentMap
+from warpshadow.light import EnvironmentMap, synthetic_sky
 
 # Coefficients are float32 of numbers up to 10.
 FLOAT32 = 5e-6
@@ -76,3 +76,13 @@ def test_light_that_fills_no_order_is_refused_in_cells():
 def test_light_that_fills_no_order_is_refused_in_harmonics(count):
     with pytest.raises(ValueError, match=f"light: got {count} coefficients, expected a square number"):
         HarmonicBasis(4).coefficients(np.zeros((count, 3)))
+
+
+@pytest.mark.parametrize("basis", [HarmonicBasis(3), CellBasis(cells.fibonacci(32))])
+def test_coefficients_are_the_callers_own(basis):
+    """What maps keep of their light is not to be written to, as an optimizer does to its start."""
+    light = synthetic_sky(height=16)
+    coefficients = basis.coefficients(light)
+    expected = coefficients.copy()
+    coefficients[:] = 0
+    np.testing.assert_array_equal(basis.coefficients(light), expected)

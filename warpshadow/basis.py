@@ -31,7 +31,7 @@ class HarmonicBasis:
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         if isinstance(light, EnvironmentMap):
-            return light.sh(self.order)
+            return light.sh(self.order).copy()
         sh.order_of("light", light)
         coefficients = np.zeros((self.size, 3), np.float32)
         count = min(self.size, len(light))
@@ -58,7 +58,7 @@ class CellBasis:
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         if isinstance(light, EnvironmentMap):
-            return light.cells(self.directions).radiance
+            return light.cells(self.directions).radiance.copy()
         order = sh.order_of("light", light)
         return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
 
