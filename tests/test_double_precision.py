@@ -171,8 +171,7 @@ def test_log_visibility_without_a_horizon(double, device, check, spheres):
 @pytest.fixture
 def quad(double, monkeypatch):
     """Receivers, normals, centers and radii, as arguments: five spheres, of which four merge while they are seen so."""
-    for module in ("directional", "log_sh"):
-        monkeypatch.setattr(double(f"visibility.{module}"), "MERGED_FROM", 4)
+    monkeypatch.setattr(double("visibility.merging"), "MERGED_FROM", 4)
     centers, radii = 4 * random(7, 5, 3), 3 + random(8, 5) ** 2
     middle, _, extents = twins.merged_quads(centers, radii)
     away = unit(random(9, 6, 3))

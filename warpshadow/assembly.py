@@ -1,8 +1,7 @@
 """Assembly: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
 
-import contextlib
 import functools
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from warpshadow.deform import DeformationGraph, Poses
 from warpshadow.mesh import edge_neighbors
 from warpshadow.order import z_order
 from warpshadow.scene import SPHERE_METHODS, Scene
+from warpshadow.tape import unrecorded
 
 
 class _GeometryArrays(NamedTuple):
@@ -105,7 +105,7 @@ class Assembly:
     @functools.cached_property
     def _spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
-        with _unrecorded():
+        with unrecorded():
             return scene_blockers(self.scene, device=self.device, progress=self._progress)
 
     @property
@@ -285,21 +285,6 @@ class Assembly:
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
-
-
-@contextlib.contextmanager
-def _unrecorded() -> Iterator[None]:
-    """Launch beside the tape that is recording, if one is."""
-    runtime = wp._src.context.runtime  # Warp has no public way to ask
-    tape = None if runtime is None else runtime.tape
-    if tape is None:
-        yield
-        return
-    runtime.tape = None
-    try:
-        yield
-    finally:
-        runtime.tape = tape
 
 
 def _starts(parts: list[np.ndarray]) -> np.ndarray:

@@ -4,7 +4,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
-from warpshadow.parallel import launch_slices
+from warpshadow.parallel import launch_slices, split_row
 from warpshadow.raster import Fragments, run_length
 from warpshadow.tape import launch, record_adjoint
 
@@ -36,10 +36,7 @@ def _expose(
     samples: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples; they are zero before."""
-    row = first_row + wp.tid()
-    run_count = samples.shape[1] // run
-    batch = row // run_count
-    thread = row - batch * run_count
+    batch, thread = split_row(first_row + wp.tid(), samples.shape[1] // run)
     view = wp.min(batch, face_ids.shape[0] - 1)
     lit = wp.min(batch, shading.shape[0] - 1)
     reflected = wp.min(batch, albedo.shape[0] - 1)

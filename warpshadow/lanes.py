@@ -12,6 +12,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warpshadow.directions import CHUNK
+from warpshadow.parallel import split_row
 
 Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
 """Coefficients of one receiver that reach the vector units together."""
@@ -85,9 +86,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
     @wp.func
     def find_group(row: int, vertex_count: int):
         """Instance and group of a row, where the groups of all instances follow each other."""
-        group_count = (vertex_count + (lanes - 1)) // lanes
-        batch = row // group_count
-        return batch, row - batch * group_count
+        return split_row(row, (vertex_count + (lanes - 1)) // lanes)
 
     @wp.func
     def load(values: wp.array(dtype=wp.vec3), group: int):

@@ -87,6 +87,13 @@ def scratch_place(worker: int, row: int):
     return place
 
 
+@wp.func
+def split_row(row: int, count: int):
+    """Instance and item of a row, where the items of all instances follow each other, ``count`` of each."""
+    batch = row // count
+    return batch, row - batch * count
+
+
 class Scratch(NamedTuple):
     """Memory that a kernel's thread writes to and nobody reads later, an array's row [*shape] for each."""
 

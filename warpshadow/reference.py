@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow import check, sh
 from warpshadow.basis import Basis
 from warpshadow.directions import CHUNK, fibonacci
-from warpshadow.parallel import launch_slices
+from warpshadow.parallel import launch_slices, split_row
 
 
 def ray_offset(mesh: wp.Mesh) -> float:
@@ -39,8 +39,7 @@ def _trace_visibility(
 ):
     """Each thread owns one ray: a receiver and a direction."""
     row, direction = wp.tid()
-    batch = (first_row + row) // points.shape[1]
-    vertex = first_row + row - batch * points.shape[1]
+    batch, vertex = split_row(first_row + row, points.shape[1])
     normal = normals[batch, vertex]
     toward = directions[direction]
     escapes = wp.uint8(0)

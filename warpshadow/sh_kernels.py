@@ -9,6 +9,9 @@ import warp as wp
 from warpshadow.lanes import lane_type
 from warpshadow.sh import schmidt_recurrence, triple_products
 
+PRODUCT_COST = 0.1
+"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
+
 
 @functools.cache
 def zonal_type(order: int, lanes: int) -> type:

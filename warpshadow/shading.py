@@ -6,7 +6,7 @@ from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.directions import CHUNK
 from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks
-from warpshadow.parallel import launch_slices
+from warpshadow.parallel import launch_slices, split_row
 from warpshadow.tape import record_adjoint
 
 _SLAB = 256
@@ -64,9 +64,7 @@ def _shade(
     shading: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
-    row = first_row + wp.tid()
-    batch = row // shading.shape[1]
-    vertex = row - batch * shading.shape[1]
+    batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
     seen = wp.min(batch, transfer.shape[0] - 1)
     lit = wp.min(batch, light.shape[0] - 1)
     red = Chunk(0.0)
@@ -96,9 +94,7 @@ def _shade_adjoint_transfer(
     adj_transfer_chunks: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
-    row = first_row + wp.tid()
-    seen = row // adj_shading.shape[1]
-    vertex = row - seen * adj_shading.shape[1]
+    seen, vertex = split_row(first_row + wp.tid(), adj_shading.shape[1])
     begin = seen
     end = seen + 1
     if adj_transfer.shape[0] == 1:

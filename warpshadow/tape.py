@@ -1,6 +1,7 @@
 """Warp's tape: adjoints written by hand go under it, and what needs no gradient stays off it."""
 
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
@@ -28,3 +29,18 @@ def launch(
     """
     is_wanted = any(isinstance(value, wp.array) and value.requires_grad for value in inputs)
     wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=is_wanted)
+
+
+@contextlib.contextmanager
+def unrecorded() -> Iterator[None]:
+    """Launch beside the tape that is recording, if one is."""
+    runtime = wp._src.context.runtime  # Warp has no public way to ask
+    tape = None if runtime is None else runtime.tape
+    if tape is None:
+        yield
+        return
+    runtime.tape = None
+    try:
+        yield
+    finally:
+        runtime.tape = tape

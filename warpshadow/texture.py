@@ -22,7 +22,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
-from warpshadow.parallel import launch_slices
+from warpshadow.parallel import launch_slices, split_row
 from warpshadow.raster import Fragments, _instance, _relative, _volumes, run_length
 from warpshadow.tape import launch, record_adjoint
 
@@ -564,10 +564,7 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples."""
-    row = first_row + wp.tid()
-    run_count = albedo.shape[1] // run
-    instance = row // run_count
-    thread = row - instance * run_count
+    instance, thread = split_row(first_row + wp.tid(), albedo.shape[1] // run)
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
     for sample in range(thread * run, (thread + 1) * run):
         texture = texture_ids[footprint, sample]

@@ -15,8 +15,9 @@ from warpshadow import check, sh
 from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
 from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
-from warpshadow.parallel import Scratch, launch_slices, scratch_place
+from warpshadow.parallel import Scratch, launch_slices, scratch_place, split_row
 from warpshadow.sh_kernels import (
+    PRODUCT_COST,
     ProductTable,
     add_rotated_zonal,
     multiply,
@@ -25,9 +26,6 @@ from warpshadow.sh_kernels import (
     zonal_type,
 )
 from warpshadow.tape import record_adjoint
-
-_PRODUCT_COST = 0.1
-"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
 
 _CELL_COST = 0.3
 """Nanoseconds that a cell of a receiver takes."""
@@ -186,7 +184,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
     )
     scratch = [Scratch((3, order**2), lane_type(lanes))]
-    cost = _PRODUCT_COST * lanes * order**2 * bands**2
+    cost = PRODUCT_COST * lanes * order**2 * bands**2
     launch_slices(
         _sh_transfer_kernel(order, visibility is not None, lanes),
         dim=[row_count],
@@ -226,9 +224,7 @@ def _transfer_directions(
     transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
-    row = first_row + wp.tid()
-    batch = row // normals.shape[1]
-    vertex = row - batch * normals.shape[1]
+    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
     n = normals[batch, vertex]
     for chunk in range(directions.shape[1]):
         cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
@@ -251,9 +247,7 @@ def _transfer_directions_adjoint(
     adj_normals: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
-    row = first_row + wp.tid()
-    batch = row // normals.shape[1]
-    vertex = row - batch * normals.shape[1]
+    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
     n = normals[batch, vertex]
     total = wp.vec3()
     for chunk in range(directions.shape[1]):

@@ -33,15 +33,12 @@ from warpshadow.visibility.culling import (
 )
 from warpshadow.visibility.merging import (
     ITEMS,
-    MERGED_FROM,
     MERGING,
     QUAD,
     Spheres,
-    check_merging,
     load_merged_function,
-    merge,
+    merge_where_far,
     merged_adjoint,
-    unmerged,
 )
 from warpshadow.visibility.soft_edges import edge_adjoint, edge_function
 
@@ -497,7 +494,6 @@ def transmittance(
     if not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
         raise ValueError("directions: got vectors of other lengths, expected unit vectors")
     width = edge_width(softness, len(directions))
-    check_merging(merging)
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
@@ -506,8 +502,7 @@ def transmittance(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
-    is_merging = merging > 0 and radii.shape[1] >= MERGED_FROM
-    nodes = merge(centers, radii) if is_merging else unmerged(centers, radii)
+    nodes = merge_where_far(centers, radii, merging)
     spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(len(directions)))
     row_count = batch_count * group_count(vertex_count, lanes)
     dim = row_count, span_count

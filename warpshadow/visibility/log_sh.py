@@ -12,21 +12,25 @@ from warpshadow import check, sh
 from warpshadow.directions import cell_radius
 from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
 from warpshadow.parallel import Scratch, launch_slices, scratch_place
-from warpshadow.sh_kernels import add_rotated_zonal, multiply, product_table, rotated_zonal_adjoint, zonal_type
+from warpshadow.sh_kernels import (
+    PRODUCT_COST,
+    add_rotated_zonal,
+    multiply,
+    product_table,
+    rotated_zonal_adjoint,
+    zonal_type,
+)
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
 from warpshadow.visibility.culling import find_node, make_spheres
 from warpshadow.visibility.merging import (
     ITEMS,
-    MERGED_FROM,
     MERGING,
     QUAD,
     Spheres,
-    check_merging,
     load_merged_function,
-    merge,
+    merge_where_far,
     merged_adjoint,
-    unmerged,
 )
 from warpshadow.visibility.zonal_logs import LOGS, band_type, look_up, look_up_slope, zonal_table
 
@@ -36,9 +40,6 @@ HORIZON_FADE = 0.5
 
 _PAIR_COST = 0.25
 """Nanoseconds that a sphere costs for a receiver and a coefficient."""
-
-_PRODUCT_COST = 0.05
-"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
 
 
 @functools.cache
@@ -314,13 +315,12 @@ def accumulate(
     """
     sh.check_order(order)
     check.choice("log", log, LOGS)
-    check_merging(merging)
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
-    nodes = merge(centers, radii) if merging > 0 and radii.shape[1] >= MERGED_FROM else unmerged(centers, radii)
+    nodes = merge_where_far(centers, radii, merging)
     spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(order**2))
     variables = [points, normals, *nodes]
     table = zonal_table(order, log, str(device))
@@ -453,7 +453,7 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
     launch_slices(
         _product_kernel(order, lanes),
         dim=[row_count],
-        cost=_PRODUCT_COST * lanes * radii.shape[1] * order**4,
+        cost=PRODUCT_COST * lanes * radii.shape[1] * order**4,
         inputs=[
             points,
             centers,

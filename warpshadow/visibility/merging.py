@@ -134,8 +134,17 @@ def merge(centers: wp.array, radii: wp.array) -> Nodes:
     return Nodes(concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents)
 
 
-def unmerged(centers: wp.array, radii: wp.array) -> Nodes:
-    """Spheres that do not merge."""
+def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Nodes:
+    """Merge spheres where there are enough of them and ``merging``, in cell radii, is not 0.
+
+    Raises:
+        ValueError: for ``merging`` out of range.
+
+    Differentiable: centers, radii.
+    """
+    check_merging(merging)
+    if merging > 0 and radii.shape[1] >= MERGED_FROM:
+        return merge(centers, radii)
     return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
 
 
