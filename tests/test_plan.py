@@ -438,7 +438,8 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         return "shading" if "_light_cells" in key else "transfer"
     if module == "film":
         return "averaging" if "average" in key else "exposure"
-    return {"camera": "clip positions", "mesh": "normals", "receivers": "receivers", "shading": "shading"}[module]
+    same = {name: name for name in ("receivers", "shading", "sides")}
+    return {"camera": "clip positions", "mesh": "normals", **same}[module]
 
 
 class Launches:
@@ -596,10 +597,10 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
     lines = str(explain()).splitlines()
-    assert [line.split()[0] for line in (lines[0], lines[18])] == ["forward", "backward"]
-    (rasterization,) = (line for line in lines[:18] if "rasterization" in line)
+    assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
     assert "–" in rasterization and "kept: the scene's geometry and cameras stand" in rasterization
-    (exposure,) = (line for line in lines[18:] if "exposure" in line)
+    (exposure,) = (line for line in lines[19:] if "exposure" in line)
     assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
     assert "2,304 samples" in exposure
 
@@ -611,7 +612,7 @@ def test_an_explanation_computes_nothing(monkeypatch):
     renderer = Renderer(scene)
     monkeypatch.setattr(assembly, "scene_blockers", None)
     monkeypatch.setattr(wp, "launch", None)
-    assert "up to 613 receivers × 21 spheres" in str(renderer.explain())
+    assert "up to 902 receivers × 21 spheres" in str(renderer.explain())
 
 
 def test_tensors_explain_themselves():

@@ -11,7 +11,6 @@ from warpshadow import check
 from warpshadow.batch import common_batch, concatenate
 from warpshadow.blockers import scene_blockers
 from warpshadow.deform import DeformationGraph, Poses
-from warpshadow.mesh import edge_neighbors
 from warpshadow.order import z_order
 from warpshadow.scene import SPHERE_METHODS, Scene
 from warpshadow.tape import unrecorded
@@ -52,7 +51,7 @@ class Assembly:
         progress: Show progress of the fits.
 
     Attributes:
-        faces: Indices of vertices, vec3i of shape [face].
+        faces: Indices of vertices, vec3i of shape [face]; those of a body wind alike.
         uvs: Texture coordinates, vec2 of shape [1, uv].
         uv_faces: Indices of uvs, vec3i of shape [face].
         first_vertex, first_face: Where each body begins, and the end of the last, NumPy of shape [body + 1].
@@ -65,10 +64,12 @@ class Assembly:
         self._faces_of: dict[tuple[int, int], wp.array] = {}
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
-        uv_faces = [np.zeros_like(mesh.faces) if mesh.uv_faces is None else mesh.uv_faces for mesh in meshes]
+        surfaces = [mesh.surface for mesh in meshes]
+        faces = [surface.faces for surface in surfaces]
+        uv_faces = [np.zeros_like(each.faces) if each.uv_faces is None else each.uv_faces for each in surfaces]
         self.first_vertex = _starts([mesh.positions for mesh in meshes])
         self.first_face = _starts([mesh.faces for mesh in meshes])
-        self.faces = self._array(_stacked_faces([mesh.faces for mesh in meshes], self.first_vertex), wp.vec3i)
+        self.faces = self._array(_stacked_faces(faces, self.first_vertex), wp.vec3i)
         self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
         self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
 
@@ -96,11 +97,21 @@ class Assembly:
     @functools.cached_property
     def edges(self) -> wp.array:
         """Face across each edge, vec3i of shape [face]: :func:`warpshadow.mesh.edge_neighbors`."""
-        parts = [edge_neighbors(body.mesh.faces, body.mesh.positions) for body in self.scene.bodies]
+        parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
         moved = [
             np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)
         ]
         return self._array(np.concatenate(moved), wp.vec3i)
+
+    @functools.cached_property
+    def is_two_sided(self) -> np.ndarray:
+        """Bodies that may be seen from behind, those that are not closed, bool of shape [body]."""
+        return np.array([not body.mesh.surface.is_closed for body in self.scene.bodies])
+
+    @functools.cached_property
+    def two_sided_faces(self) -> wp.array:
+        """Faces of those bodies, int32 of shape [item]."""
+        return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
 
     @functools.cached_property
     def _spheres(self) -> list:

@@ -7,6 +7,7 @@ image, v up.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import warnings
@@ -87,6 +88,11 @@ class Mesh:
         for array in (self.positions, self.faces, self.uvs, self.uv_faces):
             digest.update(b"none" if array is None else f"{array.shape}".encode() + array.tobytes())
         return digest.hexdigest()
+
+    @functools.cached_property
+    def surface(self) -> Surface:
+        """How its faces are joined."""
+        return _surface(self)
 
     def transformed(
         self,
@@ -506,6 +512,74 @@ def _places(positions: np.ndarray) -> np.ndarray:
     places = np.zeros(len(positions), np.int64)
     places[order[1:]] = np.cumsum(is_new)
     return places
+
+
+class Surface(NamedTuple):
+    """How the faces of a mesh are joined, and what they enclose.
+
+    Faces joined along an edge wind alike: where some wind against most of their piece, they are turned over. So normals
+    of neighbors add up, and one side of a piece is its front, all over. On a one-sided piece (a Möbius strip) they
+    cannot, and stay as they are.
+    """
+
+    faces: np.ndarray
+    """Indices of positions, int32 of shape [face, 3]."""
+    uv_faces: np.ndarray | None
+    """Indices of uvs, int32 of shape [face, 3]."""
+    neighbors: np.ndarray
+    """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
+    is_closed: bool
+    """Whether no face shows its back to those outside: two share each edge, wind alike, and look outward."""
+
+
+def _surface(mesh: Mesh) -> Surface:
+    faces, uv_faces, neighbors = mesh.faces, mesh.uv_faces, edge_neighbors(mesh.faces, mesh.positions)
+    places = _places(mesh.positions)[faces]
+    first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
+    across = np.maximum(neighbors, 0)
+    runs_back = (first[across] == last[:, :, None]) & (last[across] == first[:, :, None])
+    winds_alike = runs_back.any(axis=2) | (neighbors < 0)
+    if not winds_alike.all():
+        is_turned = _turned(neighbors, winds_alike)
+        winds_alike ^= is_turned[:, None] ^ is_turned[across]
+        winds_alike |= neighbors < 0
+        faces, neighbors = (_with_turned(values, is_turned) for values in (faces, neighbors))
+        uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
+    is_proper = (places != first).all(axis=1)
+    is_closed = winds_alike.all() and (neighbors[is_proper] >= 0).all() and _volume(mesh.positions, faces) > 0
+    return Surface(faces, uv_faces, neighbors, bool(is_closed))
+
+
+def _volume(positions: np.ndarray, faces: np.ndarray) -> float:
+    """What faces enclose, negative where they look inward."""
+    a, b, c = np.moveaxis((positions - positions[0].astype(np.float64))[faces], 1, 0)
+    return np.sum(a * np.cross(b, c)) / 6
+
+
+def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
+    """Faces to turn over, as few as can be, so that neighbors wind alike, bool of shape [face].
+
+    Each face is there twice, as it is and turned over, and joined to what winds alike: a piece of the mesh becomes two.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(neighbors)
+    face, edge = np.nonzero(neighbors >= 0)
+    other = neighbors[face, edge] + np.where(winds_alike[face, edge], 0, count)
+    ends = np.concatenate([face, face + count]), np.concatenate([other, (other + count) % (2 * count)])
+    links = coo_array((np.ones(len(ends[0])), ends), shape=(2 * count, 2 * count))
+    part_count, part = connected_components(links, directed=False)
+    as_it_is, over = part[:count], part[count:]
+    kept = np.bincount(as_it_is, minlength=part_count)
+    return (kept[as_it_is] < kept[over]) | ((kept[as_it_is] == kept[over]) & (as_it_is > over))
+
+
+def _with_turned(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
+    """What faces have for each corner, [face, 3], with that of some faces the other way round."""
+    turned = np.where(is_turned[:, None], values[:, ::-1], values)
+    turned.setflags(write=False)
+    return turned
 
 
 # ------------------------------------------------------------------------------------------------- unwrapping

@@ -114,13 +114,19 @@ class ViewPlan(Plan):
 
     clipping: Stage
     rasterization: Stage
+    sides: Stage
     silhouettes: Stage
     normals: Stage
     receivers: Stage
 
 
-def plan_view(change: Decision, view: ViewFacts, *, vertices: int, still_vertices: int, faces: int) -> ViewPlan:
+def plan_view(
+    change: Decision, view: ViewFacts, *, vertices: int, still_vertices: int, faces: int, two_sided_faces: int
+) -> ViewPlan:
     """Plan a view, given whether what it depends on changed."""
+    sides = change
+    if change and not two_sided_faces:
+        sides = Decision(False, "every body is closed: none is seen from behind")
     images = f"{view.samples:,} samples"
     corners = f"{vertices:,} vertices"
     moving_corners = f"{vertices - still_vertices:,} vertices, {still_vertices:,} kept" if still_vertices else corners
@@ -129,6 +135,7 @@ def plan_view(change: Decision, view: ViewFacts, *, vertices: int, still_vertice
     return ViewPlan(
         _stage("clip positions", change, view.placed_by, corners if CAMERAS in view.varying else moving_corners),
         _stage("rasterization", change, view.placed_by, f"{faces:,} faces, {images}"),
+        _stage("sides", sides, (), f"{two_sided_faces:,} faces of open bodies"),
         _stage("silhouettes", change, (), images),
         _stage("normals", change, shape, moving_corners),
         _stage("receivers", change, points, view.count_of_receivers(view.receivers + view.still_receivers)),

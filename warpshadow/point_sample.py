@@ -69,10 +69,15 @@ class PointSample:
             raise ValueError("scene: the camera sees no body, expected one in the image")
         face_ids = face_ids.ravel()
         faces = stage.assembly.faces
-        self._vertices = faces.numpy()[face_ids[chosen]]
-        self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
         self._positions = stage.geometry.positions.numpy()[0]
         self._normals = vertex_normals(stage.geometry.positions, faces).numpy()[0]
+        self._vertices = faces.numpy()[face_ids[chosen]]
+        if self._view.fragments.sides is not None:  # the backs of vertices are numbered after them
+            sides = self._view.fragments.sides.numpy().ravel()
+            self._vertices = self._vertices + len(self._positions) * (sides != face_ids)[chosen, None]
+            self._positions = np.tile(self._positions, (2, 1))
+            self._normals = np.concatenate([self._normals, -self._normals])
+        self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
         self.bodies = stage.assembly.body_of_face[face_ids[chosen]]
         self._scene = scene
         if not self.truth.any():

@@ -48,10 +48,13 @@ class Fragments:
         face_ids: Index of the visible face, -1 where there is none, int32, shape [batch, height, width].
         barycentrics: Perspective-correct weights of the face's three vertices, non-negative with sum 1, zero
             where there is no face, vec3, shape [batch, height, width].
+        sides: Index of the visible side (`warpshadow.sides`), -1 where there is no face, int32, shape
+            [batch, height, width]; None where no face is known to be seen from behind.
     """
 
     face_ids: wp.array
     barycentrics: wp.array
+    sides: wp.array | None = None
 
 
 def run_length(device: wp.Device, width: int) -> int:

@@ -1,6 +1,7 @@
 """Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
 
-They are the vertices of what is seen, and for bodies that want it the points that the samples see.
+They are the vertices of what is seen, and for bodies that want it the points that the samples see. Where a surface is
+seen from behind (:mod:`warpshadow.sides`), they are others, at the same places, with opposite normals.
 """
 
 from typing import NamedTuple
@@ -20,10 +21,16 @@ class Receivers(NamedTuple):
 
     points: wp.array  # [batch, receiver − still] vec3
     normals: wp.array  # [batch, receiver − still] vec3
-    faces: wp.array  # [face + own] vec3i, indices of receivers
-    of_vertices: wp.array  # [vertex] int32, -1 for none
+    faces: wp.array  # [face or side + own] vec3i, indices of receivers
+    of_vertices: wp.array  # [vertex, and their backs if any is seen] int32, -1 for none
     fragments: Fragments  # a sample with a receiver of its own sees one of the added faces, whose corners are all it
     still: np.ndarray = np.empty(0, int)  # [still], vertices that are the first receivers; points are of those after
+
+
+@wp.func
+def _outward(number: int, count: int):
+    """Sign of the normal of a side of a face or of a vertex, of which there are ``count``."""
+    return wp.where(number < count, 1.0, -1.0)
 
 
 @wp.kernel
@@ -32,7 +39,7 @@ def _gather(
     positions: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    face_ids: wp.array2d(dtype=wp.int32),
+    sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
     vertices: wp.array(dtype=wp.int32),
     samples: wp.array2d(dtype=wp.int32),
@@ -45,16 +52,18 @@ def _gather(
     instance = wp.min(batch, positions.shape[0] - 1)
     own = receiver - vertices.shape[0]
     if own < 0:
-        points[batch, receiver] = positions[instance, vertices[receiver]]
-        point_normals[batch, receiver] = normals[instance, vertices[receiver]]
+        vertex = vertices[receiver] % positions.shape[1]
+        points[batch, receiver] = positions[instance, vertex]
+        point_normals[batch, receiver] = _outward(vertices[receiver], positions.shape[1]) * normals[instance, vertex]
     else:
-        corners = faces[0]
+        side = int(0)
         weights = wp.vec3(1.0, 0.0, 0.0)
-        view = wp.min(batch, face_ids.shape[0] - 1)
+        view = wp.min(batch, sides.shape[0] - 1)
         sample = samples[view, own]
         if sample >= 0:
-            corners = faces[face_ids[view, sample]]
+            side = sides[view, sample]
             weights = barycentrics[view, sample]
+        corners = faces[side % faces.shape[0]]
         i = corners[0]
         j = corners[1]
         k = corners[2]
@@ -63,7 +72,7 @@ def _gather(
             + weights[1] * positions[instance, j]
             + weights[2] * positions[instance, k]
         )
-        point_normals[batch, receiver] = wp.normalize(
+        point_normals[batch, receiver] = _outward(side, faces.shape[0]) * wp.normalize(
             weights[0] * normals[instance, i] + weights[1] * normals[instance, j] + weights[2] * normals[instance, k]
         )
 
@@ -102,7 +111,7 @@ def find_receivers(
         faces: Vertex indices, vec3i of shape [face].
         fragments: What each sample sees, one batch for all or one each.
         keeps_vertex: Which vertices are receivers, bool of shape [vertex]: all of those of a face that a sample sees,
-            unless the face wants samples; see :func:`seen_vertices`.
+            unless the face wants samples; see :func:`seen_vertices`. Where fragments have sides, their backs follow.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
         is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
         order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
@@ -115,21 +124,26 @@ def find_receivers(
     """
     device = positions.device
     has_own = wants_samples.any()
-    if not has_own and keeps_vertex.all() and is_still is None and order is None:
+    if not has_own and keeps_vertex.all() and is_still is None and order is None and fragments.sides is None:
         return Receivers(positions, normals, faces, constant(np.arange(len(keeps_vertex)), wp.int32, device), fragments)
-    is_still = np.zeros_like(keeps_vertex) if is_still is None else is_still
-    order = np.arange(len(keeps_vertex)) if order is None else order
+    count, corners, sides = positions.shape[1], faces.numpy(), fragments.face_ids
+    is_still = np.zeros(count, bool) if is_still is None else is_still
+    order = np.arange(count) if order is None else order
+    if fragments.sides is not None:
+        sides = fragments.sides
+        is_still, order = np.tile(is_still, 2), np.concatenate([order, order + count])
+        corners, wants_samples = np.concatenate([corners, corners + count]), np.tile(wants_samples, 2)
     still, vertices = order[(keeps_vertex & is_still)[order]], order[(keeps_vertex & ~is_still)[order]]
     vertex_count = len(still) + len(vertices)
-    samples = np.empty((len(fragments.face_ids), 0), int)
+    samples = np.empty((len(sides), 0), int)
     batch_count = len(positions)
     receiver_of_vertex = np.full(len(keeps_vertex), -1, np.int32)
     receiver_of_vertex[np.concatenate([still, vertices])] = np.arange(vertex_count)
-    receiver_faces = receiver_of_vertex[faces.numpy()]
-    receiver_fragments = fragments
+    receiver_faces = receiver_of_vertex[corners]
+    receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
     if has_own:
-        batch_count = common_batch({"positions": positions, "fragments": fragments.face_ids})
-        samples, receiver_fragments = _own_samples(fragments, wants_samples)
+        batch_count = common_batch({"positions": positions, "fragments": sides})
+        samples, receiver_fragments = _own_samples(receiver_fragments, wants_samples)
         own_faces = np.repeat(vertex_count + np.arange(samples.shape[1])[:, None], 3, axis=1)
         receiver_faces = np.concatenate([receiver_faces, own_faces])
     variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
@@ -145,7 +159,7 @@ def find_receivers(
             positions,
             normals,
             faces,
-            rows(fragments.face_ids),
+            rows(sides),
             rows(fragments.barycentrics) if has_own else None,
             wp.array(vertices, dtype=wp.int32, device=device),
             wp.array(samples, dtype=wp.int32, device=device),
@@ -172,13 +186,20 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         vertex_count: Number of vertices.
 
     Returns:
-        bool of shape [vertex]: what any instance sees, so that all have as many receivers.
+        bool of shape [vertex]: what any instance sees, so that all have as many receivers. Where fragments have sides,
+        their backs follow.
     """
-    faces, edges = silhouettes.faces.numpy(), silhouettes.edges.numpy()
-    is_seen = np.zeros(len(faces) + 1, bool)
-    is_seen[fragments.face_ids.numpy()] = True  # the last item is for samples that see none
+    corners, edges, seen = silhouettes.faces.numpy(), silhouettes.edges.numpy(), fragments.face_ids.numpy()
     takes_part = np.zeros(vertex_count, bool)
-    takes_part[faces[is_seen[:-1]]] = True
+    if fragments.sides is not None:
+        seen = fragments.sides.numpy()
+        # an edge is seen from the side that one of the pixels beside it sees, each of which has an entry for it
+        is_back = seen.ravel()[silhouettes.pixels.numpy()] >= len(corners)
+        edges = np.where((edges >= 0) & is_back[:, None, None], edges + vertex_count, edges)
+        corners, takes_part = np.concatenate([corners, corners + vertex_count]), np.tile(takes_part, 2)
+    is_seen = np.zeros(len(corners) + 1, bool)
+    is_seen[seen] = True  # the last item is for samples that see none
+    takes_part[corners[is_seen[:-1]]] = True
     takes_part[edges[edges >= 0]] = True
     return takes_part
 

@@ -777,6 +777,7 @@ def _find_contrasts(
     pixels: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     face_ids: wp.array(dtype=wp.int32),
+    sides: wp.array(dtype=wp.int32),
     barycentrics: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array2d(dtype=wp.vec4),
@@ -804,17 +805,20 @@ def _find_contrasts(
                 here = image[instance, pixel]
                 there = image[instance, other]
                 if edge[0] >= 0:
-                    first = receivers[edge[0]]
-                    second = receivers[edge[1]]
+                    is_near = _depth(face_ids[pixel], barycentrics[pixel], faces, clip) <= _depth(
+                        face_ids[other], barycentrics[other], faces, clip
+                    )
+                    near = wp.where(is_near, pixel, other)
+                    back = int(0)
+                    if sides:
+                        back = wp.where(sides[near] < faces.shape[0], 0, clip.shape[0])
+                    first = receivers[back + edge[0]]
+                    second = receivers[back + edge[1]]
                     if wp.min(first, second) >= 0:
                         across_a = _relative(clip[edge[0]], center)[1 - side / 2]
                         across_b = _relative(clip[edge[1]], center)[1 - side / 2]
                         place = wp.clamp(across_a / (across_a - across_b), 0.0, 1.0)
                         color = wp.lerp(shading[lit, first], shading[lit, second], place)
-                        is_near = _depth(face_ids[pixel], barycentrics[pixel], faces, clip) <= _depth(
-                            face_ids[other], barycentrics[other], faces, clip
-                        )
-                        near = wp.where(is_near, pixel, other)
                         color = wp.cw_mul(color, albedo[reflected, near % (width * height)])
                         if wp.isfinite(color):
                             at_edge = wp.vec4(color[0], color[1], color[2], 1.0)
@@ -840,7 +844,8 @@ def find_contrasts(
         silhouettes: Of :func:`find_silhouettes`.
         clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex].
         shading: Of the receivers, vec3 of shape [batch, receiver].
-        receivers: Receiver of each vertex, −1 for none, int32 of shape [vertex].
+        receivers: Receiver of each vertex, −1 for none, int32 of shape [vertex]; where the silhouettes' fragments have
+            sides, those of their backs follow.
         albedo: Of the samples, vec3 of shape [batch, height, width].
 
     Returns:
@@ -861,6 +866,7 @@ def find_contrasts(
             silhouettes.pixels,
             silhouettes.edges,
             fragments.face_ids.flatten(),
+            None if fragments.sides is None else fragments.sides.flatten(),
             fragments.barycentrics.flatten(),
             silhouettes.faces,
             clip_positions,

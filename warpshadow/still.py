@@ -61,6 +61,9 @@ class Still:
         self._progress = progress
         self._bodies = [number for number in range(len(assembly.scene.bodies)) if number not in geometry.moving]
         self.is_still = np.isin(assembly.body_of_vertex, self._bodies)
+        self._can_be_seen = np.concatenate(
+            [self.is_still, self.is_still & assembly.is_two_sided[assembly.body_of_vertex]]
+        )
         positions, centers, radii = map(_first_instance, geometry)
         self._geometry = Geometry(positions, centers, radii)
         if not self.holds(geometry):
@@ -103,7 +106,7 @@ class Still:
         return self._clip[1]
 
     def receivers(self, vertices: np.ndarray) -> tuple[wp.array, wp.array]:
-        """Points and normals of some vertices, vec3 of shape [1, receiver]."""
+        """Points and normals of some vertices, after which their backs are numbered, vec3 of shape [1, receiver]."""
         if not np.array_equal(vertices, self._seen):
             self._seen = vertices
             self.__dict__.pop("_receivers", None)
@@ -114,9 +117,11 @@ class Still:
         return self._gathered(self._seen)
 
     def _gathered(self, vertices: np.ndarray) -> tuple[wp.array, wp.array]:
+        count = len(self.is_still)
+        outward = np.where(vertices < count, 1, -1).astype(np.float32)
         points, normals = (
-            wp.array(array.numpy()[:, vertices], dtype=wp.vec3, device=array.device)
-            for array in (self._geometry.positions, self.normals)
+            wp.array(array.numpy()[:, vertices % count] * sign, dtype=wp.vec3, device=array.device)
+            for array, sign in ((self._geometry.positions, np.float32(1)), (self.normals, outward[:, None]))
         )
         return points, normals
 
@@ -139,7 +144,7 @@ class Still:
         """Number of still vertices, all or some, of which something is not kept yet."""
         if kind in self._rows:
             return self._rows[kind].missing(vertices)
-        return int(self.is_still.sum()) if vertices is None else len(vertices)
+        return int(self._can_be_seen.sum()) if vertices is None else len(vertices)
 
     # ------------------------------------------------------------------------------------------ what is kept
 
@@ -158,7 +163,7 @@ class Still:
 
         def trace(found: np.ndarray) -> wp.array:
             points, normals = self._gathered(found)
-            numbers = wp.array(found, dtype=wp.int32, device=points.device)
+            numbers = wp.array(found % len(self.is_still), dtype=wp.int32, device=points.device)
             if kind not in self._drawn:
                 self._drawn[kind] = cell_samples(_samples(light, samples), directions, device=points.device)
             drawn = self._drawn[kind]
@@ -178,7 +183,7 @@ class Still:
 
     def _kept(self, kind: str, vertices: np.ndarray, find: Callable[[np.ndarray], wp.array]) -> KeptRows:
         if kind not in self._rows:
-            self._rows[kind] = _Rows(self.is_still)
+            self._rows[kind] = _Rows(self._can_be_seen)
         return self._rows[kind].of(vertices, find)
 
     @functools.cached_property

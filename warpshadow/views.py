@@ -17,6 +17,7 @@ from warpshadow.mesh import vertex_normals
 from warpshadow.plan import CAMERAS, SPHERES, VERTICES, Decision, Ledger, ViewFacts, ViewPlan, plan_view
 from warpshadow.raster import Fragments, rasterize
 from warpshadow.receivers import Receivers, find_receivers, seen_vertices
+from warpshadow.sides import find_sides
 from warpshadow.silhouette import Silhouettes, find_silhouettes
 from warpshadow.still import Still
 from warpshadow.texture import Footprints
@@ -162,6 +163,7 @@ class Viewer:
             vertices=int(vertex_counts.sum()),
             still_vertices=int(vertex_counts[stands].sum()),
             faces=len(self.assembly.body_of_face),
+            two_sided_faces=self.assembly.two_sided_faces.size,
         )
         still = None
         known = None if geometry is None else self._stills.get(geometry.moving)
@@ -213,7 +215,7 @@ class Viewer:
         images = max(poses, len(self.cameras) if clip_matrices is None else len(clip_matrices))
         samples = images * camera.width * camera.height * across**2
         has_own, at_vertices = bool(self.samples_receive.any()), ~self.samples_receive
-        vertex_counts = np.diff(self.assembly.first_vertex)
+        vertex_counts = np.diff(self.assembly.first_vertex) * (1 + self.assembly.is_two_sided)
         return ViewFacts(
             varying,
             lit_by=varying if has_own else tuple(name for name in varying if name != CAMERAS),
@@ -257,14 +259,21 @@ class Viewer:
             clip_positions = self._clipped(geometry, clip_matrices, still)
         with timed(plan.rasterization, [clip_positions]):
             fragments = rasterize(clip_positions, assembly.faces, across * camera.width, across * camera.height)
+        if plan.sides:
+            with timed(plan.sides):
+                two_sided = assembly.two_sided_faces
+                fragments = find_sides(fragments, assembly.faces, two_sided, geometry.positions, clip_matrices)
         with timed(plan.silhouettes):
             silhouettes = find_silhouettes(fragments, assembly.faces, assembly.edges, clip_positions, assembly.surfaces)
         with timed(plan.normals, [geometry.positions]):
             normals = self._normals(geometry, still)
         with timed(plan.receivers, [geometry.positions, fragments.barycentrics]):
-            keeps_vertex, order = np.repeat(~self.samples_receive, np.diff(assembly.first_vertex)), None
+            body_of_vertex, order = assembly.body_of_vertex, None
+            keeps_vertex = ~self.samples_receive[body_of_vertex]
+            if fragments.sides is not None:
+                keeps_vertex = np.concatenate([keeps_vertex, keeps_vertex & assembly.is_two_sided[body_of_vertex]])
             if is_readable(assembly.device):  # a GPU would have to wait until the host knows what is seen
-                keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(keeps_vertex))
+                keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(body_of_vertex))
                 order = assembly.vertex_order
             receivers = find_receivers(
                 geometry.positions,
