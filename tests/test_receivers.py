@@ -8,7 +8,7 @@ import warpshadow as ws
 from warpshadow.camera import to_clip
 from warpshadow.mesh import vertex_normals
 from warpshadow.raster import Fragments, interpolate, rasterize
-from warpshadow.receivers import find_receivers, seen_vertices
+from warpshadow.receivers import find_receivers, number_receivers, seen_vertices
 from warpshadow.silhouette import Silhouettes, find_silhouettes
 
 # Interpolated float32 positions of size 1.
@@ -32,7 +32,8 @@ def two_triangles(device, cameras: int, requires_grad=False):
 def receivers_of(positions, faces, matrices, wants_samples):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     wants = np.array(wants_samples)
-    found = find_receivers(positions, vertex_normals(positions, faces), faces, fragments, np.repeat(~wants, 3), wants)
+    numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
+    found = find_receivers(positions, vertex_normals(positions, faces), faces, fragments, numbering, wants)
     return found, fragments
 
 
@@ -61,8 +62,8 @@ def test_views_of_one_geometry_share_the_vertices_that_any_of_them_sees(device):
     positions, faces, matrices = two_triangles(device, 3)
     normals = vertex_normals(positions, faces)
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
-    keeps_vertex = np.array([False, False, False, True, True, True])
-    found = find_receivers(positions, normals, faces, fragments, keeps_vertex, np.zeros(2, bool))
+    numbering = number_receivers(faces, np.array([[False, False, False, True, True, True]]))
+    found = find_receivers(positions, normals, faces, fragments, numbering, np.zeros(2, bool))
     np.testing.assert_array_equal(found.points.numpy(), positions.numpy()[:, 3:])
     np.testing.assert_array_equal(found.normals.numpy(), normals.numpy()[:, 3:])
     np.testing.assert_array_equal(found.of_vertices.numpy(), [-1, -1, -1, 0, 1, 2])
@@ -76,7 +77,7 @@ def test_vertices_of_seen_faces_and_of_edges_at_silhouettes_have_a_part_in_the_i
     edges = wp.array([[(-1, -1), (-2, -2), (7, 0), (-1, -1)]], dtype=wp.vec2i, device=device)
     fragments = Fragments(face_ids, None)
     seen = seen_vertices(fragments, Silhouettes(None, edges, None, fragments, faces), 9)
-    np.testing.assert_array_equal(np.flatnonzero(seen), [0, 2, 3, 4, 7])
+    np.testing.assert_array_equal(np.argwhere(seen), [[0, vertex] for vertex in (0, 2, 3, 4, 7)])
 
 
 def test_no_vertex_has_a_part_in_an_image_of_nothing(device):

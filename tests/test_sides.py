@@ -27,8 +27,8 @@ RECEIVERS = ("vertex", "pixel")
 FLOAT32 = 2e-5
 # Light from one half of all directions: in cells, in bands of spherical harmonics, by 1024 rays.
 HALF_LIGHT = {"directional": 0.02, "log-sh": 0.03, "none": 0.03, "ray-traced": 0.03}
-# Differences of an image without silhouettes: over a step, shadows bend. It is the same for fronts.
-SMOOTH = 2e-2
+# Differences of an image without silhouettes, in which shadows bend over the step; the same for fronts.
+SMOOTH = 1e-2
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -191,6 +191,24 @@ def test_backs_that_stand_among_moving_bodies_are_lit_as_fronts_that_do(method, 
         assert_near(images[1], whole.draw(light).numpy())
 
 
+@pytest.mark.parametrize("moving", [None, [1]])
+def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
+    """As on a GPU, where all vertices are receivers: with their backs, but for closed bodies, where a sample sees one.
+
+    While a graph is captured it is not even known whether one does.
+    """
+    scene = bowl_scene("none")
+    expected = Renderer(scene).render()
+    monkeypatch.setattr(views, "is_readable", lambda device: False)
+    renderer = Renderer(scene)
+    view = renderer.view(renderer.assembly.placed(moving=moving))
+    vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
+    assert view.receivers.points.shape[1] + len(view.receivers.still) == 2 * vertex_counts[0] + vertex_counts[1]
+    assert_near(renderer.draw(view=view).numpy()[0], expected)
+    front = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
+    assert front.scene_view.receivers.points.shape[1] == vertex_counts[0]
+
+
 def test_points_that_are_compared_with_rays_are_on_the_side_that_is_seen():
     for eye, expected in (((0.1, 3, 0.5), 1.0), ((0.1, -3, 0.5), 0.0)):
         scene = half_lit("directional", "vertex", eye, ws.plane(4.0, 6))
@@ -286,10 +304,11 @@ def test_gradients_of_backs_are_central_differences_of_the_image(method, receive
     motion.values["texture"][:] = 0.5
     gradients = motion.gradients()
     generator = torch.Generator().manual_seed(5)
-    for name in gradients.keys() - {"albedo"}:  # of the ball, which is out of view
+    gradients.pop("albedo")  # of the ball, which is out of view
+    for name in gradients:
         directions = [torch.randn(motion.values[name].shape, generator=generator) for _ in range(3)]
         got = np.array([(gradients[name] * direction).sum().item() for direction in directions])
-        expected = np.array([motion.difference(name, direction, 3e-4) for direction in directions])
+        expected = np.array([motion.difference(name, direction, 1e-4) for direction in directions])
         assert np.linalg.norm(got - expected) < SMOOTH * np.linalg.norm(expected), name
 
 

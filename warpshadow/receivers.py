@@ -93,15 +93,63 @@ def _weigh_own(
         weights[sample] = barycentrics[sample]
 
 
+class Numbering(NamedTuple):
+    """Which vertices are receivers, and their numbers."""
+
+    vertices: wp.array | None  # [receiver − still] int32, those after the still ones; None for all as they are
+    still: np.ndarray  # [still]
+    faces: wp.array  # [face or side] vec3i
+    of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
+
+    @property
+    def receiver_count(self) -> int:
+        """Number of receivers at vertices."""
+        return len(self.still) + (self.of_vertices.size if self.vertices is None else self.vertices.size)
+
+
+def number_receivers(
+    faces: wp.array,
+    keeps_vertex: np.ndarray,
+    is_still: np.ndarray | None = None,
+    order: np.ndarray | None = None,
+) -> Numbering:
+    """Choose the vertices that are receivers.
+
+    Args:
+        faces: Vertex indices, vec3i of shape [face].
+        keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
+        is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
+        order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
+            side. None for their own.
+    """
+    device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
+    if side_count == 1 and keeps_vertex.all() and is_still is None and order is None:
+        of_vertices = constant(np.arange(vertex_count), wp.int32, device)
+        return Numbering(None, np.empty(0, int), faces, of_vertices)
+    is_still = np.zeros(vertex_count, bool) if is_still is None else is_still
+    order = np.arange(vertex_count) if order is None else order
+    shifts = vertex_count * np.arange(side_count)
+    order = (order + shifts[:, None]).ravel()
+    stays, moves = (keeps_vertex & is_still).ravel(), (keeps_vertex & ~is_still).ravel()
+    still, vertices = order[stays[order]], order[moves[order]]
+    of_vertices = np.full(keeps_vertex.size, -1, np.int32)
+    of_vertices[np.concatenate([still, vertices])] = np.arange(len(still) + len(vertices))
+    corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
+    return Numbering(
+        wp.array(vertices, dtype=wp.int32, device=device),
+        still,
+        wp.array(corners, dtype=wp.vec3i, device=device),
+        wp.array(of_vertices, dtype=wp.int32, device=device),
+    )
+
+
 def find_receivers(
     positions: wp.array,
     normals: wp.array,
     faces: wp.array,
     fragments: Fragments,
-    keeps_vertex: np.ndarray,
+    numbering: Numbering,
     wants_samples: np.ndarray,
-    is_still: np.ndarray | None = None,
-    order: np.ndarray | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -110,12 +158,9 @@ def find_receivers(
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
         fragments: What each sample sees, one batch for all or one each.
-        keeps_vertex: Which vertices are receivers, bool of shape [vertex]: all of those of a face that a sample sees,
-            unless the face wants samples; see :func:`seen_vertices`. Where fragments have sides, their backs follow.
+        numbering: The vertices that are receivers: all of those of a face that a sample sees, unless the face wants
+            samples; with their backs where fragments have sides.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
-        is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
-        order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
-            side. None for their own.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them.
@@ -123,32 +168,27 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
-    has_own = wants_samples.any()
-    if not has_own and keeps_vertex.all() and is_still is None and order is None and fragments.sides is None:
-        return Receivers(positions, normals, faces, constant(np.arange(len(keeps_vertex)), wp.int32, device), fragments)
-    count, corners, sides = positions.shape[1], faces.numpy(), fragments.face_ids
-    is_still = np.zeros(count, bool) if is_still is None else is_still
-    order = np.arange(count) if order is None else order
-    if fragments.sides is not None:
-        sides = fragments.sides
-        is_still, order = np.tile(is_still, 2), np.concatenate([order, order + count])
-        corners, wants_samples = np.concatenate([corners, corners + count]), np.tile(wants_samples, 2)
-    still, vertices = order[(keeps_vertex & is_still)[order]], order[(keeps_vertex & ~is_still)[order]]
-    vertex_count = len(still) + len(vertices)
-    samples = np.empty((len(sides), 0), int)
-    batch_count = len(positions)
-    receiver_of_vertex = np.full(len(keeps_vertex), -1, np.int32)
-    receiver_of_vertex[np.concatenate([still, vertices])] = np.arange(vertex_count)
-    receiver_faces = receiver_of_vertex[corners]
+    vertices, still, receiver_faces, of_vertices = numbering
+    sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
+    samples, own_count = None, 0
+    batch_count = len(positions)
+    has_own = wants_samples.any()
     if has_own:
         batch_count = common_batch({"positions": positions, "fragments": sides})
-        samples, receiver_fragments = _own_samples(receiver_fragments, wants_samples)
-        own_faces = np.repeat(vertex_count + np.arange(samples.shape[1])[:, None], 3, axis=1)
-        receiver_faces = np.concatenate([receiver_faces, own_faces])
+        own_samples, receiver_fragments = _own_samples(
+            receiver_fragments, np.resize(wants_samples, len(receiver_faces))
+        )
+        own_count, samples = own_samples.shape[1], wp.array(own_samples, dtype=wp.int32, device=device)
+        own_faces = np.repeat(numbering.receiver_count + np.arange(own_count)[:, None], 3, axis=1)
+        own_faces = np.concatenate([receiver_faces.numpy(), own_faces])
+        receiver_faces = wp.array(own_faces, dtype=wp.vec3i, device=device)
+    elif vertices is None:
+        return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
+    vertices = of_vertices if vertices is None else vertices
     variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
     requires_grad = any(array.requires_grad for array in variables)
-    shape = batch_count, len(vertices) + samples.shape[1]
+    shape = batch_count, vertices.size + own_count
     points, point_normals = (
         wp.empty(shape, dtype=wp.vec3, device=device, requires_grad=requires_grad) for _ in range(2)
     )
@@ -161,20 +201,13 @@ def find_receivers(
             faces,
             rows(sides),
             rows(fragments.barycentrics) if has_own else None,
-            wp.array(vertices, dtype=wp.int32, device=device),
-            wp.array(samples, dtype=wp.int32, device=device),
+            vertices,
+            samples,
         ],
         outputs=[points, point_normals],
         device=device,
     )
-    return Receivers(
-        points,
-        point_normals,
-        wp.array(receiver_faces, dtype=wp.vec3i, device=device),
-        wp.array(receiver_of_vertex, dtype=wp.int32, device=device),
-        receiver_fragments,
-        still,
-    )
+    return Receivers(points, point_normals, receiver_faces, of_vertices, receiver_fragments, still)
 
 
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
@@ -186,21 +219,21 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         vertex_count: Number of vertices.
 
     Returns:
-        bool of shape [vertex]: what any instance sees, so that all have as many receivers. Where fragments have sides,
-        their backs follow.
+        bool of shape [1, vertex], or [2, vertex] where fragments have sides: what any instance sees, so that all have
+        as many receivers.
     """
-    corners, edges, seen = silhouettes.faces.numpy(), silhouettes.edges.numpy(), fragments.face_ids.numpy()
-    takes_part = np.zeros(vertex_count, bool)
-    if fragments.sides is not None:
-        seen = fragments.sides.numpy()
+    faces, edges, face_count = silhouettes.faces.numpy(), silhouettes.edges.numpy(), len(silhouettes.faces)
+    sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
+    is_seen = np.zeros(side_count * face_count + 1, bool)
+    is_seen[sides.numpy()] = True  # the last item is for samples that see none
+    takes_part = np.zeros((side_count, vertex_count), bool)
+    side_of_edge = np.zeros(edges.shape, int)
+    if side_count == 2:
         # an edge is seen from the side that one of the pixels beside it sees, each of which has an entry for it
-        is_back = seen.ravel()[silhouettes.pixels.numpy()] >= len(corners)
-        edges = np.where((edges >= 0) & is_back[:, None, None], edges + vertex_count, edges)
-        corners, takes_part = np.concatenate([corners, corners + vertex_count]), np.tile(takes_part, 2)
-    is_seen = np.zeros(len(corners) + 1, bool)
-    is_seen[seen] = True  # the last item is for samples that see none
-    takes_part[corners[is_seen[:-1]]] = True
-    takes_part[edges[edges >= 0]] = True
+        side_of_edge[:] = (sides.numpy().ravel()[silhouettes.pixels.numpy()] >= face_count)[:, None, None]
+    for side in range(side_count):
+        takes_part[side, faces[is_seen[side * face_count : (side + 1) * face_count]]] = True
+    takes_part[side_of_edge[edges >= 0], edges[edges >= 0]] = True
     return takes_part
 
 

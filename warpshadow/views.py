@@ -16,7 +16,7 @@ from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.plan import CAMERAS, SPHERES, VERTICES, Decision, Ledger, ViewFacts, ViewPlan, plan_view
 from warpshadow.raster import Fragments, rasterize
-from warpshadow.receivers import Receivers, find_receivers, seen_vertices
+from warpshadow.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.sides import find_sides
 from warpshadow.silhouette import Silhouettes, find_silhouettes
 from warpshadow.still import Still
@@ -268,24 +268,36 @@ class Viewer:
         with timed(plan.normals, [geometry.positions]):
             normals = self._normals(geometry, still)
         with timed(plan.receivers, [geometry.positions, fragments.barycentrics]):
-            body_of_vertex, order = assembly.body_of_vertex, None
-            keeps_vertex = ~self.samples_receive[body_of_vertex]
-            if fragments.sides is not None:
-                keeps_vertex = np.concatenate([keeps_vertex, keeps_vertex & assembly.is_two_sided[body_of_vertex]])
-            if is_readable(assembly.device):  # a GPU would have to wait until the host knows what is seen
-                keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, len(body_of_vertex))
-                order = assembly.vertex_order
-            receivers = find_receivers(
-                geometry.positions,
-                normals,
-                assembly.faces,
-                fragments,
-                keeps_vertex,
-                self.samples_receive[assembly.body_of_face],
-                None if still is None else still.is_still,
-                order,
-            )
+            numbering = self._numbering(fragments, silhouettes, still)
+            wants_samples = self.samples_receive[assembly.body_of_face]
+            receivers = find_receivers(geometry.positions, normals, assembly.faces, fragments, numbering, wants_samples)
         return View(geometry, receivers, clip_positions, fragments, silhouettes, varying, still)
+
+    def _numbering(self, fragments: Fragments, silhouettes: Silhouettes, still: Still | None) -> Numbering:
+        """The vertices that are receivers: those that are seen, or all where that cannot be read without waiting."""
+        assembly = self.assembly
+        has_backs = fragments.sides is not None
+        if is_readable(assembly.device):
+            keeps_vertex = self._can_receive[: 1 + has_backs]
+            keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
+            is_still = None if still is None else still.is_still
+            return number_receivers(assembly.faces, keeps_vertex, is_still, assembly.vertex_order)
+        if still is None:
+            return self._numberings[has_backs]
+        return number_receivers(assembly.faces, self._can_receive[: 1 + has_backs], still.is_still)
+
+    @functools.cached_property
+    def _can_receive(self) -> np.ndarray:
+        """Vertices that may be receivers, and those whose backs may be, bool of shape [2, vertex]."""
+        body_of_vertex = self.assembly.body_of_vertex
+        receives = ~self.samples_receive
+        return np.stack([receives[body_of_vertex], (receives & self.assembly.is_two_sided)[body_of_vertex]])
+
+    @functools.cached_property
+    def _numberings(self) -> tuple[Numbering, Numbering]:
+        """Of all vertices, and of all with their backs; a first call makes both, so that a capture finds them."""
+        faces, can_receive = self.assembly.faces, self._can_receive
+        return number_receivers(faces, can_receive[:1]), number_receivers(faces, can_receive)
 
     def _clipped(self, geometry: Geometry, clip_matrices: wp.array, still: Still | None) -> wp.array:
         """Clip positions; those of what stands still are kept while the cameras do."""
