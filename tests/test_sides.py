@@ -391,7 +391,7 @@ def test_a_ground_that_goes_on_to_the_horizon_shows_its_front_alone():
         camera = ws.Camera.look_at((0, 0.01, 2), (0, 0, -1), size=(64, 64))
         body = ws.Body(ws.plane(size, 64), blockers=0, translation=(3e-3 * size, 0, 0))
         scene = ws.Scene((body,), SKY, camera, ws.Visibility("none"))
-        assert Renderer(scene).scene_view.fragments.sides is None
+        assert Renderer(scene).view().fragments.sides is None
 
 
 def test_a_surface_is_closed_where_two_faces_share_each_edge_and_look_outward():
