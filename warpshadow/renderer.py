@@ -51,6 +51,9 @@ class Renderer:
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
+
+    Threads may share it: their calls come one after another. Copied or pickled, it takes along what it was made of, and
+    the copy computes the rest anew when it is asked for.
     """
 
     def __init__(
@@ -66,6 +69,13 @@ class Renderer:
             from warpshadow.tuning import resolved  # which renders to find out
 
             scene = resolved(scene, device=device, progress=progress)
+        self._arguments = {
+            "scene": scene,
+            "cameras": cameras,
+            "device": str(wp.get_device(device)),
+            "basis": basis,
+            "progress": progress,
+        }
         self.scene = scene
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
@@ -77,6 +87,14 @@ class Renderer:
         self._lighting = Lighting(self.assembly, basis, self._ledger, progress=progress)
         self._reflectance = Reflectance(self.assembly, self._ledger)
         self.basis = self._lighting.basis
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made of."""
+        return self._arguments
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make it anew."""
+        self.__init__(**state)  # type: ignore[misc]
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 

@@ -41,6 +41,8 @@ class TorchRenderer(torch.nn.Module):
 
     Attributes:
         renderer: The :class:`warpshadow.renderer.Renderer` whose methods it calls.
+
+    Threads may share it, and it can be copied, pickled and saved, as :class:`warpshadow.renderer.Renderer` can.
     """
 
     def __init__(
