@@ -445,3 +445,30 @@ def test_parts_of_receivers_need_little_memory(monkeypatch):
     Renderer(scene).render()
     assert len(sizes) > 2
     assert max(sizes) <= 64
+
+
+# ---------------------------------------------------------------------------------------------- views and geometry
+
+
+def test_a_view_of_another_renderer_is_refused(device):
+    """It keeps what the other computed in its light and of its reflectance."""
+    scene = scene_of("none", ball(), light=dome())
+    first = Renderer(scene, device=device)
+    second = Renderer(dataclasses.replace(scene, light=sunny()), device=device)
+    view = first.view()
+    image = first.draw(view=view).numpy()
+    calls = second.draw, second.shade, second.reflect, second.explain, second.body_ids
+    for call in calls:
+        with pytest.raises(ValueError, match="^view: got one that another renderer made, expected one of this"):
+            call(view=view)
+    np.testing.assert_array_equal(first.draw(view=view).numpy(), image)
+
+
+def test_a_plain_tuple_is_a_geometry(device):
+    renderer = Renderer(scene_of("directional", ball(), light=dome()), device=device)
+    plain = tuple(renderer.assembly.placed())
+    image = renderer.draw().numpy()
+    np.testing.assert_array_equal(renderer.draw(view=renderer.view(plain)).numpy(), image)
+    for wrong in (plain[:2], plain[0], "ball"):
+        with pytest.raises(ValueError, match="^geometry: got .*, expected a Geometry, as placed and deformed return"):
+            renderer.view(wrong)

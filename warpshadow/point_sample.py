@@ -159,7 +159,8 @@ def at_receivers(view: View, renderer: Renderer, points: np.ndarray, normals: np
         points=wp.array(points, dtype=wp.vec3, device=renderer.device),
         normals=wp.array(normals, dtype=wp.vec3, device=renderer.device),
     )
-    return view._replace(geometry=Geometry(*renderer.geometry), receivers=at_points)
+    geometry = Geometry(*renderer.geometry)
+    return view._replace(geometry=geometry, receivers=at_points, assembly=renderer.assembly)
 
 
 def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:

@@ -135,9 +135,17 @@ class Renderer:
 
     def body_ids(self, view: View | None = None) -> np.ndarray:
         """Body that each sample sees, -1 for none, shape [batch, height, width]."""
-        view = self.scene_view if view is None else view
+        view = self._own(view)
         face_ids = view.fragments.face_ids.numpy()
         return np.where(face_ids >= 0, self.assembly.body_of_face[face_ids], -1)
+
+    def _own(self, view: View | None) -> View:
+        """A view of this renderer, by default the scene's; those of others keep what others computed."""
+        if view is None:
+            return self.scene_view
+        if view.assembly is not self.assembly:
+            raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
+        return view
 
     def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
@@ -190,7 +198,7 @@ class Renderer:
 
         Differentiable: light, view.
         """
-        return self._lighting.shade(self.scene_view if view is None else view, light)
+        return self._lighting.shade(self._own(view), light)
 
     @property
     def albedo(self) -> wp.array:
@@ -218,7 +226,7 @@ class Renderer:
 
         Differentiable: albedo, textures, view.
         """
-        return self._reflectance.find(self.scene_view if view is None else view, albedo, textures)
+        return self._reflectance.find(self._own(view), albedo, textures)
 
     def seen_texels(self, number: int) -> np.ndarray:
         """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
@@ -262,7 +270,7 @@ class Renderer:
 
         Differentiable: light, albedo, textures, view.
         """
-        view = self.scene_view if view is None else view
+        view = self._own(view)
         lit = self.shade(light, view)
         reflected = self.reflect(albedo, textures, view)
         plan, timed = self._plan_image(view.facts, light, albedo, textures), self._ledger.timed
@@ -332,7 +340,7 @@ class Renderer:
                 geometry = Geometry(*arrays, moving=geometry.moving)
             prospect = self._viewer.plan(geometry, _as_array(clip_matrices, wp.mat44, 1))
         else:
-            prospect = Prospect(None, view.facts, view, view.still)
+            prospect = Prospect(None, self._own(view).facts, view, view.still)
         _, facts, view, still = prospect
         plans = [
             prospect.plan,

@@ -48,6 +48,7 @@ class _ViewFields(NamedTuple):
     clip_positions: wp.array
     fragments: Fragments
     silhouettes: Silhouettes
+    assembly: Assembly
     varying: tuple[str, ...] = ()
     still: Still | None = None
 
@@ -61,6 +62,7 @@ class View(_ViewFields):
         clip_positions: Of the vertices, vec4 of shape [batch, vertex].
         fragments: What each sample sees.
         silhouettes: Where neighboring samples see different surfaces.
+        assembly: The renderer's that sees it and keeps with it what it computes from it; no other draws it.
         varying: Which of vertices, spheres and cameras require a gradient.
         still: The bodies that stand still among moving ones; None where any may move.
     """
@@ -271,7 +273,7 @@ class Viewer:
             numbering = self._numbering(fragments, silhouettes, still)
             wants_samples = self.samples_receive[assembly.body_of_face]
             receivers = find_receivers(geometry.positions, normals, assembly.faces, fragments, numbering, wants_samples)
-        return View(geometry, receivers, clip_positions, fragments, silhouettes, varying, still)
+        return View(geometry, receivers, clip_positions, fragments, silhouettes, assembly, varying, still)
 
     def _numbering(self, fragments: Fragments, silhouettes: Silhouettes, still: Still | None) -> Numbering:
         """The vertices that are receivers: those that are seen, or all where that cannot be read without waiting."""
