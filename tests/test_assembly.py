@@ -94,6 +94,39 @@ def test_bodies_that_do_not_move_stand_where_the_scene_has_them(device, moving, 
             assert np.abs(gradient[:, number] - expected).max() < 50 * FLOAT32  # sums of some dozens
 
 
+def test_a_geometry_with_other_positions_remembers_what_moves(device):
+    geometry = two_bodies(device).placed(moving=[1])
+    assert geometry._replace(positions=None).moving == (1,)
+    assert geometry._replace(moving=[0, 1]).moving == (0, 1)
+    assert geometry._replace(radii=None)[:2] == geometry[:2]
+
+
+def test_what_is_handed_out_is_not_the_assemblys_own_memory(device):
+    assembly = two_bodies(device)
+    kept = [[array.numpy().copy() for array in own] for own in (assembly.rest, assembly.scene_geometry)]
+    handed_out = [
+        assembly.placed(),
+        assembly.placed(moving=[]),
+        assembly.placed(moving=[0]),
+        assembly.deformed(0),
+        assembly.deformed(0, centers=wp.clone(assembly.rest.centers[:, : assembly.first_sphere[1]])),
+    ]
+    for geometry in handed_out:
+        for array in geometry:
+            array.fill_(-7.0)
+    for before, own in zip(kept, (assembly.rest, assembly.scene_geometry), strict=True):
+        for values, array in zip(before, own, strict=True):
+            np.testing.assert_array_equal(array.numpy(), values)
+
+
+def test_a_body_alone_is_not_deformed_in_the_memory_of_the_argument(device):
+    body = two_bodies(device).scene.bodies[0]
+    scene = ws.Scene([body], ws.EnvironmentMap.constant(), ws.Camera.look_at((0, 0, 9), (0, 0, 0), size=(8, 8)))
+    positions = wp.array(body.mesh.positions[None], dtype=wp.vec3, device=device)
+    Assembly(scene, device=device).deformed(0, positions).positions.fill_(-7.0)
+    np.testing.assert_array_equal(positions.numpy()[0], body.mesh.positions)
+
+
 def test_faces_belong_to_the_vertices_of_their_body(device):
     assembly = two_bodies(device)
     faces, body_of_face = assembly.faces.numpy(), assembly.body_of_face
@@ -116,7 +149,7 @@ def test_deforming_a_body_leaves_the_other_as_it_is(device, number, verified_tap
     )
     with wp.Tape() as tape:
         rest = assembly.deformed(number, positions, centers)
-    assert rest.radii is assembly.rest.radii
+    np.testing.assert_array_equal(rest.radii.numpy(), assembly.rest.radii.numpy())
     for got, given, kept, place in (
         (rest.positions, positions, assembly.rest.positions, vertices),
         (rest.centers, centers, assembly.rest.centers, spheres),

@@ -135,6 +135,24 @@ def test_writing_into_an_image_does_not_change_the_next_one():
             assert torch.equal(renderer(light), kept)
 
 
+def test_writing_into_a_geometry_does_not_change_the_next_image():
+    expected, renderer = TorchRenderer(small_scene())(), TorchRenderer(small_scene())
+    poses, centers = renderer.scene_poses(), torch.zeros(1, 3)
+    for geometry in (renderer.placed(*poses, moving=[]), renderer.deformed(0, centers=centers)):
+        for part in geometry:
+            part.add_(0.5)
+    assert not centers.any()
+    assert torch.equal(renderer(), expected)
+    assert torch.equal(renderer(geometry=renderer.placed(*poses)), expected)
+
+
+def test_a_plain_tuple_is_a_geometry(renderer):
+    placed = renderer.placed(*renderer.scene_poses())
+    assert torch.equal(renderer(geometry=tuple(placed)), renderer(geometry=placed))
+    with pytest.raises(ValueError, match="^geometry: got tuple of 2, expected a Geometry"):
+        renderer(geometry=placed[:2])
+
+
 # ---------------------------------------------------------------------------------------------- gradients
 
 

@@ -41,6 +41,28 @@ class Geometry(_GeometryArrays):
         self.moving = None if moving is None else tuple(sorted(set(moving)))
         return self
 
+    def _replace(self, **parts: Any) -> "Geometry":
+        """Exchange some of the arrays, or ``moving``, which else stays as it is."""
+        moving = parts.pop("moving", self.moving)
+        return Geometry(*super()._replace(**parts), moving=moving)
+
+
+def as_geometry(name: str, given: Any) -> Geometry:
+    """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
+
+    Raises:
+        ValueError: for anything else, by the name of the argument.
+    """
+    if isinstance(given, Geometry):
+        return given
+    if not isinstance(given, (tuple, list)) or len(given) != len(Geometry._fields):
+        count = f" of {len(given)}" if isinstance(given, (tuple, list)) else ""
+        raise ValueError(
+            f"{name}: got {type(given).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
+            f"tuple of {', '.join(Geometry._fields)}"
+        )
+    return Geometry(*given)
+
 
 class Assembly:
     """What all poses of a scene share: topology, and the bodies' shapes at rest, each in its own space.
@@ -165,7 +187,7 @@ class Assembly:
     def placed(
         self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[int] | None = None
     ) -> Geometry:
-        """Place the bodies in the world.
+        """Place the bodies in the world, in arrays of their own.
 
         Args:
             poses: Of each body, by default the scene's.
@@ -180,7 +202,7 @@ class Assembly:
         Differentiable: poses, rest.
         """
         poses = self.poses if poses is None else poses
-        rest = self.rest if rest is None else rest
+        rest = self.rest if rest is None else as_geometry("rest", rest)
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
         if moving is None or rest.moving is None:
             return Geometry(
@@ -257,7 +279,7 @@ class Assembly:
             rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
 
         Returns:
-            All bodies at rest, for :meth:`placed`.
+            All bodies at rest, for :meth:`placed`, in arrays of their own.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
@@ -265,7 +287,7 @@ class Assembly:
         Differentiable: positions, centers, radii, rest.
         """
         check.choice("number", number, range(len(self.scene.bodies)))
-        rest = self.rest if rest is None else rest
+        rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         return Geometry(
             _spliced("positions", rest.positions, positions, first_vertex),
@@ -310,7 +332,7 @@ def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
 def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
     """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
     if part is None:
-        return whole
+        return exchanged(whole, [], lambda *_: whole)
     first, end = place.tolist()
     check.shape(name, part.shape, ("batch", end - first))
     common_batch({"rest": whole, name: part})
@@ -326,18 +348,14 @@ def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callabl
         part_of: Makes what comes in place of a run, shape [batch, item], given its begin and end.
 
     Returns:
-        Shape [batch, item]; batches of 1 serve every instance of the others.
+        Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
 
     Differentiable: whole, where it is not exchanged, and parts.
     """
-    if not runs:
-        return whole
-    pieces, last = [], 0
+    pieces, last = [] if runs else [whole], 0
     for first, end in runs:
         pieces += [whole[:, last:first]] if first > last else []
         pieces.append(part_of(first, end))
         last = end
-    pieces += [whole[:, last:]] if last < whole.shape[1] else []
-    if len(pieces) == 1:
-        return pieces[0]
+    pieces += [whole[:, last:]] if runs and last < whole.shape[1] else []
     return concatenate(pieces, [piece.shape[1] for piece in pieces])

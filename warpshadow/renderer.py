@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import film
-from warpshadow.assembly import Assembly, Geometry
+from warpshadow.assembly import Assembly, Geometry, as_geometry
 from warpshadow.basis import Basis
 from warpshadow.camera import Camera
 from warpshadow.light import EnvironmentMap
@@ -124,7 +124,7 @@ class Renderer:
 
         Differentiable: geometry, clip_matrices.
         """
-        return self._viewer.see(geometry, clip_matrices)
+        return self._viewer.see(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
 
     @functools.cached_property
     def scene_view(self) -> View:
@@ -335,6 +335,7 @@ class Renderer:
         )
         if view is None:
             if geometry is not None:
+                geometry = as_geometry("geometry", geometry)
                 dtypes = wp.vec3, wp.vec3, wp.float32
                 arrays = (_as_array(array, dtype, 2) for array, dtype in zip(geometry, dtypes, strict=True))
                 geometry = Geometry(*arrays, moving=geometry.moving)

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from warpshadow import check, deform
-from warpshadow.assembly import Geometry
+from warpshadow.assembly import Geometry, as_geometry
 from warpshadow.basis import Basis
 from warpshadow.batch import common_batch
 from warpshadow.camera import Camera, compose_clip_matrices
@@ -91,6 +91,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: light, albedo, textures, geometry, clip_matrices; the README's table says how exactly.
         """
         renderer, bodies = self.renderer, self.renderer.scene.bodies
+        geometry = None if geometry is None else as_geometry("geometry", geometry)
         arguments = _Arguments(self.device, has_batch=renderer.has_camera_batch and clip_matrices is None)
         if isinstance(light, torch.Tensor):
             arguments.add("light", light, wp.vec3, (renderer.basis.size,))
@@ -147,7 +148,8 @@ class TorchRenderer(torch.nn.Module):
                 are those of their meshes. What ``rest`` deforms is among those that move.
 
         Returns:
-            Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one.
+            Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one; tensors of their
+            own, which may be written to.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
@@ -155,6 +157,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all.
         """
         assembly, count = self.renderer.assembly, len(self.renderer.scene.bodies)
+        rest = None if rest is None else as_geometry("rest", rest)
         scales = wp.to_torch(assembly.poses.scales) if scales is None else scales
         arguments = _Arguments(self.device)
         arguments.add("rotations", rotations, wp.mat33, (count,))
@@ -199,7 +202,7 @@ class TorchRenderer(torch.nn.Module):
             rest: All bodies at rest, by default as their meshes are.
 
         Returns:
-            All bodies at rest, for :meth:`placed`.
+            All bodies at rest, for :meth:`placed`; tensors of their own, which may be written to.
 
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
@@ -207,6 +210,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all.
         """
         assembly = self.renderer.assembly
+        rest = None if rest is None else as_geometry("rest", rest)
         parts = {"positions": positions, "centers": centers, "radii": radii}
         arguments = _Arguments(self.device)
         for (name, tensor), dtype in zip(parts.items(), _GEOMETRY_DTYPES, strict=True):
