@@ -5,7 +5,6 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow import assembly as assembly_module
 from warpshadow.assembly import Assembly, Geometry
 from warpshadow.deform import Poses
 
@@ -43,22 +42,6 @@ def test_placed_bodies_are_where_the_scene_has_them(device):
     ]
     assert np.abs(geometry.centers - np.concatenate([part.centers for part in placed])).max() < 4 * FLOAT32
     assert np.abs(geometry.radii - np.concatenate([part.radii for part in placed])).max() < FLOAT32
-
-
-def test_fits_of_spheres_are_beside_the_tape(device, monkeypatch):
-    """A pose that requires a gradient is often what asks for the spheres first."""
-    assembly = two_bodies(device)
-    tapes = []
-
-    def fitted(scene, **options):
-        tapes.append(wp._src.context.runtime.tape)
-        return [body.blockers for body in scene.bodies]
-
-    monkeypatch.setattr(assembly_module, "scene_blockers", fitted)
-    with wp.Tape() as tape:
-        assembly.placed()
-        assert wp._src.context.runtime.tape is tape
-    assert tapes == [None]
 
 
 @pytest.mark.parametrize("moving", [[0], [1], [], [1, 0]])

@@ -384,7 +384,7 @@ def test_poses_that_do_not_fit_are_refused(renderer, change, message):
 
 def test_rotations_of_the_three_kinds_are_rotations():
     generator = torch.Generator().manual_seed(0)
-    for count in (3, 4, 6):
+    for count in (3, 4, 6, 9):
         matrices = rotation_matrices(torch.randn(2, 5, count, generator=generator))
         assert matrices.shape == (2, 5, 3, 3)
         assert (matrices @ matrices.mT - torch.eye(3)).abs().max() < FLOAT32

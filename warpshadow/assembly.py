@@ -13,7 +13,7 @@ from warpshadow.blockers import scene_blockers
 from warpshadow.deform import DeformationGraph, Poses
 from warpshadow.order import z_order
 from warpshadow.scene import SPHERE_METHODS, Scene
-from warpshadow.tape import unrecorded
+from warpshadow.threads import one_at_a_time
 
 
 class _GeometryArrays(NamedTuple):
@@ -136,10 +136,10 @@ class Assembly:
         return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
 
     @functools.cached_property
+    @one_at_a_time
     def _spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
-        with unrecorded():
-            return scene_blockers(self.scene, device=self.device, progress=self._progress)
+        return scene_blockers(self.scene, device=self.device, progress=self._progress)
 
     @property
     def sphere_counts(self) -> np.ndarray:
@@ -184,6 +184,7 @@ class Assembly:
         """Where the scene has its bodies and their spheres; the batch is 1."""
         return self.placed()
 
+    @one_at_a_time
     def placed(
         self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[int] | None = None
     ) -> Geometry:
@@ -243,6 +244,7 @@ class Assembly:
                 runs.append((first, end))
         return runs
 
+    @one_at_a_time
     def graph(self, number: int, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
 
@@ -259,6 +261,7 @@ class Assembly:
             body.mesh.positions, self._spheres[number].centers, count=count, device=self.device
         )
 
+    @one_at_a_time
     def deformed(
         self,
         number: int,

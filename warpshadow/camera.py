@@ -22,6 +22,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.tape import launch
+from warpshadow.threads import one_at_a_time
 
 # Rotations read from a file are often rounded to six digits.
 _ROTATION_TOLERANCE = 1e-4
@@ -232,6 +233,7 @@ def _compose_clip_matrices(
     )  # fmt: skip
 
 
+@one_at_a_time
 def compose_clip_matrices(
     intrinsics: wp.array, rotations: wp.array, translations: wp.array, *, size: tuple[int, int], near: float = 0.01
 ) -> wp.array:

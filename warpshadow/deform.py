@@ -11,7 +11,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch
-from warpshadow.tape import launch
+from warpshadow.tape import launch, record_adjoint
+from warpshadow.threads import one_at_a_time
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
@@ -100,6 +101,7 @@ _ROTATION_KERNELS = {
 }
 
 
+@one_at_a_time
 def rotation_matrices(parameters: wp.array) -> wp.array:
     """Make rotation matrices of free parameters.
 

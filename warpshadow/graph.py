@@ -24,6 +24,7 @@ from typing import Generic, TypeVar
 import warp as wp
 
 from warpshadow.constants import collected
+from warpshadow.tape import recorded
 
 Result = TypeVar("Result")
 
@@ -95,7 +96,7 @@ def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) 
     def evaluate() -> wp.array:
         for variable in variables:
             variable.grad.zero_()
-        with wp.Tape() as tape:
+        with recorded() as tape:
             value = loss()
         tape.backward(value)
         return value

@@ -23,6 +23,8 @@ from warpshadow.raster import Fragments
 from warpshadow.reflectance import Reflectance
 from warpshadow.scene import AUTO, Scene
 from warpshadow.silhouette import find_contrasts, smooth_silhouettes
+from warpshadow.tape import unrecorded
+from warpshadow.threads import one_at_a_time
 from warpshadow.views import Prospect, View, Viewer
 
 COARSE_FACE = 400
@@ -99,8 +101,9 @@ class Renderer:
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
     @property
+    @one_at_a_time
     def geometry(self) -> Geometry:
-        """Where the scene has its bodies and their spheres; the batch is 1."""
+        """Where the scene has its bodies and their spheres; the batch is 1. Not to be written to."""
         return self.assembly.scene_geometry
 
     @property
@@ -108,6 +111,7 @@ class Renderer:
         """The cameras, mat44 of shape [camera]."""
         return self._viewer.clip_matrices
 
+    @one_at_a_time
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
@@ -133,6 +137,7 @@ class Renderer:
         self._warn_of_coarse_faces(view.fragments)
         return view
 
+    @one_at_a_time
     def body_ids(self, view: View | None = None) -> np.ndarray:
         """Body that each sample sees, -1 for none, shape [batch, height, width]."""
         view = self._own(view)
@@ -169,6 +174,7 @@ class Renderer:
     # ------------------------------------------------------------------------------------------ light and reflectance
 
     @functools.cached_property
+    @one_at_a_time
     def transfer(self) -> wp.array:
         """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
@@ -181,6 +187,7 @@ class Renderer:
         """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [view, receiver]."""
         return self.shade()
 
+    @one_at_a_time
     def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
         """Light the receivers of a view.
 
@@ -205,6 +212,7 @@ class Renderer:
         """Reflectance that the scene's samples see, vec3 of shape [camera, height, width]."""
         return self.reflect()
 
+    @one_at_a_time
     def reflect(
         self,
         albedo: Sequence[wp.array | None] | None = None,
@@ -228,6 +236,7 @@ class Renderer:
         """
         return self._reflectance.find(self._own(view), albedo, textures)
 
+    @one_at_a_time
     def seen_texels(self, number: int) -> np.ndarray:
         """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
 
@@ -245,6 +254,7 @@ class Renderer:
 
     # ------------------------------------------------------------------------------------------ image
 
+    @one_at_a_time
     def draw(
         self,
         light: Light | None = None,
@@ -298,11 +308,13 @@ class Renderer:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or
             [camera, height, width, 4] where cameras were given; the background is 0.
         """
-        images = self.draw(light).numpy().copy()
+        with unrecorded():
+            images = self.draw(light).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
     # ------------------------------------------------------------------------------------------ what runs
 
+    @one_at_a_time
     def explain(
         self,
         light: Any = None,

@@ -20,6 +20,8 @@ from warpshadow.deform import Poses, Vec6
 from warpshadow.light import EnvironmentMap
 from warpshadow.renderer import Renderer
 from warpshadow.scene import Scene
+from warpshadow.tape import recorded, unrecorded
+from warpshadow.threads import one_at_a_time, one_call
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6}
 _GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
@@ -58,6 +60,7 @@ class TorchRenderer(torch.nn.Module):
         self.renderer = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
         self.device = torch.device(wp.device_to_torch(self.renderer.device))
 
+    @one_at_a_time
     def forward(
         self,
         light: torch.Tensor | EnvironmentMap | None = None,
@@ -127,6 +130,7 @@ class TorchRenderer(torch.nn.Module):
 
         return arguments.apply(draw)
 
+    @one_at_a_time
     def placed(
         self,
         rotations: torch.Tensor,
@@ -182,6 +186,7 @@ class TorchRenderer(torch.nn.Module):
         poses = self.renderer.assembly.poses
         return tuple(wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales))
 
+    @one_at_a_time
     def deformed(
         self,
         number: int,
@@ -273,7 +278,7 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     """
     check.choice("parameters: last dimension", parameters.shape[-1], _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
-    rows = parameters.reshape(1, -1, parameters.shape[-1])
+    rows = parameters.reshape(1, -1, *dtype._shape_)
     matrices = apply(deform.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
     return matrices.reshape(*parameters.shape[:-1], 3, 3)
 
@@ -335,7 +340,7 @@ def apply(
 
     Args:
         function: Takes an array for each tensor and returns an array, or a tuple of them; what it launches is recorded
-            on a tape if a tensor requires a gradient.
+            on a tape of this thread's if a tensor requires a gradient.
         tensors: Float32; contiguous or not. Items of a dtype lie in the last dimensions: a [batch, vertex, 3] tensor
             is an array of vec3 of shape [batch, vertex].
         dtypes: Warp's dtype of each.
@@ -368,7 +373,8 @@ class _WarpFunction(torch.autograd.Function):
             wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=is_wanted)
             for tensor, dtype, is_wanted in zip(tensors, dtypes, wants, strict=True)
         ]
-        with _current_stream(device), wp.Tape() as tape:
+        # streams are the device's, as Warp has it, not a thread's
+        with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
             results = function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
         outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
@@ -383,7 +389,7 @@ class _WarpFunction(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients: torch.Tensor):
         ctx.saved_tensors  # noqa: B018
-        with _current_stream(gradients[0].device):
+        with one_call, _current_stream(gradients[0].device), unrecorded():
             # copies, since memory shared with torch is reused behind the tape's back
             for result, gradient in zip(ctx.results, gradients, strict=True):
                 if result.requires_grad:

@@ -26,6 +26,8 @@ from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
+from warpshadow.tape import unrecorded
+from warpshadow.threads import one_at_a_time
 
 ALGORITHM_VERSION = 3
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
@@ -50,6 +52,7 @@ class SphereFit(NamedTuple):
     report: FitReport
 
 
+@one_at_a_time
 def fit_spheres(
     mesh: Mesh,
     count: int = 64,
@@ -95,7 +98,8 @@ def fit_spheres(
         raise ValueError(f"error: got {error!r}, expected a positive number such as 0.05, or None")
     job, middle, diagonal = _job(mesh, seed, steps if refine else 0, wp.get_device(device))
     fit = partial(_cached_fit if cache else _fit, job, progress)
-    balls, report = fit(int(count)) if error is None else _search(fit, error)
+    with unrecorded():
+        balls, report = fit(int(count)) if error is None else _search(fit, error)
     balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
     spheres = Spheres(balls[:, :3] * diagonal + middle, balls[:, 3] * diagonal)
     return SphereFit(spheres, report)
