@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.assembly import Assembly, Geometry
@@ -48,7 +49,8 @@ def test_placed_bodies_are_where_the_scene_has_them(device):
 def test_bodies_that_do_not_move_stand_where_the_scene_has_them(device, moving, verified_tape):
     assembly = two_bodies(device)
     rng = np.random.default_rng(5)
-    arrays = rng.normal(size=(3, 2, 3, 3)), rng.normal(size=(3, 2, 3)), rng.uniform(0.5, 2, (3, 2))
+    rotations = Rotation.random(6, random_state=5).as_matrix().reshape(3, 2, 3, 3)
+    arrays = rotations, rng.normal(size=(3, 2, 3)), rng.uniform(0.5, 2, (3, 2))
     dtypes = wp.mat33, wp.vec3, wp.float32
     poses = Poses(
         *(

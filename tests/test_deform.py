@@ -36,6 +36,12 @@ def sixd_twin(columns):
     return np.stack([x, y, np.cross(x, y)], axis=-1)
 
 
+def nearest_twin(matrices):
+    u, _, vt = np.linalg.svd(matrices.reshape(*matrices.shape[:-1], 3, 3))
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return u @ vt
+
+
 TWINS = {
     "quaternion": (wp.vec4, 4, lambda q: Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)),
     "axis-angle": (
@@ -44,6 +50,7 @@ TWINS = {
         lambda v: Rotation.from_rotvec(v.reshape(-1, 3)).as_matrix().reshape(*v.shape[:-1], 3, 3),
     ),
     "columns": (deform.Vec6, 6, sixd_twin),
+    "matrix": (wp.mat33, 9, nearest_twin),
 }
 
 
@@ -55,14 +62,28 @@ def test_rotations_and_their_gradients_are_those_of_the_twin(kind, device, verif
     if kind == "axis-angle":
         parameters[0] *= [[1e-9], [1e-3], [0.3], [2.0]]  # both sides of the series, and near zero
     weights = rng.normal(size=(3, 4, 3, 3))
-    array = put(parameters, dtype, device)
+    array = put(parameters.reshape(3, 4, *dtype._shape_), dtype, device)
     with wp.Tape() as tape:
         rotations = deform.rotation_matrices(array)
     np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)
     rotations.grad.assign(weights.astype(np.float32))
     tape.backward()
     expected = differences(lambda p: np.sum(weights * twin(p)), parameters)
-    assert np.linalg.norm(array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+    gradient = array.grad.numpy().reshape(parameters.shape)
+    assert np.linalg.norm(gradient - expected) < GRADIENT * np.linalg.norm(expected)
+
+
+def test_a_rotation_is_nearest_to_itself_with_a_finite_gradient(device):
+    """Its singular values are equal, by whose differences the adjoint of a decomposition divides."""
+    rotations, weights = Rotation.random(8, random_state=0).as_matrix(), np.random.default_rng(1).normal(size=(8, 9))
+    array = put(rotations[None], wp.mat33, device)
+    with wp.Tape() as tape:
+        nearest = deform.rotation_matrices(array)
+    np.testing.assert_allclose(nearest.numpy()[0], rotations, atol=FLOAT32)
+    nearest.grad.assign(weights.reshape(1, 8, 3, 3).astype(np.float32))
+    tape.backward()
+    expected = differences(lambda p: np.sum(weights.reshape(8, 3, 3) * nearest_twin(p)), rotations.reshape(8, 9))
+    assert np.linalg.norm(array.grad.numpy().reshape(8, 9) - expected) < GRADIENT * np.linalg.norm(expected)
 
 
 def test_no_rotation_is_the_identity_with_a_finite_gradient(device):
@@ -76,20 +97,21 @@ def test_no_rotation_is_the_identity_with_a_finite_gradient(device):
 
 
 @pytest.mark.parametrize("length", [1e-17, 1e-9, 1.0, 1e9, 1e17])
-@pytest.mark.parametrize("kind", ["quaternion", "columns"])
+@pytest.mark.parametrize("kind", ["quaternion", "columns", "matrix"])
 def test_rotations_and_their_gradients_do_not_depend_on_the_length_of_parameters(kind, length, device):
     """But that gradients are as much longer as parameters are shorter. Squares of these lengths overflow float32."""
     dtype, size, twin = TWINS[kind]
     rng = np.random.default_rng(5)
     parameters, weights = rng.normal(size=(1, 6, size)), rng.normal(size=(1, 6, 3, 3))
-    array = put(length * parameters, dtype, device)
+    array = put(length * parameters.reshape(1, 6, *dtype._shape_), dtype, device)
     with wp.Tape() as tape:
         rotations = deform.rotation_matrices(array)
     np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)
     rotations.grad.assign(weights.astype(np.float32))
     tape.backward()
     expected = differences(lambda p: np.sum(weights * twin(p)), parameters)
-    assert np.linalg.norm(length * array.grad.numpy() - expected) < GRADIENT * np.linalg.norm(expected)
+    gradient = length * array.grad.numpy().reshape(parameters.shape)
+    assert np.linalg.norm(gradient - expected) < GRADIENT * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("angle", [1e-5, 1e-3])
@@ -130,20 +152,23 @@ def test_axis_angles_of_any_length_are_rotations_with_finite_gradients(angle, de
         ([0, 0, 0, 0, 1, 0], deform.Vec6, "got 1 columns shorter than 1e-18"),
         ([0, 1, 0, 0, 0, 0], deform.Vec6, "got 1 columns shorter than 1e-18"),
         ([1, 2, 3, -2, -4, -6], deform.Vec6, r"got 1 pairs of parallel columns \(first at index \(1, 2\)\)"),
+        (np.zeros((3, 3)), wp.mat33, "got 1 matrices smaller than 1e-18"),
+        (np.ones((3, 3)), wp.mat33, "got 1 matrices as near to several rotations"),
+        (np.diag([-1, 1, 1]), wp.mat33, r"got 1 matrices as near to several rotations, .* at index \(1, 2\)"),
         ([np.nan, 0, 0, 1], wp.vec4, r"got 1 NaN or Inf values \(first at index \(1, 2, 0\)\)"),
         ([0, np.inf, 0], wp.vec3, "got 1 NaN or Inf values"),
         ([0, 1e19, 0], wp.vec3, "got 1 values out of range"),
     ],
 )
 def test_parameters_of_no_rotation_are_refused(values, dtype, message, device):
-    parameters = np.random.default_rng(6).normal(size=(2, 3, len(values)))
+    parameters = np.random.default_rng(6).normal(size=(2, 3, *np.shape(values)))
     parameters[1, 2] = values
     with pytest.raises(ValueError, match=f"^parameters: {message}"):
         deform.rotation_matrices(put(parameters, dtype, device))
 
 
 def test_rotations_of_another_type_are_refused(device):
-    with pytest.raises(ValueError, match="parameters: got dtype vec2f?, expected vec4, vec3 or deform.Vec6"):
+    with pytest.raises(ValueError, match="parameters: got dtype vec2f?, expected vec4, vec3, deform.Vec6 or mat33"):
         deform.rotation_matrices(wp.zeros((1, 1), dtype=wp.vec2, device=device))
 
 
@@ -255,7 +280,7 @@ def test_too_few_nodes_are_refused():
 def test_poses_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, device):
     values = {
         "rest": np.ones((1, 2, 3)),
-        "rotations": np.ones((1, 1, 3, 3)),
+        "rotations": np.eye(3)[None, None].copy(),
         "translations": np.ones((1, 1, 3)),
         "scales": np.ones((1, 1)),
     }
@@ -263,7 +288,7 @@ def test_poses_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, d
     dtypes = wp.vec3, wp.mat33, wp.vec3, wp.float32
     rest, *similarity = (put(v, dtype, device) for v, dtype in zip(values.values(), dtypes, strict=True))
     members = wp.zeros(2, dtype=wp.int32, device=device)
-    with pytest.raises(ValueError, match=f"^{name}: got 1 (NaN or Inf values|values out of range)"):
+    with pytest.raises(ValueError, match=f"^{name}: got 1 (NaN or Inf values|values out of range|matrices that)"):
         deform.Poses(*similarity).points(rest, members)
 
 

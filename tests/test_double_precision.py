@@ -84,11 +84,11 @@ def test_vertex_normals(double, device, check):
     check(lambda p: double("mesh").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
 
 
-@pytest.mark.parametrize("kind", ["quaternion", "axis-angle", "columns"])
+@pytest.mark.parametrize("kind", ["quaternion", "axis-angle", "columns", "matrix"])
 def test_rotation_matrices(kind, double, device, check):
     deform = double("deform")
-    dtype, size = {"quaternion": (wp.vec4d, 4), "axis-angle": (wp.vec3d, 3), "columns": (deform.Vec6, 6)}[kind]
-    parameters = random(0, 2, 3, size)
+    dtype = {"quaternion": wp.vec4d, "axis-angle": wp.vec3d, "columns": deform.Vec6, "matrix": wp.mat33d}[kind]
+    parameters = random(0, 2, 3, *dtype._shape_)
     if kind == "axis-angle":
         parameters[0] *= [[0], [1e-3], [0.3]]  # where the series is
     check(deform.rotation_matrices, (dtype, parameters))

@@ -382,7 +382,7 @@ def test_poses_that_do_not_fit_are_refused(renderer, change, message):
         renderer.placed(**poses)
 
 
-def test_rotations_of_the_three_kinds_are_rotations():
+def test_rotations_of_all_kinds_are_rotations():
     generator = torch.Generator().manual_seed(0)
     for count in (3, 4, 6, 9):
         matrices = rotation_matrices(torch.randn(2, 5, count, generator=generator))
@@ -391,6 +391,30 @@ def test_rotations_of_the_three_kinds_are_rotations():
         assert (torch.linalg.det(matrices) - 1).abs().max() < FLOAT32
     with pytest.raises(ValueError, match="parameters: last dimension: got 5"):
         rotation_matrices(torch.zeros(2, 5))
+
+
+def test_placed_refuses_what_is_no_rotation_and_takes_what_a_step_leaves_of_one(renderer):
+    rotations, translations, scales = renderer.scene_poses()
+    for wrong in (2 * rotations, 0.9 * rotations, rotations * torch.tensor([-1.0, 1, 1]), torch.zeros_like(rotations)):
+        with pytest.raises(ValueError, match=r"^rotations: got 2 matrices that are no rotations \(first at index"):
+            renderer.placed(wrong, translations, scales)
+    stepped = rotations + 0.01 * torch.sign(torch.randn(rotations.shape, generator=torch.Generator().manual_seed(0)))
+    renderer.placed(stepped, translations, scales)
+
+
+def test_nine_free_numbers_descend_to_a_rotation(renderer):
+    """The nearest rotation is taken of them, which need not be one; they are found by their gradient."""
+    wanted = rotation_matrices(torch.tensor([[0.3, -0.5, 0.2], [0.0, 0.1, 0.0]]))
+    _, translations, scales = renderer.scene_poses()
+    target = renderer.placed(wanted, translations, scales).positions
+    numbers = torch.eye(3).repeat(2, 1, 1).requires_grad_()
+    optimizer = torch.optim.Adam([numbers], lr=0.05)
+    for _ in range(200):
+        optimizer.zero_grad()
+        turns = rotation_matrices(numbers.flatten(-2))
+        (renderer.placed(turns, translations, scales).positions - target).square().mean().backward()
+        optimizer.step()
+    assert (turns - wanted).abs().max() < 1e-3
 
 
 # ---------------------------------------------------------------------------------------------- over time

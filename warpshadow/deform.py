@@ -11,7 +11,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch
-from warpshadow.tape import launch, record_adjoint
+from warpshadow.nearest_rotation import nearest_rotations
+from warpshadow.tape import launch
 from warpshadow.threads import one_at_a_time
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -21,6 +22,9 @@ SHORTEST = 1.0e-18
 
 PARALLEL = 1.0e-6
 """Columns at a smaller angle [radians] are parallel: what is between them is rounding."""
+
+NOT_ORTHONORMAL = 0.05
+"""Largest entry of |RᵀR − I| of what is taken for a rotation: a step of 0.01 in all nine numbers stays below."""
 
 _LARGEST_POSE = 1.0e12  # a product of scale, rotation and position is a float32
 _SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
@@ -109,25 +113,31 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
         parameters: Shape [batch, body]; the dtype says what they are:
             vec4, quaternions (x, y, z, w) of any length from 1e-18 on;
             vec3, axis-angle vectors [radians], smooth at 0;
-            :data:`Vec6`, the first two columns, of which Gram–Schmidt makes a rotation (Zhou et al. 2019).
+            :data:`Vec6`, the first two columns, of which Gram–Schmidt makes a rotation (Zhou et al. 2019);
+            mat33, any matrix, whose nearest rotation is taken.
 
     Returns:
         Rotations, mat33 of shape [batch, body].
 
     Raises:
         ValueError: for another dtype, for NaN, Inf and numbers beyond 1e18, and for what is no rotation: quaternions
-            and columns of length 0, and parallel columns. (Reading them waits for a GPU. While a CUDA graph is captured
-            that cannot be, and nothing is checked.)
+            and columns of length 0, parallel columns, and matrices that are as near to several rotations, as those of
+            rank 1 and mirrored rotations are. (Reading them waits for a GPU. While a CUDA graph is captured that cannot
+            be, and nothing is checked.)
 
     Differentiable: parameters.
     """
-    if parameters.dtype not in _ROTATION_KERNELS:
-        raise ValueError(f"parameters: got dtype {parameters.dtype.__name__}, expected vec4, vec3 or deform.Vec6")
+    if parameters.dtype not in (*_ROTATION_KERNELS, wp.mat33):
+        raise ValueError(
+            f"parameters: got dtype {parameters.dtype.__name__}, expected vec4, vec3, deform.Vec6 or mat33"
+        )
     _check_rotations(parameters)
+    if parameters.dtype is wp.mat33:
+        return nearest_rotations(parameters)
     rotations = wp.empty(
         parameters.shape, dtype=wp.mat33, device=parameters.device, requires_grad=parameters.requires_grad
     )
-    wp.launch(
+    launch(
         _ROTATION_KERNELS[parameters.dtype],
         dim=parameters.shape,
         inputs=[parameters],
@@ -148,6 +158,12 @@ def _check_rotations(parameters: wp.array) -> None:
     if parameters.dtype is wp.vec4:
         _refuse(np.linalg.norm(values, axis=-1) < SHORTEST, f"quaternions shorter than {SHORTEST:g}")
         return
+    if parameters.dtype is wp.mat33:
+        largest, middle, least = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
+        _refuse(largest < SHORTEST, f"matrices smaller than {SHORTEST:g}")
+        gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * least
+        _refuse(gaps < PARALLEL * largest, "matrices as near to several rotations, as mirrored ones are,")
+        return
     x, y = values[..., :3], values[..., 3:]
     lengths = np.linalg.norm(x, axis=-1), np.linalg.norm(y, axis=-1)
     _refuse(np.minimum(*lengths) < SHORTEST, f"columns shorter than {SHORTEST:g}")
@@ -160,6 +176,21 @@ def _refuse(faults: np.ndarray, what: str) -> None:
     if faults.any():
         place = tuple(int(i) for i in np.argwhere(faults)[0])
         raise ValueError(f"parameters: got {int(faults.sum())} {what} (first at index {place}), expected rotations")
+
+
+def _check_orthonormal(matrices: np.ndarray) -> None:
+    """Raise ValueError for matrices [batch, body, 3, 3] that scale, shear or mirror."""
+    check.finite("rotations", matrices)
+    products = np.swapaxes(matrices, -1, -2) @ matrices
+    gaps, determinants = np.abs(products - np.eye(3)).max(axis=(-1, -2)), np.linalg.det(matrices)
+    faults = (gaps > NOT_ORTHONORMAL) | (determinants < 0)
+    if faults.any():
+        place = tuple(int(i) for i in np.argwhere(faults)[0])
+        raise ValueError(
+            f"rotations: got {int(faults.sum())} matrices that are no rotations (first at index {place}: det R = "
+            f"{determinants[place]:.3g}, |RᵀR − I| = {gaps[place]:.3g}), expected det R > 0 and |RᵀR − I| up to "
+            f"{NOT_ORTHONORMAL}, as rotation_matrices makes them of any nine numbers; to resize bodies there are scales"
+        )
 
 
 # ---------------------------------------------------------------------------------------------- rigid bodies
@@ -204,12 +235,14 @@ class Poses:
     """Similarities x → s R x + t of every body of every instance.
 
     Args:
-        rotations: mat33 of shape [batch, body], from :func:`rotation_matrices`.
+        rotations: mat33 of shape [batch, body], from :func:`rotation_matrices`. Entries of RᵀR may differ from those of
+            the identity by 0.05.
         translations: Offsets [scene units], vec3 of shape [batch, body].
         scales: Factors, float32 of shape [batch, body].
 
     Raises:
-        ValueError: where the shapes differ.
+        ValueError: where the shapes differ, and for matrices that are no rotations. (Reading them waits for a GPU.
+            While a CUDA graph is captured that cannot be, and nothing is checked.)
     """
 
     rotations: wp.array
@@ -220,6 +253,8 @@ class Poses:
         """Validate."""
         check.shape("translations", self.translations.shape, self.rotations.shape)
         check.shape("scales", self.scales.shape, self.rotations.shape)
+        if not self.rotations.device.is_capturing:
+            _check_orthonormal(self.rotations.numpy().astype(np.float64))
 
     def points(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Move points with their bodies.

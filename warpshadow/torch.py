@@ -23,7 +23,7 @@ from warpshadow.scene import Scene
 from warpshadow.tape import recorded, unrecorded
 from warpshadow.threads import one_at_a_time, one_call
 
-_ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6}
+_ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 _GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
 
 
@@ -143,7 +143,9 @@ class TorchRenderer(torch.nn.Module):
         """Place the bodies in the world: x → s R x + t.
 
         Args:
-            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`.
+            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`. Entries of RᵀR
+                may differ from those of the identity by 0.05, which a step of 0.01 in each of the nine numbers leaves
+                them; to go on from there, ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
@@ -266,13 +268,14 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
 
     Args:
         parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
-            axis-angle vectors [radians], smooth at 0; 6, the first two columns.
+            axis-angle vectors [radians], smooth at 0; 6, the first two columns; 9, the rows of any matrix, whose
+            nearest rotation is taken (``matrices.flatten(-2)``).
 
     Returns:
         Rotations, shape [..., 3, 3].
 
     Raises:
-        ValueError: for another n.
+        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.deform.rotation_matrices` says.
 
     Differentiable: parameters.
     """
