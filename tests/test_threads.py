@@ -134,6 +134,21 @@ def test_gradients_are_right_while_another_thread_records_a_tape_of_warp(restles
             assert torch.equal(gradient(renderer), expected)
 
 
+def test_two_threads_record_a_tape_each(restless):
+    def record():
+        x = wp.array(np.arange(4, dtype=np.float32), requires_grad=True, device="cpu")
+        with tape.recorded() as recording:
+            y = squares(squares(x))
+        assert len(recording.launches) == 2
+        y.grad.fill_(1.0)
+        recording.backward()
+        np.testing.assert_array_equal(x.grad.numpy(), 4 * x.numpy() ** 3)
+
+    with beside(record):
+        for _ in range(100):
+            record()
+
+
 def test_what_another_thread_launches_is_not_recorded():
     def launch():
         squares(wp.zeros(4, dtype=wp.float32, device="cpu", requires_grad=True))
