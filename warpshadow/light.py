@@ -122,7 +122,8 @@ class EnvironmentMap:
     def rotated(self, degrees: float) -> EnvironmentMap:
         """Turn the light about +y, counter-clockwise seen from above: +90 takes what is at +z to +x.
 
-        Whole pixels are exact; between them columns are interpolated linearly. Either way the energy is kept.
+        Whole pixels are exact; between them columns are interpolated linearly, which blurs a map of few columns. Either
+        way the energy is kept.
         """
         check.finite("degrees", np.asarray(degrees, np.float64))
         width = self.radiance.shape[1]
@@ -148,7 +149,7 @@ class EnvironmentMap:
         return sh.pixel_solid_angles(len(self.radiance))
 
     def sh(self, order: int) -> np.ndarray:
-        """Project onto spherical harmonics.
+        """Project onto spherical harmonics: the integral over what the pixels cover, however few they are.
 
         Args:
             order: Number of bands n.
@@ -346,6 +347,8 @@ def synthetic_sky(
         raise ValueError("sun_direction: got a zero vector, expected a direction")
     sun = np.array(sun_direction, dtype=np.float64) / np.linalg.norm(sun_direction)
     towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
+    edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
+    on_level = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]  # ∫ max(cos θ, 0) dω over a pixel of each row
     up = towards[..., 1]
     above = up > 0
     sun_angle = np.arccos(np.clip(towards @ sun, -1, 1))
@@ -358,14 +361,14 @@ def synthetic_sky(
     color = (1 - haze) * _chroma([0.22, 0.45, 1.0]) + haze * _chroma([0.75, 0.88, 1.0])
     color = (1 - near_sun) * color + near_sun * sun_color
     sky = (above * glow * gradation)[..., None] * color
-    sky *= np.pi / np.sum(sky @ LUMINANCE * np.maximum(up, 0) * weights)
+    sky *= np.pi / np.sum(sky @ LUMINANCE * on_level)
 
     pixel = np.pi / height
     radius = max(np.radians(sun_radius), pixel / 2)
     disc = np.clip((radius + pixel / 2 - sun_angle) / pixel, 0, 1)
     disc *= above * np.pi * sun_strength / np.sum(disc * weights)
 
-    on_ground = np.pi + np.sum(disc * np.maximum(up, 0) * weights) * sun_color
+    on_ground = np.pi + np.sum(disc * on_level) * sun_color
     distance_haze = np.exp(np.minimum(20 * up, 0))[..., None]
     horizon = sky[height // 2 - 1]
     ground = (1 - distance_haze) * (ground_albedo / np.pi * on_ground) + distance_haze * horizon
