@@ -13,7 +13,7 @@ import numpy as np
 import typer
 import warp as wp
 
-from warpshadow import quiet
+from warpshadow import __version__, files, quiet
 
 app = typer.Typer(
     add_completion=False,
@@ -30,11 +30,23 @@ INTERRUPTED = 130
 _CHECKPOINT = "checkpoint"
 _PREVIEW = "preview.png"
 
+_PICTURES = (".png", ".jpg", ".jpeg")
+
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
 
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        typer.echo(f"warpshadow {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def main() -> None:
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
     """Keep Warp's own messages off the terminal."""
     quiet()
     warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
@@ -51,12 +63,11 @@ def _clear_errors() -> Iterator[None]:
         raise typer.Exit(1) from error
 
 
-def _check_output(path: Path, *suffixes: str) -> None:
-    """Find out before the work whether its result can be written."""
+def _check_output(path: Path, *suffixes: str, instead: str = "") -> None:
+    """Find out before the work whether its result can be written; a wrong extension may mean another option."""
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}: got extension {path.suffix!r}, expected {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder")
+        raise ValueError(f"{path}: got extension {path.suffix!r}, expected {' or '.join(suffixes)}{instead}")
+    files.check_file(path)
 
 
 @app.command()
@@ -66,7 +77,9 @@ def render(
         Path,
         typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage."),
     ],
-    png: Annotated[Optional[Path], typer.Option(help="Also write an sRGB picture: .png or .jpg.")] = None,
+    png: Annotated[
+        Optional[Path], typer.Option(help="Also write an sRGB picture: .png, or .jpg, which is on black.")
+    ] = None,
     exposure: Annotated[
         Optional[float],
         typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
@@ -86,9 +99,10 @@ def render(
     from warpshadow.tuning import describe, resolved
 
     with _clear_errors():
-        _check_output(output, ".exr")
+        is_picture = output.suffix.lower() in _PICTURES
+        _check_output(output, ".exr", instead=f"; pictures are written by --png {output}" if is_picture else "")
         if png is not None:
-            _check_output(png, ".png", ".jpg", ".jpeg")
+            _check_output(png, *_PICTURES)
         loaded = parse_scene(scene)
         visibility = loaded.visibility
         visibility = dataclasses.replace(
@@ -105,7 +119,8 @@ def render(
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
         if png is not None:
             stops = auto_exposure(image) if exposure is None else exposure
-            write_image(png, exposed(image, stops))
+            picture = exposed(image, stops)
+            write_image(png, picture if png.suffix.lower() == ".png" else picture[..., :3])  # color is premultiplied
             typer.echo(f"{png}: exposure {stops:+.2f} stops")
 
 
@@ -218,10 +233,9 @@ def _resumable(folder: Path) -> Iterator[None]:
 
 def _check_folder(path: Path) -> bool:
     """Find out before the work whether a folder may be written into; whether it has a fit to go on with."""
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder")
     if path.exists() and not path.is_dir():
         raise NotADirectoryError(f"{path}: got a file, expected a folder")
+    files.check_folder(path if path.is_dir() else path.parent)
     if not path.is_dir() or _has_checkpoint(path):
         return path.is_dir()
     others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != _PREVIEW)
@@ -249,11 +263,12 @@ def spheres(
 ) -> None:
     """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
     from warpshadow.mesh import load_mesh
-    from warpshadow.spheres import fit_spheres, plot_spheres
+    from warpshadow.spheres import check_matplotlib, fit_spheres, plot_spheres
 
     with _clear_errors():
         if picture is not None:
             _check_output(picture, ".png")
+            check_matplotlib()
         if output is not None:
             _check_output(output, ".npz")
         loaded = load_mesh(mesh)
@@ -270,7 +285,7 @@ def spheres(
         typer.echo(f"surface covered                  {report.coverage:6.1%}")
         typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")
         if output is not None:
-            np.savez(output, centers=fit.spheres.centers, radii=fit.spheres.radii)
+            fit.spheres.write(output)
         if picture is not None:
             plot_spheres(loaded, fit.spheres, picture)
 
@@ -293,13 +308,12 @@ def envmap(
     from warpshadow.light import EnvironmentMap
 
     with _clear_errors():
-        if output is not None:
-            _check_output(output, ".exr")
+        beside = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
+        _check_output(beside, ".exr")
         light = EnvironmentMap.read(file, sanitize=sanitize)
         for name, value in light.statistics().items():
             shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
             typer.echo(f"{name.replace('_', ' '):26}{shown}")
-        beside = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
         write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
         typer.echo(f"{beside}: reconstruction from {order**2} coefficients")
 

@@ -5,13 +5,14 @@ Row 0 is the top. PNG and JPEG hold sRGB, which is decoded and encoded exactly; 
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from warpshadow import files
 
 
 class ImageError(ValueError):
@@ -23,7 +24,7 @@ def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: i
 
     OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
     that has them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG, JPEG:
-    gray or RGB, with or without alpha, taken for sRGB.
+    gray or RGB, with or without alpha, taken for sRGB; turned upright as their EXIF orientation says.
 
     Args:
         path: A .exr, .hdr, .pic, .png, .jpg or .jpeg file.
@@ -62,6 +63,7 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
 
     Raises:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
+        OSError: where the file cannot be written.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
@@ -73,15 +75,13 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
         raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
-    unfinished.touch()  # a missing folder is an ordinary FileNotFoundError
     try:
-        writer(unfinished, pixels)
-        os.replace(unfinished, path)
+        with files.whole(path) as unfinished:
+            writer(unfinished, pixels)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    except RuntimeError as error:  # OpenEXR's, of a disk that is full
+        raise OSError(f"{path}: {error}") from error
 
 
 def _check_size(width: int, height: int, max_pixels: int) -> None:
@@ -274,7 +274,7 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     try:
         with warnings.catch_warnings():
@@ -286,14 +286,15 @@ def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndar
         raise ImageError("not a PNG or JPEG file, or its header is damaged") from error
     with picture:
         _check_size(*picture.size, max_pixels)
+        has_alpha = picture.has_transparency_data
+        _load(picture)
+        ImageOps.exif_transpose(picture, in_place=True)
         if picture.mode.startswith("I"):  # 16-bit gray
-            codes = _load(picture).astype(np.uint16)
+            codes = np.asarray(picture).astype(np.uint16)
         else:
             if path.suffix.lower() == ".png" and _png_depth(path) == 16:
                 warnings.warn(f"{path}: 16-bit color is read at 8 bits", stacklevel=3)
-            has_alpha = picture.has_transparency_data
             color = "L" if picture.mode in ("1", "L", "LA") else "RGB"
-            _load(picture)
             codes = np.asarray(picture.convert({"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color))
     codes = codes.reshape(*codes.shape[:2], -1)
     code_max = np.iinfo(codes.dtype).max
@@ -303,10 +304,10 @@ def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndar
     return pixels
 
 
-def _load(picture) -> np.ndarray:
+def _load(picture) -> None:
     """Decode the pixels; Pillow raises any of these on a damaged file."""
     try:
-        return np.asarray(picture)
+        picture.load()
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise ImageError(f"truncated or damaged ({error})") from error
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import check
+from warpshadow import check, files
 from warpshadow.tape import launch
 
 
@@ -131,7 +131,8 @@ class Mesh:
             lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]
             corners = np.stack([self.faces, self.uv_faces], axis=-1).reshape(-1, 6) + 1
             lines += ["f {}/{} {}/{} {}/{}".format(*corner) for corner in corners.tolist()]
-        path.write_text("\n".join(lines) + "\n")
+        with files.whole(path) as unfinished:
+            unfinished.write_text("\n".join(lines) + "\n")
 
 
 def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:

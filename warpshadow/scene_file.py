@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from warpshadow import check, sh, tables
+from warpshadow import check, files, sh, tables
 from warpshadow.camera import Camera
 from warpshadow.image import read_image, write_image
 from warpshadow.light import EnvironmentMap
@@ -283,7 +283,8 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     elif np.ndim(body.albedo) == 1:
         table["albedo"] = _numbers(body.albedo)
     else:
-        np.save(colors, body.albedo)
+        with files.whole(colors) as unfinished:
+            np.save(unfinished, body.albedo)
         table["albedo"] = colors.name
         written.append(colors)
     if not isinstance(body.blockers, Spheres):
@@ -291,7 +292,7 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     elif not len(body.blockers):
         table["blockers"] = 0
     else:
-        np.savez(arrays, centers=body.blockers.centers, radii=body.blockers.radii)
+        body.blockers.write(arrays)
         table["spheres"] = arrays.name
         written.append(arrays)
     place = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
@@ -302,8 +303,10 @@ def _write_material(mesh: Path, texture: np.ndarray) -> list[Path]:
     """Let an OBJ file name its texture, as a PNG, which is what other programs draw."""
     picture, material = mesh.with_suffix(".png"), mesh.with_suffix(".mtl")
     write_image(picture, texture)
-    material.write_text(f"newmtl textured\nKd 1 1 1\nmap_Kd {picture.name}\n")
-    mesh.write_text(f"mtllib {material.name}\nusemtl textured\n{mesh.read_text()}")
+    with files.whole(material) as unfinished:
+        unfinished.write_text(f"newmtl textured\nKd 1 1 1\nmap_Kd {picture.name}\n")
+    with files.whole(mesh) as unfinished:
+        unfinished.write_text(f"mtllib {material.name}\nusemtl textured\n{mesh.read_text()}")
     return [picture, material]
 
 

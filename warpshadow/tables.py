@@ -8,6 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from warpshadow import files
+
 Table = dict[str, Any]
 
 
@@ -21,8 +25,7 @@ def read(path: Path, kind: str) -> Table:
     if not path.is_file():
         raise FileNotFoundError(f"no such {kind}")
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # editors on Windows begin files with a mark
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
         raise ValueError(f"not valid TOML: {cause}") from cause
 
@@ -41,7 +44,8 @@ def write(path: Path, tables: Mapping[str, Any]) -> None:
             blocks.append(block(f"[{name}]", value))
         elif _is_tables(value):
             blocks += [block(f"[[{name}]]", table) for table in value]
-    path.write_text("\n".join(blocks), encoding="utf-8")
+    with files.whole(path) as unfinished:
+        unfinished.write_text("\n".join(blocks), encoding="utf-8")
 
 
 def block(header: str, table: Mapping[str, Any]) -> str:
@@ -150,7 +154,9 @@ def _lines(table: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    """TOML for a value; matrices get a line for each row."""
+    """TOML for a value, NumPy's or Python's; matrices get a line for each row."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
     if isinstance(value, (list, tuple)):
         is_matrix = bool(value) and isinstance(value[0], (list, tuple))
         items = [_value(item) for item in value]

@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from warpshadow import files
+
 _MARK = b"warpshadow checkpoint 1\n"
 
 
@@ -31,17 +33,13 @@ def save(path: str | Path, state: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with files.whole(path) as unfinished:
         with unfinished.open("wb") as file:
             file.write(_MARK + hashlib.sha256(payload).digest() + payload)
             file.flush()
             os.fsync(file.fileno())
         if _payload(path) is not None:  # a damaged one does not take the place of the whole one before it
             os.replace(path, previous_path(path))
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def load(path: str | Path) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpshadow import tables
+from warpshadow import files, tables
 from warpshadow.image import write_image
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free import Values
@@ -69,7 +69,8 @@ class Report:
         values: dict[str, Any] = {
             f"{name}.{key}": each.cpu().numpy() for name, own in result.values.items() for key, each in own.items()
         }
-        np.savez(folder / "parameters.npz", **values)
+        with files.whole(folder / "parameters.npz") as unfinished:
+            np.savez(unfinished, **values)
         written += [folder / "summary.toml", folder / "parameters.npz"]
         return [*written, *self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
 
@@ -124,6 +125,7 @@ def plot_losses(result: Result, path: str | Path) -> list[Path]:
         first += len(losses)
     axes.set_xlabel("iteration (a color for each candidate of each stage)")
     axes.set_ylabel(f"loss ({result.problem.loss.kind})")
-    figure.savefig(path, dpi=120)
+    with files.whole(path) as unfinished:
+        figure.savefig(unfinished, dpi=120)
     pyplot.close(figure)
     return [Path(path)]

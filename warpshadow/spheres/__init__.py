@@ -15,7 +15,16 @@ receivers on and inside spheres are part of what is fitted.
 from warpshadow.spheres.fit import SphereFit, fit_spheres, is_fitted
 from warpshadow.spheres.measure import FitReport
 from warpshadow.spheres.occlusion import exact_occlusion
-from warpshadow.spheres.plot import plot_spheres
+from warpshadow.spheres.plot import check_matplotlib, plot_spheres
 from warpshadow.spheres.sphere_set import Spheres
 
-__all__ = ["FitReport", "SphereFit", "Spheres", "exact_occlusion", "fit_spheres", "is_fitted", "plot_spheres"]
+__all__ = [
+    "FitReport",
+    "SphereFit",
+    "Spheres",
+    "check_matplotlib",
+    "exact_occlusion",
+    "fit_spheres",
+    "is_fitted",
+    "plot_spheres",
+]

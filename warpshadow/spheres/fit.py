@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import check
+from warpshadow import check, files
 from warpshadow.mesh import Mesh
 from warpshadow.order import compact_order
 from warpshadow.spheres.cover import descend_cover, greedy_cover
@@ -232,10 +231,8 @@ def _cached_fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitR
     spheres, report = _fit(job, progress, count)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, spheres=spheres, report=json.dumps(asdict(report)))
-        os.replace(temporary, path)
+        with files.whole(path) as unfinished:
+            np.savez(unfinished, spheres=spheres, report=json.dumps(asdict(report)))
     except OSError as problem:
         warnings.warn(f"the fit could not be cached in {path.parent} ({problem})", stacklevel=4)
     return spheres, report

@@ -6,8 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from warpshadow import files
 from warpshadow.mesh import Mesh
 from warpshadow.spheres.sphere_set import Spheres
+
+
+def check_matplotlib() -> None:
+    """Raise ImportError unless matplotlib is installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise ImportError('a picture of spheres needs the package matplotlib: pip install "warpshadow[plot]"') from None
 
 
 def plot_spheres(mesh: Mesh, spheres: Spheres, path: str | Path) -> None:
@@ -17,7 +26,11 @@ def plot_spheres(mesh: Mesh, spheres: Spheres, path: str | Path) -> None:
         mesh: The mesh, y up.
         spheres: Spheres in the mesh's coordinates.
         path: Image file to write; the format follows its suffix.
+
+    Raises:
+        ImportError: when matplotlib, the extra ``plot``, is not installed.
     """
+    check_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -42,4 +55,5 @@ def plot_spheres(mesh: Mesh, spheres: Spheres, path: str | Path) -> None:
         axes.view_init(elev=15, azim=turn)
         axes.set_axis_off()
     figure.suptitle(f"{mesh.name}: {len(spheres)} spheres")
-    figure.savefig(path, dpi=110)
+    with files.whole(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from warpshadow import check
+from warpshadow import check, files
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,11 @@ class Spheres:
             raise ValueError(f"radii: got {len(self.radii)} radii for {len(self.centers)} centers, expected one each")
         if (self.radii < 0).any():
             raise ValueError(f"radii: got {self.radii.min()}, expected radii that are not negative")
+
+    def write(self, path: str | Path) -> None:
+        """Write an .npz file of ``centers`` and ``radii``, which a scene file's ``spheres`` reads."""
+        with files.whole(path) as unfinished:
+            np.savez(unfinished, centers=self.centers, radii=self.radii)
 
     def __len__(self) -> int:
         """Number of spheres."""

@@ -1,0 +1,52 @@
+"""Files that appear whole or not at all, and whether one can be written, found out before the work."""
+
+import contextlib
+import os
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def whole(path: str | Path) -> Iterator[Path]:
+    """Give a new empty file beside ``path`` to write to, which takes its place if the block ends without an error.
+
+    Otherwise it is removed, and what was at ``path`` stays. It has the suffix of ``path``, by which libraries tell
+    formats, and the permissions that the user's umask gives any new file.
+
+    Raises:
+        OSError: where it cannot be written, such as on a full disk; of ``path``, whatever the file beside it is called.
+    """
+    path = Path(path)
+    unfinished = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
+    try:
+        unfinished.touch(exist_ok=False)
+        try:
+            yield unfinished
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+    except OSError as error:
+        if error.errno is None:  # not the system's: it says itself what it is about
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def check_file(path: Path) -> None:
+    """Raise OSError unless a file can be written at a path, in place of one that may be there."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: got a folder, expected a file")
+    check_folder(path.parent)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(f"{path}: got a file that is write-protected")
+
+
+def check_folder(path: Path) -> None:
+    """Raise OSError unless a folder is there and new files can be written in it."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder")
+    try:
+        tempfile.TemporaryFile(dir=path).close()
+    except OSError as error:
+        raise type(error)(f"{path}: no file can be written in this folder ({error.strerror})") from error
