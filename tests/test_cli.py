@@ -1,11 +1,13 @@
 """The command line: what it writes, what it prints, and one clear line for each mistake."""
 
+import errno
 import functools
 import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,6 +114,16 @@ def test_render_also_writes_a_picture_at_a_given_exposure(scene, tmp_path):
     assert np.abs(picture[..., :3] - np.clip(image[..., :3] / 2, 0, 1)).max() < EIGHT_BITS
 
 
+@pytest.mark.parametrize("name", ["out.jpg", "out.JPEG"])
+def test_a_jpeg_has_no_alpha_and_is_on_black(scene, tmp_path, name):
+    scene.write_text(SCENE.replace("[16, 12]", "[64, 48]"))
+    result = run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / name, "--exposure", 0)
+    assert result.exit_code == 0, result.output
+    image, picture = ws.read_image(tmp_path / "out.exr"), ws.read_image(tmp_path / name)
+    assert picture.shape == (48, 64, 3) and (image[..., 3] == 0).any()
+    assert np.abs(picture - np.clip(image[..., :3], 0, 1)).mean() < EIGHT_BITS  # JPEG: in the mean
+
+
 def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
     output, png = tmp_path / "out.exr", tmp_path / "out.png"
     result = run("render", scene, "-o", output, "--png", png)
@@ -156,11 +168,29 @@ def test_a_missing_scene_is_one_line_and_status_1(tmp_path):
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("warpshadow.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
     missing = tmp_path / "nowhere" / "out.exr"
-    fails("render", scene, "-o", tmp_path / "out.png", parts=("out.png", "got extension '.png'", "expected .exr"))
+    picture = ("out.png", "got extension '.png'", "expected .exr; pictures are written by --png ")
+    fails("render", scene, "-o", tmp_path / "out.png", parts=picture)
     fails("render", scene, "-o", missing, parts=("nowhere", "no such folder"))
     good = ("render", scene, "-o", tmp_path / "out.exr")
     fails(*good, "--png", tmp_path / "out.gif", parts=("out.gif", ".png or .jpg"))
     fails(*good, "--png", missing.with_suffix(".png"), parts=("nowhere", "no such folder"))
+    (tmp_path / "folder.exr").mkdir()
+    for folder in (tmp_path, tmp_path / "folder.exr"):
+        fails("render", scene, "-o", folder, parts=(f"{folder}: got a folder, expected a file",))
+    fails(*good, "--png", tmp_path, parts=(f"{tmp_path}: got a folder",))
+
+
+@pytest.mark.parametrize("command", ["render", "fit", "spheres", "envmap"])
+def test_a_folder_that_takes_no_files_is_refused_before_the_work(tmp_path, monkeypatch, command):
+    """Before the input is even read: it is not there."""
+
+    def refuse(*args, **options):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    name = {"spheres": "out.npz", "fit": "out"}.get(command, "out.exr")
+    message = f"{tmp_path}: no file can be written in this folder (Permission denied)"
+    fails(command, "missing.file", "-o", tmp_path / name, parts=(message,))
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", ""])
@@ -231,8 +261,8 @@ def test_tune_chooses_by_time_as_well(scene, quick_tuning):
 @pytest.mark.parametrize(
     ("option", "value", "parts"),
     [
-        ("--error", "1e-6", ("no setting reaches an error of 1e-06; nearest is ", ", with an error of ")),
-        ("--ms", "1e-6", ("no setting reaches 1e-06 ms; nearest is ", " ms")),
+        ("--error", "1e-6", ("no setting reaches an error of 1e-06; nearest is ", ", with an error of ", "try more ")),
+        ("--ms", "1e-6", ("no setting reaches 1e-06 ms; nearest is ", " ms; try a smaller image")),
     ],
 )
 def test_tune_says_what_comes_nearest_where_nothing_reaches_it(scene, quick_tuning, option, value, parts):
@@ -241,6 +271,13 @@ def test_tune_says_what_comes_nearest_where_nothing_reaches_it(scene, quick_tuni
     last = result.stderr.strip().splitlines()[-1]
     assert last.startswith("error: ") and all(part in last for part in parts)
     assert re.search(r"^>", result.stdout, re.M) and "[visibility]" not in result.stdout
+    assert "> nearest\n" in result.stdout and "> chosen" not in result.stdout
+
+
+def test_tune_points_to_fits_where_numbers_of_spheres_were_not_tried(scene, quick_tuning, monkeypatch):
+    monkeypatch.setattr(ws.Tuning, "untried_counts", (256, 512))
+    result = run("tune", scene, "--error", "1e-6")
+    assert result.stderr.strip().endswith("; try --fit, which also fits 256, 512 spheres a body")
 
 
 @pytest.mark.parametrize(("options", "got"), [((), "neither"), (("--error", 0.1, "--ms", 9), "both")])
@@ -527,7 +564,71 @@ def test_warmup_says_when_a_device_is_ready():
     assert re.search(r"cpu: ready in \d+\.\d s", result.stdout)
 
 
+def test_a_picture_of_spheres_needs_matplotlib_which_is_said_before_the_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr("warpshadow.spheres.fit_spheres", lambda *args, **options: pytest.fail("it was fitted"))
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    ws.icosphere(1.0, 1).write(tmp_path / "ball.obj")
+    arguments = ("spheres", tmp_path / "ball.obj", "--picture", tmp_path / "ball.png")
+    fails(*arguments, parts=('needs the package matplotlib: pip install "warpshadow[plot]"',))
+
+
+# ---------------------------------------------------------------------------------------------- a full disk
+
+
+@pytest.fixture
+def full_disk():
+    """Files can have 512 bytes at most, once the fixture's value is called."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_behind(scene, tmp_path, full_disk, monkeypatch, name):
+    """Of the image or of the picture, which is the second file."""
+    scene.write_text(SCENE.replace("[16, 12]", "[64, 48]"))
+    files_before = {path.name for path in tmp_path.iterdir()}
+    write = ws.write_image
+
+    def write_with_the_disk_full(path, pixels):
+        if path.name == name:
+            full_disk()
+        write(path, pixels)
+
+    monkeypatch.setattr("warpshadow.image.write_image", write_with_the_disk_full)
+    result = run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / "out.png")
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    assert "File too large" in result.stderr and str(tmp_path / name) in result.stderr
+    assert {path.name for path in tmp_path.iterdir()} - files_before == {"out.exr"} - {name}
+
+
+def test_spheres_on_a_full_disk_leave_no_file(tmp_path, monkeypatch):
+    """Neither the fit that is asked for nor the one that is to be kept: of that, there is a warning."""
+    monkeypatch.setattr("warpshadow.spheres.fit_spheres", functools.partial(ws.fit_spheres, steps=100))
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "fits"))
+    ws.icosphere(1.0, 1).write(tmp_path / "ball.obj")
+
+    def savez_to_a_full_disk(path, **arrays):
+        Path(path).write_bytes(b"PK")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", savez_to_a_full_disk)
+    result = run("spheres", tmp_path / "ball.obj", "--count", 1, "-o", tmp_path / "fit.npz")
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    *_, warning, error = result.stderr.strip().splitlines()
+    assert "the fit could not be cached" in warning and "No space left on device" in warning
+    assert error == f"error: [Errno {errno.ENOSPC}] No space left on device: '{tmp_path / 'fit.npz'}'"
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["ball.obj"]
+
+
 # ---------------------------------------------------------------------------------------------- help
+
+
+def test_the_version_is_printed():
+    result = run("--version")
+    assert result.exit_code == 0 and result.stdout == f"warpshadow {ws.__version__}\n"
 
 
 def test_every_command_and_every_option_has_help():

@@ -333,6 +333,45 @@ def test_a_written_png_is_rounded_and_clipped_in_srgb(tmp_path, channels):
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), np.clip(pixels, 0, 1), rtol=1e-6)
 
 
+ORIENTATIONS = {
+    1: lambda stored: stored,
+    2: lambda stored: stored[:, ::-1],
+    3: lambda stored: stored[::-1, ::-1],
+    4: lambda stored: stored[::-1],
+    5: lambda stored: stored.swapaxes(0, 1),
+    6: lambda stored: np.rot90(stored, -1),
+    7: lambda stored: stored[::-1, ::-1].swapaxes(0, 1),
+    8: lambda stored: np.rot90(stored),
+}
+"""What a viewer makes of stored rows and columns (EXIF 2.3, tag 274: where row 0 and column 0 are)."""
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_a_photograph_is_turned_upright_as_viewers_do(tmp_path, orientation, name, mode):
+    from PIL import Image
+
+    stored = Image.fromarray(np.kron([[0, 80, 160], [240, 200, 120]], np.ones((8, 8))).astype(np.uint8)).convert(mode)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored.save(tmp_path / f"plain{name}", quality=95)
+    stored.save(tmp_path / name, quality=95, exif=exif)
+    expected = ORIENTATIONS[orientation](read_image(tmp_path / f"plain{name}"))
+    np.testing.assert_array_equal(read_image(tmp_path / name), expected)
+
+
+def test_16_bit_gray_is_turned_upright_too(tmp_path):
+    from PIL import Image
+
+    codes = RANDOM.integers(0, 65536, (4, 6)).astype(np.uint16)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(codes).save(tmp_path / "a.png", exif=exif)
+    expected = np.vectorize(srgb_twin)(np.rot90(codes, -1) / 65535)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png")[..., 0], expected, rtol=2e-7)
+
+
 def test_a_jpeg_reads_back_about_the_same(tmp_path):
     ramp = np.linspace(0.1, 0.9, 32)[None, :, None] * np.ones((32, 1, 3))
     write_image(tmp_path / "a.jpg", ramp)

@@ -1,6 +1,6 @@
 """Scene files that are written: they read back as the same scene; and the keys that this takes."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 
 import numpy as np
 import pytest
@@ -115,6 +115,34 @@ def test_other_programs_find_the_texture_of_a_body_that_is_written(tmp_path):
     np.testing.assert_allclose(ws.read_image(tmp_path / "body_0.exr"), texture.astype(np.float32))
     assert drawn.shape == expected.shape == texture.shape
     assert np.abs(expected - texture).max() < 0.006  # half a step of 8-bit sRGB where it is steepest
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"directions": np.int64(64)},
+        {"order": np.int32(4)},
+        {"samples": np.uint16(64)},
+        {"softness": np.float32(0.5)},
+        {"merging": np.float64(0.25), "error": np.float32(0.1)},
+    ],
+)
+def test_numpy_numbers_are_written_as_numbers(tmp_path, options):
+    camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0), size=tuple(np.array([4, 6])))
+    bodies = (ws.Body(ws.icosphere(1.0, 0), blockers=np.int64(0), scale=np.float32(0.1)),)
+    scene = ws.Scene(bodies, LIGHTS["sh"], camera, ws.Visibility(**options), supersampling=np.int64(3))
+    again = ws.load_scene(write_scene(scene, tmp_path)[0])
+    assert asdict(again.visibility) == asdict(scene.visibility)
+    assert (again.camera.width, again.camera.height, again.supersampling) == (4, 6, 3)
+    assert again.bodies[0].scale == np.float32(0.1)
+
+
+def test_a_mark_at_the_head_of_a_file_is_passed_over(load, tmp_path):
+    """As editors on Windows write it; line ends of theirs, too."""
+    scene = load(TABLES + "[visibility]\norder = 4\n")
+    (path,) = tmp_path.glob("*.toml")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert asdict(ws.load_scene(path).visibility) == asdict(scene.visibility)
 
 
 def test_tables_read_back_as_they_were_written(tmp_path):

@@ -1,6 +1,8 @@
 """Sphere fits: the formulas they rest on, what they promise, and how good they are."""
 
 import os
+import stat
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -384,6 +386,24 @@ def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tm
     assert fit_spheres(bumpy(), 6, **options).report.cached
     fit_spheres(bumpy(), 7, **options)
     assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_fits_in_a_folder_that_is_shared_can_be_read_by_others(tmp_path, monkeypatch, short_cover):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    before = os.umask(0o002)
+    try:
+        fit_spheres(bumpy(), 6, **{**QUICK, "cache": True, "steps": 5})
+    finally:
+        os.umask(before)
+    (file,) = (tmp_path / "spheres").iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o664
+
+
+def test_a_picture_needs_matplotlib_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r'package matplotlib: pip install "warpshadow\[plot\]"'):
+        plot_spheres(bumpy(), Spheres([[0, 0, 0]], [0.5]), tmp_path / "spheres.png")
 
 
 def test_the_picture_of_a_fit_is_written(tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 import warp as wp
 
-from warpshadow import __version__, files, quiet
+from warpshadow import Tuning, __version__, files, quiet
 
 app = typer.Typer(
     add_completion=False,
@@ -65,7 +65,7 @@ def _clear_errors() -> Iterator[None]:
 
 def _check_output(path: Path, *suffixes: str, instead: str = "") -> None:
     """Find out before the work whether its result can be written; a wrong extension may mean another option."""
-    if path.suffix.lower() not in suffixes:
+    if path.suffix.lower() not in suffixes and not path.is_dir():
         raise ValueError(f"{path}: got extension {path.suffix!r}, expected {' or '.join(suffixes)}{instead}")
     files.check_file(path)
 
@@ -136,7 +136,7 @@ def tune(
 ) -> None:
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
-    Exit status 1: none reaches it; the one that comes nearest is named.
+    Exit status 1: none reaches it; the one that comes nearest is named, and what to try next.
     """
     from warpshadow.scene_file import parse_scene
     from warpshadow.timing import TIMED_RECEIVERS
@@ -153,14 +153,24 @@ def tune(
             f"{loaded.camera.width} × {loaded.camera.height},\nof which shadows are timed on {TIMED_RECEIVERS} "
             "receivers and extrapolated to all"
         )
-        typer.echo(f"{tuning.table()}\n* no other is both faster and more accurate    > chosen\n")
+        mark = "chosen" if tuning.is_reached else "nearest"
+        typer.echo(f"{tuning.table()}\n* no other is both faster and more accurate    > {mark}\n")
         if not tuning.is_reached:
             wanted = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
             raise ValueError(
-                f"no setting reaches {wanted}; nearest is {describe(tuning.scene)}, "
-                f"with an error of {tuning.error:.3g} in {tuning.milliseconds:.3g} ms"
+                f"no setting reaches {wanted}; nearest is {describe(tuning.scene)}, with an error of "
+                f"{tuning.error:.3g} in {tuning.milliseconds:.3g} ms; {_next_attempt(tuning, ms is None)}"
             )
         typer.echo(tuning.toml(), nl=False)
+
+
+def _next_attempt(tuning: Tuning, is_inaccurate: bool) -> str:
+    """What may reach what no setting did."""
+    if not is_inaccurate:
+        return "try a smaller image or fewer samples a pixel (supersampling = 1)"
+    if tuning.untried_counts:
+        return f"try --fit, which also fits {', '.join(map(str, tuning.untried_counts))} spheres a body"
+    return 'try more spheres for the bodies that cast shadows, or rays: method = "ray-traced"'
 
 
 def _device(name: str) -> wp.Device:

@@ -28,7 +28,13 @@ ORDERS = (4, 6, 8)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
 
 EQUAL = 0.1
-"""Settings whose times differ by less than this share count as equally fast; then the more accurate is better."""
+"""Settings whose times differ by less than this share count as equally fast; then the more accurate is better.
+
+Where none is accurate enough, the same holds of their errors; then the faster is better.
+"""
+
+ERROR_STEP = 0.003
+"""Errors that differ by less than this count as equal, too: nobody sees it."""
 
 COARSE = 0.005
 """Error of interpolation between a body's vertices from which on its pixels are tried as receivers."""
@@ -51,7 +57,8 @@ class Tuning:
 
     Args:
         given: The scene as it was.
-        chosen: The best setting, or the nearest where none reaches what was wanted.
+        chosen: The best setting. Where none reaches what was wanted, the nearest: the fastest of those about as
+            accurate as can be, or the most accurate of those about as fast.
         is_reached: Whether it reaches it.
         trials: All that was tried, the fastest first.
     """
@@ -75,6 +82,13 @@ class Tuning:
     def milliseconds(self) -> float:
         """Time of an image."""
         return self.chosen.milliseconds
+
+    @property
+    def untried_counts(self) -> tuple[int, ...]:
+        """Numbers of spheres that were not tried, since no fit of them is kept: ``fits=True`` makes them."""
+        own = fitted_counts(self.given)
+        tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in own}
+        return tuple(count for count in SPHERE_COUNTS if own and count not in tried)
 
     def table(self) -> str:
         """What was tried, a line each: "*" marks the Pareto front, ">" what was chosen."""
@@ -182,10 +196,10 @@ def tune(
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
         reaching = [trial for trial in trials if trial.error <= wanted]
-        chosen = _cheapest(reaching) if reaching else min(trials, key=lambda trial: trial.error)
+        chosen = _cheapest(reaching) if reaching else _nearest(trials)
     else:
         reaching = [trial for trial in trials if trial.milliseconds <= wanted]
-        chosen = min(reaching, key=lambda trial: trial.error) if reaching else trials[0]
+        chosen = min(reaching, key=lambda trial: trial.error) if reaching else _cheapest(trials)
     return Tuning(scene, chosen, bool(reaching), tuple(trials))
 
 
@@ -193,6 +207,13 @@ def _cheapest(trials: Sequence[Trial]) -> Trial:
     """The fastest trial, or the most accurate of those that are about as fast."""
     longest = (1 + EQUAL) * min(trial.milliseconds for trial in trials)
     return min((trial for trial in trials if trial.milliseconds <= longest), key=lambda trial: trial.error)
+
+
+def _nearest(trials: Sequence[Trial]) -> Trial:
+    """The most accurate trial, or the fastest of those that are about as accurate."""
+    least = min(trial.error for trial in trials)
+    most = least + max(EQUAL * least, ERROR_STEP)
+    return min((trial for trial in trials if trial.error <= most), key=lambda trial: trial.milliseconds)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
