@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test lint types bench clean
+.PHONY: demo test lint types install-check bench clean
 
 demo: $(INSTALLED)
 	$(BIN)/python demos/bunny.py
@@ -21,6 +21,10 @@ lint: $(INSTALLED)
 
 types: $(INSTALLED)
 	$(BIN)/mypy
+
+# what README tells others to do, in an environment of its own
+install-check:
+	PYTHON=$(PYTHON) .ci/install
 
 # torch first: the pinned release has a CPU build where an index offers one, and nothing later replaces it
 $(INSTALLED): pyproject.toml constraints.txt
