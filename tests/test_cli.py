@@ -178,6 +178,8 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_
     for folder in (tmp_path, tmp_path / "folder.exr"):
         fails("render", scene, "-o", folder, parts=(f"{folder}: got a folder, expected a file",))
     fails(*good, "--png", tmp_path, parts=(f"{tmp_path}: got a folder",))
+    for stops in ("nan", "1e4", "-inf"):
+        fails(*good, "--exposure", stops, parts=(f"--exposure: got {float(stops):g}, expected -100 to 100 stops",))
 
 
 @pytest.mark.parametrize("command", ["render", "fit", "spheres", "envmap"])

@@ -32,6 +32,8 @@ _PREVIEW = "preview.png"
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 
+_MOST_STOPS = 100  # 2 to it is a float32
+
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
 
@@ -103,6 +105,8 @@ def render(
         _check_output(output, ".exr", instead=f"; pictures are written by --png {output}" if is_picture else "")
         if png is not None:
             _check_output(png, *_PICTURES)
+        if exposure is not None and not abs(exposure) <= _MOST_STOPS:
+            raise ValueError(f"--exposure: got {exposure:g}, expected {-_MOST_STOPS} to {_MOST_STOPS} stops")
         loaded = parse_scene(scene)
         visibility = loaded.visibility
         visibility = dataclasses.replace(
