@@ -392,8 +392,7 @@ class Rays:
         self.scene = scene
         renderer = ws.Renderer(with_visibility(scene))
         self.geometry = renderer.geometry
-        points = wp.clone(self.geometry.positions[0], requires_grad=False)
-        self.mesh = wp.Mesh(points=points, indices=renderer.assembly.faces.view(wp.int32).flatten())
+        self.mesh = renderer.assembly.casting_mesh(self.geometry.positions[0])
         samples = sample_map(scene.light.radiance, count)
         self.directions, self.radiance = samples.directions[0], samples.radiance[0]
 

@@ -299,6 +299,27 @@ class Assembly:
             moving=None if rest.moving is None else {*rest.moving, number},
         )
 
+    @property
+    def casting(self) -> list[int]:
+        """Bodies that cast shadows, from 0."""
+        return [number for number, body in enumerate(self.scene.bodies) if body.casts_shadow]
+
+    def casting_mesh(self, positions: wp.array, bodies: Collection[int] | None = None) -> wp.Mesh | None:
+        """Make the mesh that rays meet: the faces of what casts shadows.
+
+        Args:
+            positions: Vertices of all bodies [scene units], vec3 of shape [vertex]; they are copied.
+            bodies: Which bodies count, from 0; None for all.
+
+        Returns:
+            None where no such body casts a shadow.
+        """
+        casting = [number for number in self.casting if bodies is None or number in bodies]
+        if not casting:
+            return None
+        faces = self.faces.numpy()[np.isin(self.body_of_face, casting)]
+        return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
+
     def faces_of(self, first: int, end: int) -> wp.array:
         """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
         if (first, end) not in self._faces_of:

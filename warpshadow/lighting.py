@@ -103,7 +103,13 @@ class Lighting:
         missing = facts.still_receivers
         if still is not None:
             missing = still.missing(self._kept_of(light), None if view is None else view.receivers.still)
-        blockers = BlockerFacts(self._scene.visibility.method, int(counts.sum()), int(counts[moves].sum()), missing)
+        blockers = BlockerFacts(
+            self._scene.visibility.method,
+            spheres=int(counts.sum()),
+            moving_spheres=int(counts[moves].sum()),
+            casting=len(self._assembly.casting),
+            missing=missing,
+        )
         return plan_lighting(facts, light_facts, blockers)
 
     def _kept_shading(self, view: View, light: Light) -> wp.array | None:
@@ -336,7 +342,7 @@ class Lighting:
     def _trace_transfer(self, plan: LightingPlan, view: View) -> wp.array:
         points, normals, *_ = view.receivers
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
-        with self._ledger.timed(plan.visibility):
+        with self._ledger.timed(plan.visibility or plan.transfer):
             for instance, mesh in enumerate(self._ray_meshes(view)):
                 traced = trace_transfer(
                     mesh,
@@ -359,19 +365,18 @@ class Lighting:
         count = max(1, self._scene.visibility.samples // self._scene.supersampling**2)
         samples = sample_map(radiance, count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        with self._ledger.timed(plan.visibility):
+        with self._ledger.timed(plan.visibility or plan.shading):
             for instance, mesh in enumerate(self._ray_meshes(view)):
                 lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self._progress)
                 wp.copy(traced[instance], lit)
         return traced
 
-    def _ray_meshes(self, view: View) -> Iterator[wp.Mesh]:
-        """What blocks the light of each instance of receivers."""
+    def _ray_meshes(self, view: View) -> Iterator[wp.Mesh | None]:
+        """What blocks the light of each instance of receivers; None for nothing."""
         points, positions = view.receivers.points, view.geometry.positions
         for instance in range(points.shape[0] if points.size else 0):
             if instance < positions.shape[0]:
-                corners = wp.clone(positions[instance], requires_grad=False)
-                mesh = wp.Mesh(points=corners, indices=self._assembly.faces.view(wp.int32).flatten())
+                mesh = self._assembly.casting_mesh(positions[instance])
             yield mesh
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:

@@ -170,12 +170,14 @@ class BlockerFacts:
         method: How visibility is computed.
         spheres: Number of spheres.
         moving_spheres: Number of those of bodies that move, all of them where any may.
+        casting: Number of bodies that cast shadows.
         missing: Number of vertices on still bodies for which it is not known yet what still bodies block.
     """
 
     method: str
     spheres: int
     moving_spheres: int
+    casting: int
     missing: int
 
     @property
@@ -209,12 +211,12 @@ def plan_lighting(view: ViewFacts, light: LightFacts, blockers: BlockerFacts) ->
     receivers, still = view.count_of_receivers(view.receivers), view.count_of_receivers(view.still_receivers)
     every = view.count_of_receivers(view.receivers + view.still_receivers)
 
-    def visibility(spheres: int, bodies: str) -> Decision:
+    def visibility(blocking: int, bodies: str) -> Decision:
         if not new:
             return new
         if blockers.method == "none":
             return Decision(False, "the method is to have no shadows")
-        if not is_traced and not spheres:
+        if not blocking:
             return Decision(False, f"{bodies} has blockers")
         return new
 
@@ -227,7 +229,7 @@ def plan_lighting(view: ViewFacts, light: LightFacts, blockers: BlockerFacts) ->
     )
     if on_still and not view.still_receivers:
         on_still = Decision(False, "no vertex that stands still among moving ones is a receiver")
-    on_moving = visibility(blockers.spheres, "no body")
+    on_moving = visibility(blockers.casting if is_traced else blockers.spheres, "no body")
     if on_moving and not view.receivers:
         on_moving = Decision(False, "no receiver moves" if view.still_receivers else "nothing is seen")
     cast = f" × {blockers.spheres:,} spheres"

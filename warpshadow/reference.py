@@ -13,15 +13,67 @@ from warpshadow.basis import Basis
 from warpshadow.directions import CHUNK, fibonacci
 from warpshadow.parallel import launch_slices, split_row
 
-
-def ray_offset(mesh: wp.Mesh) -> float:
-    """Start of rays above a receiver that keeps a mesh from blocking itself: 1e-4 of the diagonal of its bounds."""
-    corners = mesh.points.numpy()
-    return 1e-4 * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-
-
 _RAY_COST = 200.0
 """Nanoseconds that a ray takes."""
+
+_ROUNDING = 2.0**-21
+"""How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
+
+_RAISE = 1.0e-4
+"""Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
+
+
+@wp.func
+def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
+    """Whether a ray from a receiver meets a face, in float64, where coordinates and their differences are exact.
+
+    A receiver on a face, to float32's rounding, is put slightly above it, on the side of its normal. It so gets no
+    shadow from the face and its neighbors in the plane, but does where light comes from behind them. For all other
+    faces rays start at the receiver itself, so that nothing is too thin or too near to cast a shadow.
+    """
+    a = wp.vec3d(corner_a) - wp.vec3d(point)
+    b = wp.vec3d(corner_b) - wp.vec3d(point)
+    c = wp.vec3d(corner_c) - wp.vec3d(point)
+    across = wp.cross(b - a, c - a)
+    drop = wp.dot(across, a)  # from the plane to the receiver, times |across|
+    largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
+    if wp.abs(drop) <= wp.float64(_ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
+        length = wp.length(across)
+        height = wp.where(wp.dot(across, wp.vec3d(normal)) < wp.float64(0.0), -_RAISE, _RAISE)
+        move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
+        a -= move
+        b -= move
+        c -= move
+        drop = wp.dot(across, a)
+    ray = wp.vec3d(toward)
+    u = wp.dot(ray, wp.cross(c, b))
+    v = wp.dot(ray, wp.cross(a, c))
+    w = wp.dot(ray, wp.cross(b, a))
+    least = wp.min(u, wp.min(v, w))
+    most = wp.max(u, wp.max(v, w))
+    return (least >= wp.float64(0.0) or most <= wp.float64(0.0)) and drop * wp.dot(across, ray) > wp.float64(0.0)
+
+
+@wp.func
+def _escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
+    if mesh == wp.uint64(0):
+        return True
+    # the boxes' slabs need a slope
+    slope = wp.vec3(
+        wp.where(toward[0] == 0.0, 1.0e-20, toward[0]),
+        wp.where(toward[1] == 0.0, 1.0e-20, toward[1]),
+        wp.where(toward[2] == 0.0, 1.0e-20, toward[2]),
+    )
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, slope)
+    face = int(0)
+    while wp.bvh_query_next(query, face):
+        a = wp.mesh_get_point(mesh, 3 * face)
+        b = wp.mesh_get_point(mesh, 3 * face + 1)
+        c = wp.mesh_get_point(mesh, 3 * face + 2)
+        if _is_met(point, normal, toward, a, b, c):
+            return False
+    return True
 
 
 @wp.kernel(enable_backward=False)
@@ -33,7 +85,6 @@ def _trace_visibility(
     points: wp.array2d[wp.vec3],
     normals: wp.array2d[wp.vec3],
     directions: wp.array[wp.vec3],
-    offset: float,
     # out
     visibility: wp.array3d[wp.uint8],
 ):
@@ -43,33 +94,21 @@ def _trace_visibility(
     normal = normals[batch, vertex]
     toward = directions[direction]
     escapes = wp.uint8(0)
-    if wp.dot(normal, toward) > 0.0:
-        start = points[batch, vertex] + offset * normal
-        if not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
-            escapes = wp.uint8(1)
+    if wp.dot(normal, toward) > 0.0 and _escapes(mesh, points[batch, vertex], normal, toward):
+        escapes = wp.uint8(1)
     visibility[batch, vertex, direction] = escapes
 
 
-def trace_visibility(
-    mesh: wp.Mesh,
-    points: wp.array,
-    normals: wp.array,
-    directions: wp.array,
-    *,
-    offset: float | None = None,
-) -> wp.array:
+def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, directions: wp.array) -> wp.array:
     """Trace which directions every receiver sees past the mesh, exactly.
 
-    Rays start ``offset`` above the receiver along its normal, so that a point of the mesh does not block
-    itself. Directions below a receiver's horizon (n·ω ≤ 0) are not traced and count as blocked.
+    Receivers may lie on the mesh. Directions below a receiver's horizon (n·ω ≤ 0) are not traced and count as blocked.
 
     Args:
-        mesh: The blockers in scene units, one mesh for all batches; build it once, it holds the hierarchy.
+        mesh: What blocks the light, one mesh for all batches; build it once, it holds the hierarchy. None for nothing.
         points: Receiver positions [scene units], vec3, shape [batch, vertex].
         normals: Unit normals of the receivers, vec3, shape [batch, vertex].
         directions: Unit directions toward the light, vec3, shape [direction].
-        offset: Start of the rays above the receivers [scene units]; by default 1e-4 of the diagonal of the
-            mesh's bounding box.
 
     Returns:
         1 where the ray escapes, else 0; uint8, shape [batch, vertex, direction].
@@ -82,20 +121,20 @@ def trace_visibility(
     check.shape("points", points.shape, ("batch", "vertex"))
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
-    if offset is None:
-        offset = ray_offset(mesh)
-    if not (np.isfinite(offset) and offset >= 0.0):
-        raise ValueError(f"offset: got {offset!r}, expected a finite length that is not negative")
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     launch_slices(
         _trace_visibility,
         dim=(points.size, *directions.shape),
         cost=_RAY_COST,
-        inputs=[mesh.id, points, normals, directions, float(offset)],
+        inputs=[_id(mesh), points, normals, directions],
         outputs=[visibility],
         device=points.device,
     )
     return visibility
+
+
+def _id(mesh: wp.Mesh | None) -> wp.uint64:
+    return wp.uint64(0) if mesh is None else mesh.id
 
 
 # ---------------------------------------------------------------------------------------------- shading by rays
@@ -169,7 +208,6 @@ def _trace_shading(
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    offset: float,
     directions: wp.array2d[wp.vec3],
     radiance: wp.array2d[wp.vec3],
     # out
@@ -178,24 +216,24 @@ def _trace_shading(
     """A thread owns a receiver."""
     receiver = first_row + wp.tid()
     chosen = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
+    point = points[receiver]
     normal = normals[receiver]
-    start = points[receiver] + offset * normal
     total = wp.vec3()
     for sample in range(directions.shape[1]):
         toward = directions[chosen, sample]
         cosine = wp.dot(normal, toward)
-        if cosine > 0.0 and not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
+        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
             total += cosine * radiance[chosen, sample]
     shading[receiver] = total / wp.pi
 
 
 def trace_shading(
-    mesh: wp.Mesh, points: wp.array, normals: wp.array, samples: LightSamples, *, progress: bool = False
+    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, samples: LightSamples, *, progress: bool = False
 ) -> wp.array:
     """Trace the shading of receivers: the radiance of a white surface, single bounce, as a path tracer gives it.
 
     Args:
-        mesh: What blocks the light.
+        mesh: What blocks the light, None for nothing.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light.
@@ -210,13 +248,12 @@ def trace_shading(
     directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
     shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
-    offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch_slices(
             _trace_shading,
             dim=[part.stop - part.start],
             cost=_RAY_COST * directions.shape[1],
-            inputs=[mesh.id, points[part], normals[part], offset, directions, radiance],
+            inputs=[_id(mesh), points[part], normals[part], directions, radiance],
             outputs=[shading[part]],
             device=device,
         )
@@ -224,12 +261,12 @@ def trace_shading(
 
 
 def trace_transfer(
-    mesh: wp.Mesh, points: wp.array, normals: wp.array, basis: Basis, count: int, *, progress: bool = False
+    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, basis: Basis, count: int, *, progress: bool = False
 ) -> wp.array:
     """Trace transfer vectors: light of the basis is then shadowed by the mesh itself, exactly but for sampling.
 
     Args:
-        mesh: What blocks the light.
+        mesh: What blocks the light, None for nothing.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         basis: What the light is expressed in.
@@ -245,14 +282,12 @@ def trace_transfer(
     towards = wp.array(directions, dtype=wp.vec3, device=points.device)
     functions = (4 / len(directions) * basis.functions(directions)).astype(np.float32)
     transfer = np.empty((points.shape[0], basis.size), np.float32)
-    offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**22 // len(directions), progress):
         visibility = trace_visibility(
             mesh,
             points[part].reshape((1, -1)),
             normals[part].reshape((1, -1)),
             towards,
-            offset=offset,
         )
         cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
         transfer[part] = (visibility.numpy()[0] * cosine) @ functions
@@ -268,7 +303,6 @@ def _trace_cells(
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     numbers: wp.array[wp.int32],
-    offset: float,
     directions: wp.array2d[wp.vec3],
     cells: wp.array2d[wp.int32],
     radiance: wp.array3d[wp.float32],
@@ -278,12 +312,12 @@ def _trace_cells(
     """A thread owns a receiver, whose cells are zero before."""
     receiver = first_row + wp.tid()
     chosen = int(wp.rand_init(17, numbers[receiver]) % wp.uint32(directions.shape[0]))
+    point = points[receiver]
     normal = normals[receiver]
-    start = points[receiver] + offset * normal
     for sample in range(directions.shape[1]):
         toward = directions[chosen, sample]
         cosine = wp.dot(normal, toward) / wp.pi
-        if cosine > 0.0 and not wp.mesh_query_ray_anyhit(mesh, start, toward, 1.0e30):
+        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
             cell = cells[chosen, sample]
             for channel in range(light.shape[1]):
                 light[receiver, channel, cell] = (
@@ -325,7 +359,7 @@ def cell_samples(samples: LightSamples, directions: np.ndarray, *, device: wp.De
 
 
 def trace_cells(
-    mesh: wp.Mesh,
+    mesh: wp.Mesh | None,
     points: wp.array,
     normals: wp.array,
     numbers: wp.array,
@@ -336,7 +370,7 @@ def trace_cells(
     """Trace how much light each cell of directions sends past a mesh: :func:`trace_shading`, apart for each cell.
 
     Args:
-        mesh: What blocks the light.
+        mesh: What blocks the light, None for nothing.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         numbers: What tells the receivers apart, int32 of shape [receiver]: one gets the same rays whoever is with it.
@@ -350,13 +384,12 @@ def trace_cells(
     """
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
     light = wp.zeros(shape, dtype=wp.float32, device=points.device)
-    offset = ray_offset(mesh)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch_slices(
             _trace_cells,
             dim=[part.stop - part.start],
             cost=_RAY_COST * samples.directions.shape[1],
-            inputs=[mesh.id, points[part], normals[part], numbers[part], offset, *samples[:3]],
+            inputs=[_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
             outputs=[light[part]],
             device=points.device,
         )

@@ -79,8 +79,9 @@ class Body:
         mesh: The mesh.
         albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3].
         texture: Reflectance as an image in place of ``albedo``, linear RGB of shape [height, width, 3]; needs uvs.
-        blockers: Number of spheres to fit to the mesh, or the spheres themselves; 0 casts no shadow. A flat body
-            with all else on its front side is a ground, for which any number means one sphere touching it from behind.
+        blockers: Number of spheres to fit to the mesh, or the spheres themselves; 0 or none casts no shadow, by rays
+            neither. A flat body with all else on its front side is a ground, for which any number means one sphere
+            touching it from behind.
         rotation: Axis-angle vector [degrees], shape [3].
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
@@ -141,6 +142,11 @@ class Body:
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise ValueError(f"scale: got {self.scale!r}, expected a positive number")
         check.choice("receivers", self.receivers, RECEIVERS)
+
+    @property
+    def casts_shadow(self) -> bool:
+        """Whether the body blocks light."""
+        return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
     def rotation_matrix(self) -> np.ndarray:
         """The rotation as a matrix, float64 of shape [3, 3] (Rodrigues' formula)."""

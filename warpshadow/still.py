@@ -167,7 +167,7 @@ class Still:
             if kind not in self._drawn:
                 self._drawn[kind] = cell_samples(_samples(light, samples), directions, device=points.device)
             drawn = self._drawn[kind]
-            return trace_cells(self._blockers, points[0], normals[0], numbers, drawn, progress=self._progress)
+            return trace_cells(self._casting_mesh, points[0], normals[0], numbers, drawn, progress=self._progress)
 
         return self._kept(kind, vertices, trace)
 
@@ -187,20 +187,8 @@ class Still:
         return self._rows[kind].of(vertices, find)
 
     @functools.cached_property
-    def _blockers(self) -> wp.Mesh:
-        """The meshes of the still bodies that block light."""
-        assembly = self._assembly
-        blocking = [
-            number for number in self._bodies if assembly.first_sphere[number] < assembly.first_sphere[number + 1]
-        ]
-        faces = assembly.faces.numpy()[np.isin(assembly.body_of_face, blocking)]
-        used, indices = np.unique(faces, return_inverse=True)
-        points = self._geometry.positions.numpy()[0, used]
-        device = assembly.device
-        return wp.Mesh(
-            points=wp.array(points, dtype=wp.vec3, device=device),
-            indices=wp.array(indices.ravel(), dtype=wp.int32, device=device),
-        )
+    def _casting_mesh(self) -> wp.Mesh | None:
+        return self._assembly.casting_mesh(self._geometry.positions[0], self._bodies)
 
 
 def _first_instance(array: wp.array) -> wp.array:
