@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow import reference, sh
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
-from warpshadow.mesh import Mesh, icosphere
+from warpshadow.mesh import Mesh, icosphere, plane
 from warpshadow.reference import (
     SET_COUNT,
     cell_samples,
@@ -66,6 +66,20 @@ def test_points_of_a_convex_mesh_see_their_whole_hemisphere(device):
     assert not visible[cosine <= 0].any()
 
 
+def moeller_trumbore(mesh: Mesh, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Whether rays meet any face, float64: bool of shape [point, direction]."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(directions[:, None], second[None])  # [direction, face, 3]
+    determinant = (across * first).sum(axis=-1)
+    from_corner = points[:, None] - corners[None, :, 0]  # [point, face, 3]
+    u = np.einsum("pfi,dfi->pdf", from_corner, across) / determinant
+    sideways = np.cross(from_corner, first)
+    v = np.einsum("pfi,di->pdf", sideways, directions) / determinant
+    along = (sideways * second).sum(axis=-1)[:, None] / determinant
+    return ((u > 0) & (v > 0) & (u + v < 1) & (along > 0)).any(axis=-1)
+
+
 def test_moeller_and_trumbore_find_the_same_rays_blocked(device):
     ball = icosphere(1.0, 2)
     mesh = Mesh(ball.positions * [1.5, 0.3, 1.0] + np.sin(3 * ball.positions[:, ::-1]), ball.faces)  # not convex
@@ -76,16 +90,7 @@ def test_moeller_and_trumbore_find_the_same_rays_blocked(device):
     directions = fibonacci(32)
     visible = trace(warp_mesh(mesh, device), points[None], normals[None], directions, device)[0]
 
-    corners = mesh.positions[mesh.faces].astype(np.float64)
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across = np.cross(directions[:, None], second[None])  # [direction, face, 3]
-    determinant = (across * first).sum(axis=-1)
-    from_corner = points[:, None] - corners[None, :, 0]  # [point, face, 3]
-    u = np.einsum("pfi,dfi->pdf", from_corner, across) / determinant
-    sideways = np.cross(from_corner, first)
-    v = np.einsum("pfi,di->pdf", sideways, directions) / determinant
-    along = (sideways * second).sum(axis=-1)[:, None] / determinant
-    hit = ((u > 0) & (v > 0) & (u + v < 1) & (along > 0)).any(axis=-1)
+    hit = moeller_trumbore(mesh, points, directions)
     expected = ~hit & (normals @ directions.T > 0)
     assert 0.1 < hit.mean() < 0.9
     assert (visible == expected).mean() > 0.998  # rays through edges may go either way
@@ -95,6 +100,103 @@ def test_normals_of_another_shape_are_refused(device):
     mesh = warp_mesh(icosphere(1.0, 1), device)
     with pytest.raises(ValueError, match="normals: got shape"):
         trace(mesh, np.zeros((1, 2, 3)), np.ones((1, 1, 3)), fibonacci(16), device)
+
+
+# ---------------------------------------------------------------------------------------------- receivers on faces
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(faces))
+
+
+OBJECTS = {
+    "a ball that touches the ground": lambda size: icosphere(size / 2, 2).transformed(translation=[0, size / 2, 0]),
+    "a plate a thousandth of its size above": lambda size: plane(size, 1).transformed(translation=[0, size / 1000, 0]),
+    "a leaning plate": lambda size: plane(size, 1).transformed(
+        rotation=np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]), translation=[0, 0.301 * size, 0]
+    ),
+}
+
+
+@pytest.mark.parametrize("segments", [1, 64])
+@pytest.mark.parametrize("name", OBJECTS)
+def test_shadows_of_what_touches_a_ground_of_any_size_are_its_own_whatever_its_size(name, segments, device):
+    """No ray starts beyond what it is to meet, and none meets the ground that it starts from."""
+    directions = fibonacci(64)
+    spots = np.random.default_rng(SEED).uniform(-1, 1, size=(40, 3)) * [1, 0, 1]
+    for size in (1e-3, 1.0, 1e3):
+        body = OBJECTS[name](size)
+        for ground_size in (1.0, 1e2, 1e5):
+            points = (spots * min(0.8 * size, 0.5 * ground_size)).astype(np.float32)
+            mesh = warp_mesh(joined(body, plane(ground_size, segments)), device)
+            up = np.tile([0.0, 1.0, 0.0], (1, len(points), 1))
+            visible = trace(mesh, points[None], up, directions, device)[0]
+            expected = ~moeller_trumbore(body, points.astype(np.float64), directions) & (directions[:, 1] > 0)
+            assert (visible != expected).mean() < 0.002  # rays through edges may go either way
+
+
+@pytest.mark.parametrize(("size", "distance"), [(1.0, 0.0), (1e5, 0.0), (100.0, 1e5), (1e5, 1e5)])
+@pytest.mark.parametrize("segments", [1, 16])
+def test_grounds_of_any_size_slope_and_place_cast_no_shadow_on_their_points(size, distance, segments, device):
+    """Points are interpolated in float32, as those of pixels are, so they lie beside their faces, or on edges."""
+    rng = np.random.default_rng(SEED)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.linalg.det(rotation)
+    directions = fibonacci(128)
+    ground = plane(size, segments).transformed(rotation=rotation, translation=distance * np.array([0.5, 0.3, -0.8]))
+    weights = rng.dirichlet(np.ones(3), size=400)
+    weights[::4, 0] = 0
+    weights[::4] /= weights[::4].sum(axis=1, keepdims=True)
+    corners = ground.positions[rng.choice(ground.faces, 400)]
+    points = np.einsum("pk,pkx->px", weights.astype(np.float32), corners, dtype=np.float32)
+    normals = np.tile(rotation[:, 1], (400, 1))
+    visible = trace(warp_mesh(ground, device), points[None], normals[None], directions, device)[0]
+    slope = 1e-2  # float32 turns faces of 6 units, 1e5 away, by a tenth of that
+    assert visible[:, directions @ rotation[:, 1] > slope].all()
+
+
+def test_scaling_a_scene_by_a_power_of_two_changes_no_ray(device):
+    ball = icosphere(1.0, 2)
+    bumpy = Mesh(ball.positions * (1 + 0.3 * np.sin(5 * ball.positions[:, ::-1])), ball.faces)
+    normals = bumpy.positions / np.linalg.norm(bumpy.positions, axis=1, keepdims=True)
+    directions = fibonacci(64)
+    expected = trace(warp_mesh(bumpy, device), bumpy.positions[None], normals[None], directions, device)
+    assert 0.2 < expected.mean() < 0.45
+    for scale in (2.0**-40, 2.0**40):
+        scaled = Mesh(scale * bumpy.positions, bumpy.faces)
+        visible = trace(warp_mesh(scaled, device), scaled.positions[None], normals[None], directions, device)
+        np.testing.assert_array_equal(visible, expected)
+
+
+def test_light_from_behind_a_receivers_own_face_does_not_reach_it(device):
+    """Smooth normals lean away from faces; then a face shades what lies on it, in the middle and at the corners."""
+    sheet = plane(1.0, 1)
+    points = np.array([[0.1, 0, 0.2], [0, 0, 0], [-0.5, 0, 0], [0.5, 0, 0.5]])
+    normals = np.tile([0.6, 0.8, 0.0], (4, 1))
+    directions = fibonacci(256)
+    directions = directions[(directions @ normals[0] > 0) & (np.abs(directions[:, 1]) > 0.01)]
+    visible = trace(warp_mesh(sheet, device), points[None], normals[None], directions, device)[0]
+    from_behind = directions[:, 1] < 0
+    assert from_behind.sum() > 20 and visible[:, ~from_behind].all()
+    assert not visible[:3, from_behind].any()  # all such light comes from +x
+    assert visible[3, from_behind].all()  # there past the corner
+
+
+def test_rays_along_axes_meet_flat_faces(device):
+    """Boxes of no height, met exactly from below, on them, on edges between them, and beside them."""
+    points = np.array([[0.2, -1, 0.3], [0.2, 0, 0.3], [0.5, -1, 0.5], [0.5, 0, 0.5], [1.1, -1, 0.3], [1.1, 0, 0.3]])
+    up = np.array([[0.0, 1.0, 0.0]])
+    visible = trace(warp_mesh(plane(2.0, 4), device), points[None], np.repeat(up, 6, axis=0)[None], up, device)
+    np.testing.assert_array_equal(visible[0, :, 0], [0, 1, 0, 1, 1, 1])
+
+
+def test_faces_without_area_stop_no_ray(device):
+    corners = np.array([[0, 1, 0], [1, 1, 0], [2, 1, 0], [0, 1, 0]], np.float32)
+    mesh = warp_mesh(Mesh(corners, np.array([[0, 1, 2], [0, 0, 3], [1, 1, 2]])), device)
+    up = np.array([[0.0, 1.0, 0.0]])
+    assert trace(mesh, np.array([[[0.5, 0, 0], [0.5, 1, 0]]]), np.tile(up, (1, 2, 1)), up, device).all()
 
 
 # ---------------------------------------------------------------------------------------------- shading by rays
@@ -295,3 +397,13 @@ def test_cells_of_unit_light_are_transfer_to_them(device):
     light = trace_cells(mesh, points, normals, numbers, samples).numpy()[:, 0]
     expected = trace_transfer(mesh, points, normals, CellBasis(directions), 512).numpy()
     assert np.abs(light - expected).max() < 1e-6
+
+
+def test_past_no_mesh_nothing_is_traced(device):
+    mesh, points, normals, _ = ball_over_points(device)
+    samples, basis = sample_map(np.ones((16, 32, 3), np.float32), 2048), HarmonicBasis(2)
+    assert np.abs(trace_shading(None, points, normals, samples).numpy() - 1).max() < ROUGH
+    transfer = trace_transfer(None, points, normals, basis, 4096).numpy()
+    assert np.abs(transfer @ [np.sqrt(4 * np.pi), 0, 0, 0] - 1).max() < 5e-3
+    everything = trace(None, np.zeros((1, 1, 3)), np.array([[[0.0, 1, 0]]]), fibonacci(64), device)[0, 0]
+    np.testing.assert_array_equal(everything, fibonacci(64)[:, 1] > 0)
