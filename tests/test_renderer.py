@@ -11,6 +11,7 @@ import warpshadow as ws
 from warpshadow import lighting, sh
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
+from warpshadow.point_sample import PointSample
 from warpshadow.renderer import Renderer
 
 METHODS = ("directional", "log-sh", "none", "ray-traced")
@@ -119,6 +120,35 @@ def test_without_blockers_log_sh_is_no_visibility_at_all(device):
     bodies = ball(blockers=0), ground()
     shadowed, direct = (ws.render(scene_of(method, *bodies), device=device) for method in ("log-sh", "none"))
     np.testing.assert_array_equal(shadowed, direct)
+
+
+# ---------------------------------------------------------------------------------------------- bodies without blockers
+
+
+@pytest.mark.parametrize("blockers", [0, ws.Spheres(np.empty((0, 3)), [])], ids=["0", "no spheres"])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, blockers):
+    """Neither when all bodies may move nor when it stands still among moving ones, nor on what it is compared with."""
+    canopy = ws.Body(ws.plane(4.0, 8), blockers=blockers, translation=(0, 2.6, 0))  # beyond what the camera sees
+    results = []
+    for bodies in ((ball(), ground()), (ball(), ground(), canopy)):
+        scene = scene_of(method, *bodies, samples=64)
+        renderer = Renderer(scene, device=device)
+        moved = renderer.view(renderer.assembly.placed(moving=[0]))
+        results.append((renderer.render(), renderer.draw(view=moved).numpy(), PointSample(scene, count=99).truth))
+    for without, with_canopy in zip(*results, strict=True):
+        np.testing.assert_array_equal(with_canopy, without)
+
+
+def test_where_nothing_casts_a_shadow_rays_need_no_hierarchy(device, monkeypatch):
+    monkeypatch.setattr(wp, "Mesh", None)
+    renderer = Renderer(scene_of("ray-traced", ball(blockers=0), ground()), device=device)
+    assert renderer.explain()["visibility"].forward.why == "no body has blockers"
+    direct = ws.render(scene_of("none", ball(blockers=0), ground()), device=device)
+    assert relative_error(renderer.render(), direct) < RAY_NOISE
+    light = wp.array(renderer.basis.coefficients(dome())[None], dtype=wp.vec3, device=device)
+    assert not renderer.explain(light)["visibility"]
+    assert relative_error(renderer.draw(light).numpy()[0], direct) < RAY_NOISE
 
 
 # ---------------------------------------------------------------------------------------------- light
