@@ -292,7 +292,7 @@ def test_poses_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, d
         deform.Poses(*similarity).points(rest, members)
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e10])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 2e18])
 @pytest.mark.parametrize("name", ["matrices", "translations"])
 def test_deformations_refuse_what_is_not_finite_or_too_large_by_its_name(name, value, graph, device):
     values = {"matrices": np.ones((1, 12, 3, 3)), "translations": np.ones((1, 12, 3))}
@@ -303,3 +303,36 @@ def test_deformations_refuse_what_is_not_finite_or_too_large_by_its_name(name, v
             call(matrices, translations)
     with pytest.raises(ValueError, match=f"^{name}: got 1 "):
         graph.shear(matrices) if name == "matrices" else graph.centers(translations)
+
+
+def test_bodies_and_nodes_may_be_as_large_and_far_as_everything_else(graph, device):
+    poses = deform.Poses(
+        put(np.eye(3)[None, None], wp.mat33, device),
+        put(np.full((1, 1, 3), 5e17), wp.vec3, device),
+        put([[4e17]], wp.float32, device),
+    )
+    members = wp.zeros(1, dtype=wp.int32, device=device)
+    assert (poses.points(put(np.ones((1, 1, 3)), wp.vec3, device), members).numpy() == np.float32(9e17)).all()
+    shifts = put(np.full((1, 12, 3), 1e18), wp.vec3, device)
+    np.testing.assert_allclose(graph.centers(shifts).numpy(), 1e18)
+
+
+@pytest.mark.parametrize("name", ["rigidity", "shear"])
+def test_energies_that_are_no_float32_are_refused_and_smaller_ones_have_gradients(name, device):
+    rng = np.random.default_rng(2)
+    nodes = 100 * rng.normal(size=(12, 3))
+    graph = deform.DeformationGraph.bind(nodes, nodes, count=3, device=device)
+    values = rng.normal(size=(1, 12, 3, 3))
+
+    def energy(size):
+        matrices, translations = put(size * values, wp.mat33, device), put(np.zeros((1, 12, 3)), wp.vec3, device)
+        with wp.Tape() as tape:
+            result = graph.shear(matrices) if name == "shear" else graph.rigidity(matrices, translations)
+        tape.backward(grads={result: wp.ones_like(result, requires_grad=False)})
+        return result.numpy(), matrices.grad.numpy()
+
+    assert all(np.isfinite(found).all() for found in energy(1e8))
+    with pytest.raises(
+        ValueError, match="^matrices.*: got an energy beyond float32's range, expected smaller numbers$"
+    ):
+        energy(2e17)

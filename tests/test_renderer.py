@@ -469,7 +469,9 @@ def test_parts_of_receivers_need_little_memory(monkeypatch):
     sizes = []
     shade = lighting.shade
     monkeypatch.setattr(
-        lighting, "shade", lambda transfer, light: sizes.append(transfer.shape[1]) or shade(transfer, light)
+        lighting,
+        "shade",
+        lambda transfer, *rest, **most: sizes.append(transfer.shape[1]) or shade(transfer, *rest, **most),
     )
     scene = ws.Scene((ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE),), dome(), CAMERA)
     Renderer(scene).render()

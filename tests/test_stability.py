@@ -3,6 +3,7 @@
 The cases and their measurement are those of demos/stability.py, which prints the figures that these tests bound.
 """
 
+import dataclasses
 import sys
 import warnings
 from pathlib import Path
@@ -15,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+import warpshadow as ws
+from warpshadow.deform import Poses
 from warpshadow.directions import fibonacci
 from warpshadow.mesh import vertex_normals
 from warpshadow.shading import shade
@@ -422,6 +425,80 @@ def test_any_finite_light_gives_finite_shading_and_gradients(light, order):
         return shade(directional_transfer(seen, normals, directions), coefficients)
 
     assert_finite(*backward(shading, *scene, coefficients))
+
+
+# ------------------------------------------------------------------------------------------ one bound for all
+
+METHODS = ("directional", "log-sh", "none", "ray-traced")
+
+
+def small_scene(method, *, scale=1.0, light=1.0, texel=0.5):
+    """A ball over a textured ground, whatever its size, in constant light or in harmonics."""
+    ball = ws.Body(ws.icosphere(0.5, 1), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 0.6 * scale, 0))
+    ground = ws.Body(ws.plane(4.0, 4), blockers=0, texture=np.full((4, 4, 3), texel))
+    bodies = [dataclasses.replace(body, scale=scale) for body in (ball, ground)]
+    eye, target = np.array([0.3, 2, 3.5]) * scale, np.array([0, 0.4, 0]) * scale
+    camera = ws.Camera.look_at(eye, target, size=(12, 8), near=0.01 * scale)
+    light = ws.EnvironmentMap.constant(light, height=8) if np.isscalar(light) else light
+    return ws.Scene(bodies, light, camera, ws.Visibility(method, directions=32, order=4, samples=32))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_light_colors_and_scenes_up_to_the_bound_give_finite_images_by_every_method(method):
+    harmonics = np.random.default_rng(0).choice([-LARGEST, LARGEST], (16, 3))
+    for light in (LARGEST, harmonics):
+        assert np.isfinite(ws.render(small_scene(method, light=light, texel=LARGEST))).all()
+    expected = ws.render(small_scene(method))
+    for scale in (2.0**-20, 2.0**40):
+        assert np.abs(ws.render(small_scene(method, scale=scale)) - expected).max() < VALUE
+    for scale in (2.0**-57, 2.0**57):  # 7e-18 to 1.4e17: silhouettes are no longer smoothed
+        image = ws.render(small_scene(method, scale=scale))
+        assert np.isfinite(image).all() and np.abs(image - expected)[expected[..., 3] == 1].mean() < 0.02
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_refuses_what_is_beyond_the_bound_by_the_name_of_the_argument(method):
+    beyond = 1.1e18
+    renderer = ws.Renderer(small_scene(method))
+    free = np.full((renderer.basis.size, 3), beyond)
+    calls = [
+        ("radiance", lambda: small_scene(method, light=beyond)),
+        ("light", lambda: small_scene(method, light=np.full((16, 3), beyond))),
+        ("light", lambda: renderer.render(free[:16])),
+        ("light", lambda: renderer.draw(put(free, wp.vec3))),
+        ("texture", lambda: small_scene(method, texel=beyond)),
+        ("scale", lambda: small_scene(method, scale=beyond)),
+        ("eye", lambda: ws.Camera.look_at((0, 0, beyond), (0, 0, 0))),
+        ("near", lambda: ws.Camera.look_at((0, 0, 1), (0, 0, 0), near=beyond)),
+        ("clip_matrices", lambda: renderer.view(clip_matrices=put(np.full((4, 4), beyond), wp.mat44))),
+        ("positions", lambda: ws.Mesh(beyond * np.eye(3), np.array([[0, 1, 2]]))),
+        ("centers", lambda: ws.Spheres([[beyond, 0, 0]], [1])),
+        ("radii", lambda: ws.Spheres([[0, 0, 0]], [beyond])),
+    ]
+    for name, call in calls:
+        with pytest.raises(ValueError, match=rf"^{name}: got .*1e\+18"):
+            call()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_are_refused_where_they_or_what_they_place_are_beyond_the_bound(method):
+    renderer = ws.Renderer(small_scene(method))
+    rotations = renderer.assembly.poses.rotations
+    for shift, scale, name in ((2e18, 1.0, "translations"), (0, 2e18, "scales"), (LARGEST, LARGEST, "positions")):
+        poses = Poses(rotations, put(np.full((2, 3), shift), wp.vec3), put([scale, scale], wp.float32))
+        with pytest.raises(ValueError, match=rf"^{name}: got .*1e\+18"):
+            renderer.view(renderer.assembly.placed(poses))
+
+
+@pytest.mark.parametrize("method", METHODS[:3])
+@pytest.mark.parametrize("scale", [2.0**-57, 2.0**57])
+def test_poses_of_the_smallest_and_the_largest_scenes_have_finite_gradients(method, scale):
+    renderer = ws.Renderer(small_scene(method, scale=scale))
+    assembly, poses = renderer.assembly, renderer.assembly.poses
+    free = [wp.clone(array, requires_grad=True) for array in (poses.rotations, poses.translations, poses.scales)]
+    values, gradients = backward(lambda *free: renderer.draw(view=renderer.view(assembly.placed(Poses(*free)))), *free)
+    assert_finite(values, gradients)
+    assert all(gradient.any() for gradient in gradients)
 
 
 # ------------------------------------------------------------------------------------------ triangles

@@ -254,6 +254,7 @@ def compose_clip_matrices(
     """
     width, height = _size(size)
     variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
+    check.finite_arrays(variables)
     to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
     clip_matrices = wp.empty(
         common_batch(variables),
@@ -299,6 +300,7 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
         ValueError: naming the argument, what it got and what it accepts.
     Differentiable: positions, clip_matrices.
     """
+    check.finite_arrays({"clip_matrices": clip_matrices})
     batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
     clip_positions = wp.empty(
         (batch_count, positions.shape[1]),
@@ -325,8 +327,8 @@ def _array(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _positive(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name}: got {value!r}, expected a positive number")
+    if not 0.0 < value <= check.LARGEST:
+        raise ValueError(f"{name}: got {value!r}, expected a positive number up to {check.LARGEST:g}")
     return float(value)
 
 

@@ -7,9 +7,7 @@ import numpy as np
 import warp as wp
 
 LARGEST = 1.0e18
-"""The largest coordinate, radius or coefficient that stages accept: its square, summed up, still fits a float32."""
-
-_FLOAT32_MAX = float(np.finfo(np.float32).max)
+"""The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -31,13 +29,20 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
             )
 
 
-def finite(name: str, values: np.ndarray) -> None:
-    """Raise ValueError when a floating-point array holds NaN or Inf, with their count and the first place."""
+def finite(name: str, values: np.ndarray, *, least: float = -LARGEST, most: float = LARGEST) -> None:
+    """Raise ValueError when an array holds NaN, Inf or numbers out of range, with their count and the first place."""
     bad = ~np.isfinite(values)
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
             f"{name}: got {int(bad.sum())} NaN or Inf values (first at index {place}), expected finite numbers"
+        )
+    outside = (values < least) | (values > most)
+    if outside.any():
+        place = tuple(int(i) for i in np.argwhere(outside)[0])
+        raise ValueError(
+            f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
+            f"expected {least:g} to {most:g}"
         )
 
 
@@ -58,9 +63,9 @@ def _count_outside(
 
 
 def finite_arrays(
-    arrays: Mapping[str, wp.array | None], *, most: float = _FLOAT32_MAX, nonnegative: Collection[str] = ()
+    arrays: Mapping[str, wp.array | None], *, most: float = LARGEST, nonnegative: Collection[str] = ()
 ) -> None:
-    """Raise ValueError when float32 arrays on a device, of scalars, vectors or matrices, hold NaN or Inf.
+    """Raise ValueError when float32 arrays on a device hold NaN, Inf or numbers out of range, of whatever dtype.
 
     On a GPU, one count for all of them is read back, which waits for the device. While a CUDA graph is captured that
     cannot be, and nothing is checked.
@@ -77,14 +82,7 @@ def finite_arrays(
     is_on_host = all(array.device.is_cpu for array in present.values())
     find = _outside_on_host if is_on_host else _outside_on_device
     for name in find(present, ranges):
-        values, least = present[name].numpy(), ranges[name][0]
-        finite(name, values)
-        outside = (values < least) | (values > most)
-        place = tuple(int(i) for i in np.argwhere(outside)[0])
-        raise ValueError(
-            f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
-            f"expected {least:g} to {most:g}"
-        )
+        finite(name, present[name].numpy(), least=ranges[name][0], most=most)
 
 
 def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:

@@ -26,9 +26,7 @@ PARALLEL = 1.0e-6
 NOT_ORTHONORMAL = 0.05
 """Largest entry of |RᵀR − I| of what is taken for a rotation: a step of 0.01 in all nine numbers stays below."""
 
-_LARGEST_POSE = 1.0e12  # a product of scale, rotation and position is a float32
 _SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
-_LARGEST_NODE = 1.0e9  # so is the fourth power of a matrix, in the energies
 
 # ---------------------------------------------------------------------------------------------- rotations
 
@@ -151,7 +149,7 @@ def _check_rotations(parameters: wp.array) -> None:
     """Raise ValueError for parameters that no rotation has."""
     if parameters.device.is_capturing:
         return
-    check.finite_arrays({"parameters": parameters}, most=check.LARGEST)
+    check.finite_arrays({"parameters": parameters})
     if parameters.dtype is wp.vec3:
         return
     values = parameters.numpy().astype(np.float64)
@@ -280,7 +278,7 @@ class Poses:
         """Shape of what moves."""
         check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
         arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
-        check.finite_arrays(arrays, most=_LARGEST_POSE)
+        check.finite_arrays(arrays)
         return common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]
 
 
@@ -439,7 +437,7 @@ class DeformationGraph:
     def centers(self, translations: wp.array) -> wp.array:
         """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
-        check.finite_arrays({"translations": translations}, most=_LARGEST_NODE)
+        check.finite_arrays({"translations": translations})
         return _launch(_move_nodes, translations.shape, wp.vec3, [self.node_positions, translations])
 
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
@@ -452,7 +450,7 @@ class DeformationGraph:
         """
         self._check(matrices, translations)
         inputs = [self.node_positions, self.neighbors, matrices, translations]
-        return _launch(_sum_rigidity, (matrices.shape[0], self.neighbors.shape[0]), wp.float32, inputs, is_sum=True)
+        return _energy("matrices, translations", _sum_rigidity, (len(matrices), len(self.neighbors)), inputs)
 
     def shear(self, matrices: wp.array) -> wp.array:
         """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
@@ -460,24 +458,30 @@ class DeformationGraph:
         Differentiable: matrices.
         """
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
-        check.finite_arrays({"matrices": matrices}, most=_LARGEST_NODE)
-        return _launch(_sum_shear, matrices.shape, wp.float32, [matrices], is_sum=True)
+        check.finite_arrays({"matrices": matrices})
+        return _energy("matrices", _sum_shear, matrices.shape, [matrices])
 
     def _check(self, matrices: wp.array, translations: wp.array) -> None:
         check.shape("matrices", matrices.shape, ("batch", self.node_positions.shape[0]))
         check.shape("translations", translations.shape, matrices.shape)
-        check.finite_arrays({"matrices": matrices, "translations": translations}, most=_LARGEST_NODE)
+        check.finite_arrays({"matrices": matrices, "translations": translations})
 
 
-def _launch(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array], is_sum: bool = False):
-    """Launch a kernel whose result has the shape of the launch, or of its batch where threads add to a sum."""
-    device = inputs[0].device
-    make = wp.zeros if is_sum else wp.empty
-    result = make(
-        dim[:1] if is_sum else dim,
-        dtype=dtype,
-        device=device,
-        requires_grad=any(array.requires_grad for array in inputs),
-    )
-    launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=device)
+def _launch(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array]) -> wp.array:
+    """Launch a kernel whose result has the shape of the launch."""
+    result = wp.empty(dim, dtype=dtype, device=inputs[0].device, requires_grad=_varies(inputs))
+    launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=result.device)
     return result
+
+
+def _energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:
+    """Launch a kernel whose threads add to the energy of their instance; ValueError where that is no float32."""
+    energy = wp.zeros(dim[0], dtype=wp.float32, device=inputs[0].device, requires_grad=_varies(inputs))
+    launch(kernel, dim=dim, inputs=inputs, outputs=[energy], device=energy.device)
+    if not energy.device.is_capturing and not np.isfinite(energy.numpy()).all():
+        raise ValueError(f"{names}: got an energy beyond float32's range, expected smaller numbers")
+    return energy
+
+
+def _varies(inputs: list[wp.array]) -> bool:
+    return any(array.requires_grad for array in inputs)

@@ -46,10 +46,10 @@ class EnvironmentMap:
     """Light from infinitely far away, as an equirectangular map, validated; the array is a read-only copy.
 
     Args:
-        radiance: Linear RGB, finite and not negative, float32, shape [height, 2·height, 3].
+        radiance: Linear RGB, 0 to 1e18, float32, shape [height, 2·height, 3].
 
     Raises:
-        ImageError: for another shape or aspect, or NaN, Inf or negative values.
+        ImageError: for another shape or aspect, or NaN, Inf, negative values or values beyond 1e18.
     """
 
     radiance: np.ndarray = field(repr=False)
@@ -63,9 +63,9 @@ class EnvironmentMap:
         if bad.any():
             row, col, channel = np.argwhere(bad)[0]
             raise ImageError(
-                f"radiance: got {bad.sum()} NaN, Inf or negative values (first at row {row}, column {col}, "
-                f"channel {channel}: {radiance[row, col, channel]}), expected finite values of 0 or more; "
-                "sanitize='zero' or 'neighbors' repairs them on reading"
+                f"radiance: got {bad.sum()} NaN, Inf or negative values or such beyond {check.LARGEST:g} (first at row "
+                f"{row}, column {col}, channel {channel}: {radiance[row, col, channel]}), expected finite values of 0 "
+                "or more; sanitize='zero' or 'neighbors' repairs them on reading"
             )
         radiance.setflags(write=False)
         object.__setattr__(self, "radiance", radiance)
@@ -83,7 +83,7 @@ class EnvironmentMap:
 
         Args:
             path: An .exr or .hdr file, or any other that :func:`warpshadow.image.read_image` reads.
-            sanitize: What becomes of NaN, Inf and negative values: None raises, "zero" makes them 0,
+            sanitize: What becomes of NaN, Inf, negative values and those beyond 1e18: None raises, "zero" makes them 0,
                 "neighbors" the mean of the good values among the eight pixels around, spreading inward.
             part: Name or index of the part of a multi-part OpenEXR file.
             convention: Where the center of the file and its right quarter look, in a world with y up:
@@ -261,11 +261,11 @@ def _check_aspect(pixels: np.ndarray) -> None:
 
 
 def _bad_values(radiance: np.ndarray) -> np.ndarray:
-    return ~(np.isfinite(radiance) & (radiance >= 0))
+    return ~((radiance >= 0) & (radiance <= check.LARGEST))
 
 
 def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
-    """Replace NaN, Inf and negative values."""
+    """Replace what no map may hold."""
     bad = _bad_values(radiance)
     values = np.where(bad, 0, radiance)
     if how == "zero" or not bad.any():

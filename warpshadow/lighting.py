@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import sh
+from warpshadow import check, sh
 from warpshadow.assembly import Assembly
 from warpshadow.basis import Basis, CellBasis, HarmonicBasis, conversion
 from warpshadow.batch import common_batch, concatenate, expand
@@ -29,6 +29,9 @@ Light = KnownLight | wp.array
 
 PART = 1 << 13
 """Receivers that are lit at once where no gradient is asked for."""
+
+_LARGEST_COEFFICIENT = 1e3 * check.LARGEST
+"""Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
 
 
 class _Terms(NamedTuple):
@@ -128,6 +131,8 @@ class Lighting:
     def shade(self, view: View, light: Light | None = None) -> wp.array:
         """Light the receivers of a view, by default in the scene's light: vec3 of shape [batch, receiver]."""
         light = self._scene.light if light is None else light
+        if isinstance(light, np.ndarray):
+            check.finite("light", light)
         plan = self._plan_of(view, light)
         if not plan.shading:
             shading = self._kept_shading(view, light)
@@ -146,6 +151,7 @@ class Lighting:
         return self.plan(view.facts, light, view=view, still=view.still)
 
     def _shade_free(self, plan: LightingPlan, view: View, light: wp.array) -> wp.array:
+        most = check.LARGEST
         if not view.varying:
             transfers = self._kept_transfers(plan, view)
         elif self.is_traced:
@@ -155,8 +161,9 @@ class Lighting:
             transfers = self._transfers(plan, self._groups(plan, view, terms), terms)
             if self._own_from_basis is not None:
                 light = shade(constant(self._own_from_basis[None], wp.float32, light.device), light)
+                most = _LARGEST_COEFFICIENT
         with self._ledger.timed(plan.shading, [*transfers, light]):
-            return _joined([shade(transfer, light) for transfer in transfers])
+            return _joined([shade(transfer, light, most=most) for transfer in transfers])
 
     def _shade_known(self, plan: LightingPlan, view: View, light: KnownLight) -> wp.array:
         terms = self._scene_terms if light is self._scene.light else self._known_terms(light)
@@ -387,7 +394,7 @@ def _lit(group: _Group, transfer: wp.array, terms: _Terms) -> wp.array:
     """Shading of a group in known light."""
     if terms.kept == LIT_CELLS and group.kept is not None:
         return light_cells(transfer, group.kept)
-    return shade(transfer, terms.coefficients)
+    return shade(transfer, terms.coefficients, most=_LARGEST_COEFFICIENT)
 
 
 def _in_step(group: _Group) -> _Group:

@@ -136,16 +136,16 @@ class Mesh:
 
 
 def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:
-    """Copy to float32 [item, width]; MeshError when empty, of another shape, or not finite."""
+    """Copy to float32 [item, width]; MeshError when empty, of another shape, not finite or too large."""
     with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
         values = np.array(values, dtype=np.float32, order="C")
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
         raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
     if len(bad):
         raise MeshError(
-            f"{name}: got NaN or Inf at {len(bad)} of {len(values)} "
-            f"(first at {item} {bad[0]}: {values[bad[0]].tolist()}), expected finite float32 numbers"
+            f"{name}: got NaN, Inf or numbers beyond {check.LARGEST:g} at {len(bad)} of {len(values)} "
+            f"(first at {item} {bad[0]}: {values[bad[0]].tolist()}), expected finite numbers"
         )
     return values
 
@@ -731,7 +731,7 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
 
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
-    check.finite_arrays({"positions": positions}, most=check.LARGEST)
+    check.finite_arrays({"positions": positions})
     device, requires_grad = positions.device, positions.requires_grad
     sums = wp.zeros(positions.shape, dtype=wp.vec3d, device=device, requires_grad=requires_grad)
     normals = wp.empty(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)

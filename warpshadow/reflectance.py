@@ -129,7 +129,7 @@ class Reflectance:
         materials = self._materials(albedo, textures)
         for name, given in (("albedo", albedo), ("textures", textures)):
             arrays = {f"{name}[{number}]": array for number, array in enumerate(given or ())}
-            check.finite_arrays(arrays, most=check.LARGEST)
+            check.finite_arrays(arrays)
         plan = self._plan(view.facts, materials, view.kept)
         if not plan.reflectance:
             assert view.kept.reflectance is not None

@@ -139,8 +139,8 @@ class Body:
             check.shape(name, vector.shape, (3,))
             check.finite(name, vector)
             object.__setattr__(self, name, vector)
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale: got {self.scale!r}, expected a positive number")
+        if not 0 < self.scale <= check.LARGEST:
+            raise ValueError(f"scale: got {self.scale!r}, expected a positive number up to {check.LARGEST:g}")
         check.choice("receivers", self.receivers, RECEIVERS)
 
     @property

@@ -157,13 +157,14 @@ def _shade_adjoint_light(
                 wp.atomic_add(adj_light, lit, channel, k, total[channel])
 
 
-def shade(transfer: wp.array, light: wp.array) -> wp.array:
+def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -> wp.array:
     """Light receivers: the radiance T · L of a white surface.
 
     Args:
         transfer: Transfer vectors, float32 of shape [batch, vertex, coefficient].
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
             Either batch may be 1 and then serves every instance of the other.
+        most: Largest magnitude of a coefficient.
 
     Returns:
         Shading, vec3 of shape [batch, vertex].
@@ -174,7 +175,7 @@ def shade(transfer: wp.array, light: wp.array) -> wp.array:
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))
-    check.finite_arrays({"light": light}, most=check.LARGEST)
+    check.finite_arrays({"light": light}, most=most)
     for name, array in (("transfer", transfer), ("light", light)):
         if not array.is_contiguous:
             raise ValueError(f"{name}: got a strided array, expected a contiguous one")

@@ -42,7 +42,7 @@ def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array,
     check.shape("centers", centers.shape, (points.shape[0], "sphere"))
     check.shape("radii", radii.shape, centers.shape)
     arrays = {"points": points, "normals": normals, "centers": centers, "radii": radii}
-    check.finite_arrays(arrays, most=check.LARGEST, nonnegative=["radii"])
+    check.finite_arrays(arrays, nonnegative=["radii"])
 
 
 @functools.cache

@@ -537,7 +537,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     if not device.is_capturing:
         held, broken = faults.numpy().tolist()
         if broken:
-            check.finite_arrays({"log_sh": log_sh}, most=check.LARGEST)
+            check.finite_arrays({"log_sh": log_sh})
         if held:
             warnings.warn(
                 f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
