@@ -163,7 +163,14 @@ def test_a_camera_names_the_argument_it_refuses(name, value):
         ("eye", {"eye": (0, np.inf, 0)}),
         ("fov_y", {"fov_y": 180.0}),
         ("fov_y", {"fov_y": np.nan}),
+        ("fov_y", {"fov_y": "40"}),
         ("size", {"size": (1, 2, 3)}),
+        ("size", {"size": 256}),
+        ("size", {"size": "256x256"}),
+        ("eye", {"eye": "front"}),
+        ("eye", {"eye": None}),
+        ("eye", {"eye": (0, (1, 2), 3)}),
+        ("near", {"near": "0.1"}),
         ("size (width)", {"size": (0, 2)}),
         ("size (height)", {"size": (1, 2.0)}),
         ("near", {"near": -1.0}),
@@ -172,6 +179,11 @@ def test_a_camera_names_the_argument_it_refuses(name, value):
 def test_look_at_names_the_argument_it_refuses(name, options):
     with pytest.raises(ValueError, match=f"^{re.escape(name)}: got"):
         Camera.look_at(**{"eye": (0, 0, 5), "target": (0, 0, 0), **options})
+
+
+def test_a_field_of_view_that_may_be_radians_is_remarked_on():
+    with pytest.warns(UserWarning, match="fov_y: got 0.7 degrees.* radians, they are 40.11 degrees"):
+        Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=0.7)
 
 
 def test_from_opengl_names_the_argument_it_refuses():

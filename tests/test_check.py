@@ -1,10 +1,17 @@
 """Argument checks: what passes, and what the message of a refusal says."""
 
+import math
+import re
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from warpshadow import check
+from warpshadow.mesh import MeshError
 
 
 def test_a_known_choice_passes():
@@ -86,6 +93,112 @@ def test_host_and_device_find_the_same_arrays(find, device):
     arrays["strided"] = strided
     assert find(arrays, dict.fromkeys(arrays, (-4.0, 4.0))) == ["nan", "inf", "large", "strided"]
     assert find({"strided": strided}, {"strided": (0.0, 10.0)}) == []  # 11 is not in the part
+
+
+@pytest.mark.parametrize("value", [1, -2.5, np.float32(3), np.int64(4)])
+def test_numbers_are_pythons_and_numpys(value):
+    assert check.is_number(value)
+    assert check.is_integer(value) == (value in (1, 4))
+
+
+@pytest.mark.parametrize("value", [True, "1", None, math.nan, math.inf, 10**400, np.ones(1), (1,), np.True_])
+def test_what_is_no_finite_number_is_none(value):
+    assert not check.is_number(value)
+
+
+@pytest.mark.parametrize("value", [True, 1.0, "1", None, np.float32(1)])
+def test_what_is_no_integer_is_none(value):
+    assert not check.is_integer(value)
+
+
+@pytest.mark.parametrize("value", [-1, 2, 1.0, True, "1", None])
+def test_the_number_of_a_thing_is_a_whole_one_that_there_is(value):
+    check.index("body", np.int64(1), 2, "body")
+    with pytest.raises(ValueError, match=f"^body: got {value!r}, expected the number of a body, from 0 to 1$"):
+        check.index("body", value, 2, "body")
+
+
+@pytest.mark.parametrize(
+    ("value", "called"),
+    [
+        ("cow.obj", "'cow.obj'"),
+        (Path("cow.obj"), "'cow.obj'"),
+        (None, "None"),
+        ((1, 2, 1), "(1, 2, 1)"),
+        (dict, "the class dict"),
+        ([0.5] * 99, "list of 99 items"),
+        ("x" * 99, "'" + "x" * 59 + "…"),
+        (np.zeros((2, 3), np.uint8), "ndarray of uint8 and shape (2, 3)"),
+        (torch.zeros(2, 3), "Tensor of torch.float32 and shape (2, 3)"),
+        (wp.zeros(2, dtype=wp.vec3), "array of vec3f and shape (2,)"),
+        (pytest, "module"),
+    ],
+)
+def test_a_message_quotes_what_is_short_and_describes_the_rest(value, called):
+    with pytest.raises(ValueError, match=f"^mesh: got {re.escape(called)}, expected a set$"):
+        check.instance("mesh", value, set, "a set")
+
+
+def test_numbers_are_copied_from_whatever_holds_them():
+    for values in ([[1, 2], [3, 4]], np.array([[1, 2], [3, 4]]), torch.tensor([[1.0, 2], [3, 4]])):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            copied = check.numbers("x", values)
+        np.testing.assert_array_equal(copied, np.array([[1, 2], [3, 4]], np.float32))
+        assert copied.dtype == np.float32 and not np.shares_memory(copied, np.asarray(values))
+    assert np.isinf(check.numbers("x", 1e39))
+
+
+@pytest.mark.parametrize("values", ["red", None, [[1, 2], [3]], {}, [None], True, 1j, torch.zeros(2).bfloat16()])
+def test_what_holds_no_numbers_is_named(values):
+    with pytest.raises(MeshError, match="^x: got .*, expected three numbers"):
+        check.numbers("x", values, expected="three numbers", error=MeshError)
+
+
+def test_a_tensor_whose_gradient_would_be_lost_is_refused():
+    with pytest.raises(ValueError, match=r"^x: got Tensor of .* that requires a gradient.*\.detach\(\)"):
+        check.numbers("x", torch.zeros(3, requires_grad=True))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64])
+def test_codes_of_a_picture_are_not_taken_for_light(dtype):
+    with pytest.raises(ValueError, match=rf"^image: got values of {np.dtype(dtype)}, .*srgb_to_linear\(values / 255\)"):
+        check.pixels("image", np.ones((2, 2, 3), dtype), expected="RGB")
+    assert check.pixels("image", np.ones((2, 2, 3), np.float16), expected="RGB").dtype == np.float32
+
+
+def test_a_device_is_warps_torchs_or_a_name(device):
+    same = wp.get_device(device)
+    assert check.device("device", device) == check.device("device", same) == same
+    assert check.device("device", torch.device(device)) == same
+    assert check.device("device", None) == wp.get_device()
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "mps", 0, torch.device("meta")])
+def test_a_device_that_is_not_there_is_refused_with_those_that_are(name, capfd):
+    with pytest.raises(ValueError, match=f"^device: got '{name}', expected one of 'cpu'"):
+        check.device("device", name)
+    assert "error" not in "".join(capfd.readouterr()).lower()  # the driver's
+
+
+def test_a_missing_file_is_named_with_the_folder_that_it_is_looked_for_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.obj").touch()
+    assert check.file("mesh", "a.obj").is_file() and check.file("mesh", tmp_path / "a.obj").is_file()
+    with pytest.raises(FileNotFoundError, match=rf"^mesh: no such file: b.obj \(in {re.escape(str(tmp_path))}\)$"):
+        check.file("mesh", "b.obj")
+    with pytest.raises(FileNotFoundError, match=f"^mesh: no such file: {re.escape(str(tmp_path / 'b.obj'))}$"):
+        check.file("mesh", tmp_path / "b.obj")
+
+
+@pytest.mark.parametrize("given", [np.ones(2), torch.ones(2, 3), {0: None}, "ab", 3])
+def test_what_is_given_for_each_body_is_a_list(given):
+    check.per_body("albedo", None, 2)
+    check.per_body("albedo", (None, 1), 2)
+    with pytest.raises(ValueError, match="^albedo: got .*, expected a list of 2 items, one for each body"):
+        check.per_body("albedo", given, 2)
+    with pytest.raises(ValueError, match="^albedo: got 1 items, expected 2, one for each body"):
+        check.per_body("albedo", [None], 2)
 
 
 def test_a_string_in_an_expected_shape_stands_for_any_length():

@@ -433,6 +433,8 @@ def test_unknown_extensions_missing_files_and_needless_parts_are_named(tmp_path)
         ("a.png", np.zeros(4), r"got pixels of shape \(4,\)"),
         ("a.jpg", np.zeros((4, 4, 4)), "JPEG has no alpha"),
         ("a.png", np.full((4, 4, 3), np.nan), "got 48 NaN values"),
+        ("a.png", np.full((4, 4, 3), 200, np.uint8), "pixels: got values of uint8"),
+        ("a.exr", "pixels", "pixels: got .pixels., expected linear values"),
     ],
 )
 def test_pixels_that_cannot_be_written_are_refused_and_leave_the_old_file(tmp_path, name, pixels, message):

@@ -80,8 +80,11 @@ def fibonacci(count):
         (np.ones((24, 4, 3)), "got 4 x 24 pixels, which looks like a cube map"),
         (np.ones((12, 16, 3)), "got 16 x 12 pixels, which looks like a cube map"),
         (np.ones((16, 12, 3)), "got 12 x 16 pixels, which looks like a cube map"),
-        (np.ones((8, 16)), r"got shape \(8, 16\), expected \[height, 2·height, 3\]"),
-        (np.ones((8, 16, 4)), r"got shape \(8, 16, 4\)"),
+        (np.ones((8, 16)), r"got shape \(8, 16\), expected \[height, 2·height, 3\]: gray"),
+        (np.ones((8, 16, 4)), r"got shape \(8, 16, 4\), .*: \[..., :3\] is without alpha"),
+        (np.ones((8, 16, 3), np.uint8), r"got values of uint8, .*srgb_to_linear\(values / 255\)"),
+        ("park.exr", r"got 'park.exr', expected an array .*EnvironmentMap.read\(path\)"),
+        (None, "got None, expected an array"),
         (np.ones((0, 0, 3)), r"got shape \(0, 0, 3\)"),
     ],
 )

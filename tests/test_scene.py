@@ -1,5 +1,7 @@
 """Scene files: every key, its default, and the message for everything that can be wrong with it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -310,16 +312,77 @@ def test_a_missing_scene_file_is_named(tmp_path):
         ({"albedo": np.ones((11, 3))}, r"albedo: got shape \(11, 3\)"),
         ({"albedo": (np.nan, 0, 0)}, "albedo: got 1 NaN"),
         ({"texture": np.ones((2, 2, 3))}, "texture: got an image, but mesh 'icosphere' has no uvs"),
+        ({"albedo": "red"}, r"albedo: got 'red', expected 3 finite numbers, or an .npy file"),
+        ({"albedo": (255, 100, 3)}, r"albedo: got values from 3.0 to 255.0, .*srgb_to_linear\(colors / 255\)"),
+        ({"albedo": np.ones((12, 3), np.uint8)}, "albedo: got values of uint8"),
         ({"blockers": -1}, "blockers: got -1"),
         ({"rotation": (1, 2)}, r"rotation: got shape \(2,\)"),
+        ({"rotation": np.eye(3)}, r"rotation: got shape \(3, 3\), expected \[3\]: an axis-angle vector in degrees"),
         ({"translation": (np.inf, 0, 0)}, "translation: got 1 NaN or Inf"),
+        ({"translation": None}, "translation: got None, expected three numbers"),
         ({"scale": 0.0}, "scale: got 0.0, expected a positive number"),
+        ({"scale": (1, 2, 1)}, r"scale: got \(1, 2, 1\), .*mesh.transformed\(scale=\(x, y, z\)\)"),
+        ({"scale": "2"}, "scale: got '2', expected a positive number"),
+        ({"mesh": None}, "mesh: got None, expected a Mesh or the path of a file"),
+        ({"mesh": np.ones((4, 3))}, r"mesh: got ndarray .* Mesh\(positions, faces\) makes one"),
         ({"receivers": "vertices"}, "receivers: got 'vertices'.*did you mean 'vertex'"),
     ],
 )
 def test_a_bad_argument_of_a_body_is_named(options, message):
     with pytest.raises(ValueError, match=message):
-        ws.Body(ws.icosphere(1.0, 0), **options)
+        ws.Body(**{"mesh": ws.icosphere(1.0, 0)} | options)
+
+
+@pytest.mark.parametrize(
+    ("texture", "message"),
+    [
+        (np.full((2, 2, 3), 200, np.uint8), r"texture: got values of uint8, .*srgb_to_linear\(values / 255\)"),
+        (np.full((2, 2, 3), 200.0), "texture: got values from 200.0 to 200.0, expected reflectances in"),
+        (np.full((2, 2, 3), -0.1), "texture: got values from -0.1"),
+        (np.ones((2, 2, 4)), r"texture: got shape \(2, 2, 4\), .*: \[..., :3\] is without alpha"),
+        (np.ones((2, 2)), "gray images are repeated"),
+        (np.ones((3, 8, 8)), "channels come last"),
+    ],
+)
+def test_an_image_that_is_no_reflectance_is_refused(texture, message):
+    with pytest.raises(ValueError, match=message):
+        ws.Body(ws.plane(1.0, 1), texture=texture)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_paths_stand_for_what_is_in_them_as_in_a_scene_file(load, tmp_path, monkeypatch, kind):
+    ws.plane(1.0, 1).write(tmp_path / "tile.obj")
+    ws.write_image(tmp_path / "tile.png", np.full((2, 4), 0.25))  # gray, which becomes RGB
+    np.save(tmp_path / "colors.npy", np.full((4, 3), 0.5, np.float32))
+    np.savez(tmp_path / "ball.npz", centers=[[0, 1, 0]], radii=[0.5])
+    ws.synthetic_sky(height=8).write(tmp_path / "sky.exr")
+    expected = load(
+        CAMERA + '[light]\nenvmap = "sky.exr"\n[[body]]\nmesh = "tile.obj"\ntexture = "tile.png"\n'
+        '[[body]]\nmesh = "tile.obj"\nalbedo = "colors.npy"\nspheres = "ball.npz"\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    textured = ws.Body(kind("tile.obj"), texture=kind("tile.png"))
+    colored = ws.Body(kind("tile.obj"), albedo=kind("colors.npy"), blockers=kind("ball.npz"))
+    scene = ws.Scene((textured, colored), kind("sky.exr"), expected.camera)
+    np.testing.assert_array_equal(scene.light.radiance, expected.light.radiance)
+    for body, other in zip(scene.bodies, expected.bodies, strict=True):
+        assert body.mesh.content_hash == other.mesh.content_hash and body.mesh.name == "tile"
+        np.testing.assert_array_equal(body.albedo, other.albedo)
+    np.testing.assert_array_equal(textured.texture, expected.bodies[0].texture)
+    np.testing.assert_array_equal(colored.blockers.centers, [[0, 1, 0]])
+    np.testing.assert_array_equal(colored.blockers.radii, expected.bodies[1].blockers.radii)
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [("mesh", "cow.obj"), ("texture", "wood.png"), ("albedo", "x.npy"), ("blockers", "x.npz")]
+)
+def test_a_file_that_a_body_names_is_missed_or_unfit_by_the_name_of_the_argument(name, file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=rf"^{name}: no such file: {file} \(in "):
+        ws.Body(**{"mesh": ws.plane(1.0, 1), name: file})
+    (tmp_path / file).write_bytes(b"\x00 nothing of the kind")
+    with pytest.raises(ValueError, match=f"^{name}: .*{file}"):
+        ws.Body(**{"mesh": ws.plane(1.0, 1), name: file})
 
 
 def test_a_texture_without_texels_is_refused():
@@ -344,6 +407,16 @@ def test_an_array_given_to_a_body_is_copied():
     ("options", "message"),
     [
         ({"bodies": ()}, "bodies: got none"),
+        ({"bodies": ws.Body(ws.icosphere(1.0, 0))}, "bodies: got Body, expected a list"),
+        ({"bodies": [ws.icosphere(1.0, 0)]}, r"bodies\[0\]: got Mesh, expected a Body"),
+        ({"light": None}, "light: got None, expected an EnvironmentMap, the path of one, or SH coefficients"),
+        ({"light": 1.0}, r"light: got shape \(\), .*EnvironmentMap.constant"),
+        ({"light": np.ones((4, 8, 3))}, r"light: got shape \(4, 8, 3\), .*EnvironmentMap\(pixels\)"),
+        ({"light": np.ones((100, 3))}, "light: order: got 10, expected a number of bands from 2 to 8"),
+        ({"camera": None}, "camera: got None, expected a Camera"),
+        ({"camera": [ws.Camera.look_at((0, 0, 3), (0, 0, 0))] * 2}, r"camera: got list .*Renderer\(scene, cameras="),
+        ({"visibility": "log-sh"}, "visibility: got 'log-sh', expected a Visibility"),
+        ({"supersampling": 2.0}, "supersampling: got 2.0"),
         ({"light": np.ones((5, 3))}, "light: got 5 coefficients"),
         ({"light": np.full((4, 3), np.nan)}, "light: got 12 NaN"),
         ({"supersampling": 0}, "supersampling: got 0"),
@@ -358,3 +431,34 @@ def test_a_bad_argument_of_a_scene_is_named(options, message):
     }
     with pytest.raises(ValueError, match=message):
         ws.Scene(**{**arguments, **options})
+
+
+def test_light_that_is_no_file_is_missed_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bodies, camera = [ws.Body(ws.icosphere(1.0, 0))], ws.Camera.look_at((0, 0, 3), (0, 0, 0))
+    with pytest.raises(FileNotFoundError, match=r"^light: no such file: park.exr \(in "):
+        ws.Scene(bodies, "park.exr", camera)
+    ws.write_image("square.exr", np.ones((4, 4, 3)))
+    with pytest.raises(ws.ImageError, match="^light: square.exr: radiance: got 4 x 4 pixels"):
+        ws.Scene(bodies, "square.exr", camera)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"method": "directionl"},
+        {"directions": "128"},
+        {"directions": 128.0},
+        {"order": "8"},
+        {"order": 8.0},
+        {"softness": "soft"},
+        {"softness": None},
+        {"merging": "x"},
+        {"samples": 1e3},
+        {"error": "5%"},
+    ],
+)
+def test_a_bad_argument_of_visibility_is_named(options):
+    ((name, value),) = options.items()
+    with pytest.raises(ValueError, match=f"^{name}: got {value!r}.*, expected"):
+        ws.Visibility(**options)

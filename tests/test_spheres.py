@@ -3,7 +3,6 @@
 import os
 import stat
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -359,11 +358,11 @@ def test_arguments_out_of_range_are_refused(arguments, message):
 
 
 def test_a_mesh_without_surface_is_refused():
-    line = SimpleNamespace(positions=np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0]]), faces=np.int32([[0, 1, 2]]))
+    line = Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]])
     with pytest.raises(ValueError, match="without area"):
         fit_spheres(line, 4, **QUICK)
-    with pytest.raises(ValueError, match="no faces"):
-        fit_spheres(SimpleNamespace(positions=line.positions, faces=np.zeros((0, 3), np.int32)), 4, **QUICK)
+    with pytest.raises(ValueError, match=r"mesh: got 'cow.obj', expected a Mesh; load_mesh\(path\) reads one"):
+        fit_spheres("cow.obj")
 
 
 # ------------------------------------------------------------------------------ cache and picture

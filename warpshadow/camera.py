@@ -13,6 +13,7 @@ Conventions (OpenCV, with pixel centers at +0.5):
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,9 @@ from warpshadow.threads import one_at_a_time
 
 # Rotations read from a file are often rounded to six digits.
 _ROTATION_TOLERANCE = 1e-4
+
+# Fields of view below this [degrees] are rather π/2 radians or less.
+_NARROW = 1.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +323,7 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
 
 
 def _array(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.array(values, np.float64)
+    array = check.numbers(name, values, expected=f"numbers {list(shape)}", dtype=np.float64)
     check.shape(name, array.shape, shape)
     check.finite(name, array)
     array.setflags(write=False)
@@ -327,25 +331,32 @@ def _array(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _positive(name: str, value: float) -> float:
-    if not 0.0 < value <= check.LARGEST:
-        raise ValueError(f"{name}: got {value!r}, expected a positive number up to {check.LARGEST:g}")
+    if not (check.is_number(value) and 0.0 < value <= check.LARGEST):
+        raise ValueError(f"{name}: got {check.described(value)}, expected a positive number up to {check.LARGEST:g}")
     return float(value)
 
 
 def _pixel_count(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+    if not check.is_integer(value) or value < 1:
         raise ValueError(f"{name}: got {value!r}, expected a positive whole number of pixels")
     return int(value)
 
 
 def _size(size: tuple[int, int]) -> tuple[int, int]:
-    check.shape("size", np.shape(size), (2,))
+    if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
+        raise ValueError(f"size: got {check.described(size)}, expected width and height [pixels], such as (640, 480)")
     return _pixel_count("size (width)", size[0]), _pixel_count("size (height)", size[1])
 
 
 def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
-    if not 0.0 < fov_y < 180.0:
-        raise ValueError(f"fov_y: got {fov_y!r}, expected degrees between 0 and 180")
+    if not (check.is_number(fov_y) and 0.0 < fov_y < 180.0):
+        raise ValueError(f"fov_y: got {check.described(fov_y)}, expected degrees between 0 and 180")
+    if fov_y < _NARROW:
+        warnings.warn(
+            f"fov_y: got {fov_y:g} degrees, which is as narrow as a telescope's; if these are radians, they are "
+            f"{np.degrees(fov_y):.4g} degrees",
+            stacklevel=3,
+        )
     focal = 0.5 * height / np.tan(np.radians(0.5 * fov_y))
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
 

@@ -1,13 +1,18 @@
 """Argument checks: one clear error that names the argument, what it got and what it accepts."""
 
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+import math
+import os
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 LARGEST = 1.0e18
 """The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
+
+_LONGEST = 60  # characters of a value that messages quote
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -27,6 +32,153 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
             raise ValueError(
                 f"{where}: unknown key {key!r}{_suggestion(key, known)}; known keys are {', '.join(known)}"
             )
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a finite number, Python's or NumPy's."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer that is no float
+        return False
+
+
+def is_integer(value: object) -> bool:
+    """Whether a value is a whole number, Python's or NumPy's, and of an integer type."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def is_path(value: object) -> bool:
+    """Whether a value may name a file."""
+    return isinstance(value, (str, os.PathLike))
+
+
+def path(name: str, value: object) -> Path:
+    """A path; ValueError for what names no file."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise ValueError(f"{name}: got {described(value)}, expected the path of a file")
+    return Path(value)
+
+
+def index(name: str, value: object, count: int, what: str) -> None:
+    """Raise ValueError unless a value is the number of one of ``count`` things, from 0; the message calls one that."""
+    if not is_integer(value) or value not in range(count):
+        raise ValueError(f"{name}: got {described(value)}, expected the number of a {what}, from 0 to {count - 1}")
+
+
+def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Raise ValueError unless a value is of a class; the message says what is expected, and how to get it."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name}: got {described(value)}, expected {expected}")
+
+
+def per_body(name: str, given: object, count: int) -> None:
+    """Raise ValueError unless something is given for each of ``count`` bodies, or None for all."""
+    if given is None:
+        return
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise ValueError(
+            f"{name}: got {described(given)}, expected a list of {count} items, one for each body, None for what the "
+            "scene has"
+        )
+    if len(given) != count:
+        raise ValueError(f"{name}: got {len(given)} items, expected {count}, one for each body")
+
+
+def file(name: str, value: str | os.PathLike) -> Path:
+    """The path of a file, relative to the current folder; FileNotFoundError if there is none."""
+    found = Path(value)
+    if not found.is_file():
+        where = "" if found.is_absolute() else f" (in {Path.cwd()})"
+        raise FileNotFoundError(f"{name}: no such file: {found}{where}")
+    return found
+
+
+def device(name: str, value: object) -> wp.Device:
+    """Warp's device for one of its own, torch's, a name, or None for its default; ValueError with those there are."""
+    wp.init()
+    has_gpu = wp.is_cuda_available()
+    alias = None if value is None else str(value)
+    if has_gpu or alias is None or not alias.startswith("cuda"):  # without, Warp would print errors of its driver
+        try:
+            return wp.get_device(alias)
+        except ValueError:
+            pass
+    known = ", ".join(repr(each.alias) for each in wp.get_devices())
+    raise ValueError(f"{name}: got {alias!r}, expected one of {known}{'' if has_gpu else '; there is no CUDA device'}")
+
+
+def numbers(
+    name: str,
+    values: object,
+    *,
+    expected: str = "numbers",
+    dtype: type = np.float32,
+    error: type[ValueError] = ValueError,
+) -> np.ndarray:
+    """Copy numbers to an array of floats.
+
+    Args:
+        name: Of the argument.
+        values: An array, a tensor, numbers or nested sequences of them.
+        expected: What the message says is expected.
+        dtype: Of the copy; what is too large for it becomes Inf.
+        error: What is raised: for text, None, rows of different lengths, and tensors whose gradient would be lost.
+    """
+    if getattr(values, "requires_grad", False):
+        raise error(
+            f"{name}: got {described(values)} that requires a gradient, which would end here, expected {expected}: "
+            ".detach() is without one"
+        )
+    try:
+        found = np.asarray(values)
+    except ValueError as cause:  # rows of different lengths
+        raise error(f"{name}: got {described(values)}, expected {expected}") from cause
+    except TypeError as cause:  # a tensor on a GPU, or of a type that NumPy has not
+        raise error(f"{name}: got {described(values)}, expected {expected} ({cause})") from cause
+    if found.dtype.kind not in "iuf":
+        raise error(f"{name}: got {described(values)}, expected {expected}")
+    with np.errstate(over="ignore"):
+        return np.array(found, dtype, order="C")
+
+
+def pixels(name: str, values: object, *, expected: str, error: type[ValueError] = ValueError) -> np.ndarray:
+    """Copy linear values of pixels as :func:`numbers` does; codes of a picture, which are integers, are refused."""
+    copied = numbers(name, values, expected=expected, error=error)
+    dtype = np.asarray(values).dtype
+    if dtype.kind != "f":
+        raise error(
+            f"{name}: got values of {dtype}, expected linear ones as floats: those of an 8-bit picture are "
+            "warpshadow.image.srgb_to_linear(values / 255), and read_image(path) reads one"
+        )
+    return copied
+
+
+def channels_last(got: tuple[int, ...]) -> str:
+    """What makes [height, width, 3] of an image's shape that has it not, for messages; nothing if that is not known."""
+    if len(got) == 2:
+        return "gray images are repeated for R, G, B"
+    if got[-1:] == (4,):
+        return "[..., :3] is without alpha"
+    return "channels come last" if len(got) > 2 and got[-3] in (1, 3, 4) else ""
+
+
+def described(value: object) -> str:
+    """What messages call a value: itself where that is short, else its type and shape."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, os.PathLike):
+        return repr(str(value))
+    if hasattr(value, "shape") and hasattr(value, "dtype") and len(value.shape):
+        dtype = getattr(value.dtype, "__name__", value.dtype)
+        return f"{type(value).__name__} of {dtype} and shape {tuple(value.shape)}"
+    text = repr(value)
+    if value is None or isinstance(value, (str, bytes, int, float, complex, np.number)):
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    if isinstance(value, (list, tuple, dict)):
+        return text if len(text) <= _LONGEST else f"{type(value).__name__} of {len(value)} items"
+    return type(value).__name__
 
 
 def finite(name: str, values: np.ndarray, *, least: float = -LARGEST, most: float = LARGEST) -> None:
@@ -121,13 +273,17 @@ def _scalars(array: wp.array) -> wp.array:
     return values
 
 
-def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless ``got`` matches ``expected``, where a string stands for any length."""
+def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], meaning: str = "") -> None:
+    """Raise ValueError unless ``got`` matches ``expected``, where a string stands for any length.
+
+    The message ends with what such an array means, and how to make one, if that is said.
+    """
     matches = len(got) == len(expected) and all(
         isinstance(wanted, str) or have == wanted for have, wanted in zip(got, expected, strict=True)
     )
     if not matches:
-        raise ValueError(f"{name}: got shape {tuple(got)}, expected [{', '.join(map(str, expected))}]")
+        lengths = ", ".join(map(str, expected))
+        raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")
 
 
 def _suggestion(value: object, choices: list) -> str:

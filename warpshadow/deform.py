@@ -278,7 +278,7 @@ class Poses:
         """Shape of what moves."""
         check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
         arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
-        check.finite_arrays(arrays)
+        check.finite_arrays(arrays, nonnegative=["scales"])
         return common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.order import compact_order
 
 CHUNK = 16
@@ -16,7 +17,7 @@ BUNDLE = 4
 
 def check_count(name: str, count: int) -> None:
     """Raise ValueError unless ``count`` is a positive multiple of 16."""
-    if count <= 0 or count % CHUNK:
+    if not check.is_integer(count) or count <= 0 or count % CHUNK:
         raise ValueError(f"{name}: got {count!r}, expected a positive multiple of {CHUNK}")
 
 
@@ -52,7 +53,7 @@ def edge_width(softness: float, count: int) -> float:
     Raises:
         ValueError: for a width of π/4 or more, where an edge is no edge, and below 0.002, where float32 loses it.
     """
-    width = softness * cell_radius(count)
+    width = softness * cell_radius(count) if check.is_number(softness) else -1.0
     if not 2e-3 <= width < np.pi / 4:
         raise ValueError(
             f"softness: got {softness!r} for {count} directions, expected {2e-3 / cell_radius(count):.3g} to "

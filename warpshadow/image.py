@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpshadow import files
+from warpshadow import check, files
 
 
 class ImageError(ValueError):
@@ -38,7 +38,7 @@ def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: i
         ImageError: for what is not such a file, is truncated, deep, too large, or has other channels.
         FileNotFoundError: when the file does not exist.
     """
-    path = Path(path)
+    path = check.path("path", path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
@@ -50,6 +50,12 @@ def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: i
         return reader(path, part, max_pixels)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from error
+
+
+def read_rgb(path: str | Path, *, part: str | int | None = None) -> np.ndarray:
+    """Read a picture as :func:`read_image` does, as RGB: gray is repeated, alpha dropped."""
+    pixels = read_image(path, part=part)
+    return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
 
 
 def write_image(path: str | Path, pixels: np.ndarray) -> None:
@@ -65,11 +71,11 @@ def write_image(path: str | Path, pixels: np.ndarray) -> None:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
         OSError: where the file cannot be written.
     """
-    path = Path(path)
+    path = check.path("path", path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
         raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_WRITERS)}")
-    pixels = np.asarray(pixels, dtype=np.float32)
+    pixels = check.pixels("pixels", pixels, expected="linear values [height, width, channel]", error=ImageError)
     shape = pixels.shape
     if pixels.ndim == 2:
         pixels = pixels[..., None]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow import check, sh
-from warpshadow.image import ImageError, read_image, srgb_to_linear, write_image
+from warpshadow.image import ImageError, read_rgb, srgb_to_linear, write_image
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 
@@ -56,8 +56,8 @@ class EnvironmentMap:
 
     def __post_init__(self) -> None:
         """Copy, convert and validate the pixels."""
-        with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
-            radiance = np.array(self.radiance, dtype=np.float32, order="C")
+        expected = "an array [height, 2·height, 3]; EnvironmentMap.read(path) reads a file"
+        radiance = check.pixels("radiance", self.radiance, expected=expected, error=ImageError)
         _check_aspect(radiance)
         bad = _bad_values(radiance)
         if bad.any():
@@ -96,8 +96,7 @@ class EnvironmentMap:
         """
         check.choice("sanitize", sanitize, [None, "zero", "neighbors"])
         check.choice("convention", convention, CONVENTIONS)
-        pixels = read_image(path, part=part)
-        pixels = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
+        pixels = read_rgb(path, part=part)
         try:
             _check_aspect(pixels)
             if sanitize:
@@ -109,7 +108,8 @@ class EnvironmentMap:
     @classmethod
     def constant(cls, rgb: float | Sequence[float] = 1.0, height: int = 16) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB."""
-        return cls(np.broadcast_to(np.asarray(rgb, np.float32), (height, 2 * height, 3)))
+        _check_height(height)
+        return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
 
     def write(self, path: str | Path) -> None:
         """Write an OpenEXR file of float32 RGB."""
@@ -125,7 +125,8 @@ class EnvironmentMap:
         Whole pixels are exact; between them columns are interpolated linearly, which blurs a map of few columns. Either
         way the energy is kept.
         """
-        check.finite("degrees", np.asarray(degrees, np.float64))
+        if not check.is_number(degrees):
+            raise ValueError(f"degrees: got {check.described(degrees)}, expected a finite angle about +y")
         width = self.radiance.shape[1]
         shift = -degrees / 360 * width % width
         if abs(shift - round(shift)) < 1e-6:  # 90 degrees computed from an angle are still whole pixels
@@ -138,7 +139,7 @@ class EnvironmentMap:
 
     def scaled(self, factor: float | Sequence[float]) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
-        return EnvironmentMap(self.radiance * np.asarray(factor, dtype=np.float32))
+        return EnvironmentMap(self.radiance * _color("factor", factor))
 
     def directions(self) -> np.ndarray:
         """Unit vectors to the pixel centers, float32, shape [height, width, 3]."""
@@ -249,7 +250,10 @@ def _cells_of_pixels(height: int, directions: bytes) -> np.ndarray:
 
 def _check_aspect(pixels: np.ndarray) -> None:
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise ImageError(f"radiance: got shape {pixels.shape}, expected [height, 2·height, 3]")
+        remedy = check.channels_last(pixels.shape)
+        raise ImageError(
+            f"radiance: got shape {pixels.shape}, expected [height, 2·height, 3]{remedy and f': {remedy}'}"
+        )
     height, width, _ = pixels.shape
     if width != 2 * height:
         faces_or_crosses = [(6, 1), (1, 6), (4, 3), (3, 4)]
@@ -258,6 +262,22 @@ def _check_aspect(pixels: np.ndarray) -> None:
         raise ImageError(
             f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
         )
+
+
+def _color(name: str, values: float | Sequence[float]) -> np.ndarray:
+    """One number, or one for each of R, G, B; not negative."""
+    expected = "one number, or one for each of R, G, B"
+    color = check.numbers(name, values, expected=expected, error=ImageError)
+    if color.shape not in ((), (3,)):
+        raise ImageError(f"{name}: got shape {color.shape}, expected {expected}")
+    if (color < 0).any():
+        raise ImageError(f"{name}: got {check.described(values)}, expected nothing negative")
+    return color
+
+
+def _check_height(height: int) -> None:
+    if not check.is_integer(height) or height < 1:
+        raise ValueError(f"height: got {check.described(height)}, expected a positive whole number of rows")
 
 
 def _bad_values(radiance: np.ndarray) -> np.ndarray:
@@ -341,11 +361,16 @@ def synthetic_sky(
         ground_albedo: Reflectance of the ground.
         height: Rows of the map.
     """
-    check.finite("sun_direction", np.asarray(sun_direction, np.float64))
-    check.shape("sun_direction", np.shape(sun_direction), (3,))
-    if not np.any(sun_direction):
+    sun = check.numbers("sun_direction", sun_direction, expected="a direction (x, y, z)", dtype=np.float64)
+    check.finite("sun_direction", sun)
+    check.shape("sun_direction", sun.shape, (3,))
+    if not np.any(sun):
         raise ValueError("sun_direction: got a zero vector, expected a direction")
-    sun = np.array(sun_direction, dtype=np.float64) / np.linalg.norm(sun_direction)
+    for name, value in (("sun_strength", sun_strength), ("sun_radius", sun_radius), ("ground_albedo", ground_albedo)):
+        if not (check.is_number(value) and value >= 0):
+            raise ValueError(f"{name}: got {check.described(value)}, expected a number of 0 or more")
+    _check_height(height)
+    sun /= np.linalg.norm(sun)
     towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
     edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
     on_level = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]  # ∫ max(cos θ, 0) dω over a pixel of each row

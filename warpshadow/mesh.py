@@ -11,10 +11,10 @@ import functools
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -137,8 +137,8 @@ class Mesh:
 
 def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:
     """Copy to float32 [item, width]; MeshError when empty, of another shape, not finite or too large."""
-    with np.errstate(over="ignore"):  # a number too large for float32 becomes Inf and is reported below
-        values = np.array(values, dtype=np.float32, order="C")
+    expected = f"an array [{item}, {width}]; load_mesh(path) reads a file"
+    values = check.numbers(name, values, expected=expected, error=MeshError)
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
         raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
     bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
@@ -152,17 +152,21 @@ def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.nda
 
 def _indices(name: str, faces: np.ndarray, count: int, item: str) -> np.ndarray:
     """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
+    check.numbers(name, faces, expected="integers [face, 3]", error=MeshError)
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-        raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face")
+        polygons = "; triangulate other polygons" if faces.ndim == 2 and faces.shape[1] > 3 else ""
+        raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face{polygons}")
     if not np.issubdtype(faces.dtype, np.integer):
-        raise MeshError(f"{name}: got {faces.dtype}, expected integers")
+        raise MeshError(f"{name}: got {faces.dtype}, expected integers, such as faces.astype(int)")
     bad = np.argwhere((faces < 0) | (faces >= count))
     if len(bad):
         face, corner = bad[0]
+        counts_from_one = faces.min() == 1 and faces.max() == count
         raise MeshError(
             f"{name}: got {len(bad)} indices out of range "
             f"(first at face {face}: {item} {faces[face, corner]}), expected 0 to {count - 1}"
+            f"{f'; those that count from 1 are {name} - 1 here' if counts_from_one else ''}"
         )
     return np.array(faces, dtype=np.int32, order="C")
 
@@ -205,7 +209,7 @@ def load_mesh(path: str | Path) -> Mesh:
     Warns:
         Once, with the counts of degenerate faces, duplicate faces, unreferenced vertices, and dropped uvs.
     """
-    path = Path(path)
+    path = check.path("path", path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise MeshError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
@@ -427,12 +431,14 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     Returns:
         The mesh; u runs along +x, v along -z, both from 0 to 1.
     """
-    size_x, size_z = np.broadcast_to(size, 2).tolist()
-    columns, rows = np.broadcast_to(segments, 2).tolist()
-    if not (0 < size_x < np.inf and 0 < size_z < np.inf):
-        raise MeshError(f"size: got {size}, expected positive numbers")
-    if not (isinstance(columns, int) and isinstance(rows, int) and columns > 0 and rows > 0):
-        raise MeshError(f"segments: got {segments}, expected positive integers")
+    size_x, size_z = _pair(size)
+    columns, rows = _pair(segments)
+    if not all(check.is_number(edge) and edge > 0 for edge in (size_x, size_z)):
+        raise MeshError(f"size: got {check.described(size)}, expected a positive number, or one for x and one for z")
+    if not all(check.is_integer(count) and count > 0 for count in (columns, rows)):
+        raise MeshError(
+            f"segments: got {check.described(segments)}, expected a positive integer, or one for x and one for z"
+        )
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
     positions = np.stack([(uvs[:, 0] - 0.5) * size_x, np.zeros(len(uvs)), (0.5 - uvs[:, 1]) * size_z], axis=-1)
@@ -442,6 +448,12 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     return Mesh(positions, faces, uvs, faces, "plane")
 
 
+def _pair(value: Any) -> tuple[Any, Any]:
+    """Two values, or one for both."""
+    values = tuple(value) if isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, str) else (value,)
+    return values if len(values) == 2 else (value, value)  # the value itself is refused if it is several
+
+
 def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
     """Make a sphere around the origin from an icosahedron whose faces are split in four, without uvs.
 
@@ -449,10 +461,10 @@ def icosphere(radius: float = 1.0, subdivisions: int = 3) -> Mesh:
         radius: Distance of the vertices from the origin [scene units].
         subdivisions: Number of splits s, 0 to 8: 10·4ˢ + 2 vertices and 20·4ˢ faces.
     """
-    if not 0 < radius < np.inf:
-        raise MeshError(f"radius: got {radius}, expected a positive number")
-    if subdivisions not in range(9):
-        raise MeshError(f"subdivisions: got {subdivisions}, expected an integer from 0 to 8")
+    if not (check.is_number(radius) and radius > 0):
+        raise MeshError(f"radius: got {check.described(radius)}, expected a positive number")
+    if not check.is_integer(subdivisions) or subdivisions not in range(9):
+        raise MeshError(f"subdivisions: got {subdivisions!r}, expected an integer from 0 to 8")
     # The twelve corners are the cyclic shifts of (0, ±1, ±golden); neighbors are 2 apart.
     golden = (1 + 5**0.5) / 2
     corners = np.array([(0, y, z * golden) for y in (-1, 1) for z in (-1, 1)])

@@ -1,18 +1,18 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check, files, sh, tables
 from warpshadow.camera import Camera
-from warpshadow.image import read_image, write_image
+from warpshadow.image import write_image
 from warpshadow.light import EnvironmentMap
-from warpshadow.mesh import Mesh, icosphere, load_mesh, plane
-from warpshadow.scene import Body, Scene, Visibility
+from warpshadow.mesh import Mesh, icosphere, plane
+from warpshadow.scene import COLORS, SCENE, Body, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.tables import Table
 from warpshadow.tuning import resolved
@@ -49,7 +49,7 @@ def load_scene(path: str | Path, *, progress: bool = False) -> Scene:
 
 def parse_scene(path: str | Path) -> Scene:
     """Read a scene file as :func:`load_scene` does, but leave "auto" as it is."""
-    path = Path(path)
+    path = check.path("path", path)
     with tables.located(str(path), SceneError):
         return _scene(tables.read(path, "scene file"), path.parent)
 
@@ -165,23 +165,24 @@ def _body(table: Table, folder: Path) -> Body:
     for one, other in (("albedo", "texture"), ("blockers", "spheres")):
         if one in table and other in table:
             raise ValueError(f"expected either {one} or {other}")
-    mesh = _primitive(table) if "primitive" in table else _mesh(table, folder)
-    place = {key: table[key] for key in _PLACE_KEYS if key in table}
+    place: dict[str, Any] = {"mesh": _primitive(table) if "primitive" in table else _mesh(table, folder)}
+    place |= {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
-        pixels = read_image(tables.file(table, "texture", folder))
-        place["texture"] = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
-    if isinstance(place.get("albedo"), str):
-        place["albedo"] = _colors(table, folder)
-    else:
+        place["texture"] = tables.file(table, "texture", folder)
+    if not isinstance(place.get("albedo"), str):
         tables.check_vector(table, "albedo")
+    elif place["albedo"].endswith(COLORS):
+        place["albedo"] = tables.file(table, "albedo", folder)
     if "spheres" in place:
         del place["spheres"]
-        place["blockers"] = _spheres(table, folder)
+        path = tables.file(table, "spheres", folder)
+        with tables.located("spheres"):
+            place["blockers"] = Spheres.read(path)
     for key in ("rotation", "translation"):
         tables.check_vector(table, key)
     tables.check_integer(table, "blockers")
     tables.number(table, "scale", 1.0)
-    return Body(mesh, **place)
+    return Body(**place)
 
 
 def _primitive(table: Table) -> Mesh:
@@ -198,29 +199,9 @@ def _primitive(table: Table) -> Mesh:
     return make(**{key: table[key] for key in shape_keys if key in table})
 
 
-def _mesh(table: Table, folder: Path) -> Mesh:
+def _mesh(table: Table, folder: Path) -> Path:
     check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
-    return load_mesh(tables.file(table, "mesh", folder))
-
-
-def _colors(table: Table, folder: Path) -> np.ndarray:
-    if not table["albedo"].endswith(".npy"):
-        raise ValueError(f"albedo: got {table['albedo']!r}, expected 3 finite numbers, or an .npy file of [vertex, 3]")
-    path = tables.file(table, "albedo", folder)
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"albedo: got {path} ({error}), expected an .npy file of [vertex, 3]") from error
-
-
-def _spheres(table: Table, folder: Path) -> Spheres:
-    path = tables.file(table, "spheres", folder)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            centers, radii = arrays["centers"], arrays["radii"]
-    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"spheres: got {path} ({error}), expected an .npz file of centers and radii") from error
-    return Spheres(centers, radii)
+    return tables.file(table, "mesh", folder)
 
 
 # ---------------------------------------------------------------------------------------------- writing
@@ -238,6 +219,7 @@ def write_scene(scene: Scene, folder: str | Path) -> list[Path]:
     Returns:
         The files.
     """
+    check.instance("scene", scene, Scene, SCENE)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []

@@ -26,7 +26,7 @@ MAX_ORDER = ORDERS[-1]
 
 def check_order(order: int) -> None:
     """Raise ValueError unless ``order`` is a number of bands that the kernels are made for."""
-    if order not in ORDERS:
+    if not check.is_integer(order) or order not in ORDERS:
         raise ValueError(f"order: got {order!r}, expected a number of bands from {ORDERS[0]} to {ORDERS[-1]}")
 
 

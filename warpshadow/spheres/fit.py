@@ -90,12 +90,13 @@ def fit_spheres(
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
     """
+    check.instance("mesh", mesh, Mesh, "a Mesh; load_mesh(path) reads one")
     for name, value, least in (("count", count, 0), ("seed", seed, 0), ("steps", steps, 1)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        if not check.is_integer(value) or value < least:
             raise ValueError(f"{name}: got {value!r}, expected an integer of at least {least}")
-    if error is not None and not (np.isfinite(error) and error > 0):
+    if error is not None and not (check.is_number(error) and error > 0):
         raise ValueError(f"error: got {error!r}, expected a positive number such as 0.05, or None")
-    job, middle, diagonal = _job(mesh, seed, steps if refine else 0, wp.get_device(device))
+    job, middle, diagonal = _job(mesh, seed, steps if refine else 0, check.device("device", device))
     fit = partial(_cached_fit if cache else _fit, job, progress)
     with unrecorded():
         balls, report = fit(int(count)) if error is None else _search(fit, error)
@@ -114,13 +115,8 @@ def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_Job, np
     """What decides a fit of a mesh; the middle of its bounds and their diagonal."""
     positions = np.asarray(mesh.positions, np.float64)
     faces = np.asarray(mesh.faces, np.int32)
-    check.shape("mesh.positions", positions.shape, ("vertex", 3))
-    check.shape("mesh.faces", faces.shape, ("face", 3))
-    if not len(faces):
-        raise ValueError("mesh: got no faces, expected at least one")
     used, renumbered = np.unique(faces, return_inverse=True)
     positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
-    check.finite("mesh.positions", positions)
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
     corners = positions[faces]

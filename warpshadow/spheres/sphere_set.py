@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +30,7 @@ class Spheres:
     def __post_init__(self) -> None:
         """Copy, convert and validate the arrays."""
         for name, shape in (("centers", ("sphere", 3)), ("radii", ("sphere",))):
-            values = np.array(getattr(self, name), dtype=np.float32)
+            values = check.numbers(name, getattr(self, name), expected=f"an array [{', '.join(map(str, shape))}]")
             check.shape(name, values.shape, shape)
             check.finite(name, values)
             values.flags.writeable = False
@@ -38,6 +39,20 @@ class Spheres:
             raise ValueError(f"radii: got {len(self.radii)} radii for {len(self.centers)} centers, expected one each")
         if (self.radii < 0).any():
             raise ValueError(f"radii: got {self.radii.min()}, expected radii that are not negative")
+
+    @classmethod
+    def read(cls, path: str | Path) -> Spheres:
+        """Read an .npz file of the arrays ``centers`` and ``radii``, as ``warpshadow spheres -o`` writes it.
+
+        Raises:
+            ValueError: for what is not such a file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                centers, radii = arrays["centers"], arrays["radii"]
+        except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"got {path} ({error}), expected an .npz file of centers and radii") from error
+        return cls(centers, radii)
 
     def write(self, path: str | Path) -> None:
         """Write an .npz file of ``centers`` and ``radii``, which a scene file's ``spheres`` reads."""

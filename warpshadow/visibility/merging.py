@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from warpshadow import check
 from warpshadow.batch import concatenate
 from warpshadow.lanes import lane_functions, lane_type
 from warpshadow.tape import launch
@@ -109,7 +110,7 @@ def _merge(
 
 def check_merging(merging: float) -> None:
     """Raise ValueError unless ``merging`` is a half-angle in cell radii, 0 to 1."""
-    if not 0 <= merging <= 1:
+    if not (check.is_number(merging) and 0 <= merging <= 1):
         raise ValueError(f"merging: got {merging!r}, expected 0 (never) to 1 cell radius")
 
 
