@@ -73,7 +73,8 @@ def test_all_but_a_scene_a_target_and_what_is_free_has_the_defaults_of_python(lo
     assert len(problem.scene.bodies) == 2
 
 
-def test_everything_that_can_be_free_is_read(load):
+def test_everything_that_can_be_free_is_read(load, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("blockers = 0", "blockers = 8"))
     text = MINIMAL.replace("light = true", "light = {order = 3, nonnegativity = 0.5}\nexposure = true")
     fit = load(
         text + "camera = {focal = true}\n[[free.albedo]]\nbody = 0\nper_vertex = true\n"
@@ -243,8 +244,12 @@ def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, 
         (MINIMAL.replace('image = "photo.exr"', ""), ["[[target]] number 1", "image: missing"]),
         (MINIMAL + "[free.pose]\nbody = 0\n", ["[free.pose]: expected [[free.pose]]"]),
         (MINIMAL + "[[free.pose]]\n", ["[[free.pose]] number 1", "body: missing, expected a whole number"]),
-        (MINIMAL + "[[free.pose]]\nbody = 2\n", ["[[free.pose]] number 1", "body: got 2, expected one of 0, 1"]),
-        (MINIMAL + "[[free.radii]]\nbody = 0\n[[free.radii]]\nbody = 0\n", ["free: got radii[0] twice"]),
+        (
+            MINIMAL + "[[free.pose]]\nbody = 2\n",
+            ["[[free.pose]] number 1", "body: got 2, expected the number of a body, from 0 to 1"],
+        ),
+        (MINIMAL + "[[free.pose]]\nbody = 0\n[[free.pose]]\nbody = 0\n", ["free: got pose[0] twice"]),
+        (MINIMAL + "[[free.texture]]\nbody = 0\n", ["[[free.texture]] number 1", "whose mesh has no uvs"]),
         (MINIMAL.replace("true", "3"), ["[free] light", "3", "table"]),
         (MINIMAL.replace("true", "{order = 3, directions = 16}"), ["[free] light", "order, directions", "one of them"]),
         ('stages = "poses"\n' + MINIMAL, ["stages: got 'poses'", "did you mean 'pose'"]),

@@ -160,6 +160,9 @@ def test_a_softness_that_directions_do_not_allow_is_refused_at_once_with_its_sta
         ({"iterations": 2.5}, "iterations: got 2.5"),
         ({"iterations": True}, "iterations: got True"),
         ({"learning_rate": 0}, "learning_rate: got 0"),
+        ({"learning_rate": "fast"}, "learning_rate: got 'fast'"),
+        ({"scale": None}, "scale: got None"),
+        ({"supersampling": 2.0}, "supersampling: got 2.0"),
         ({"learning_rate": math.inf}, "learning_rate: got inf"),
         ({"learning_rate": math.nan}, "learning_rate: got nan"),
         ({"scale": 0}, "scale: got 0"),
@@ -181,6 +184,11 @@ def test_a_stage_names_what_is_wrong_with_it(options, message):
     ("options", "message"),
     [
         ({"stages": []}, "stages: got none"),
+        ({"stages": 100}, r"stages\[0\]: got 100, expected a Stage, such as Stage\(iterations=200\)"),
+        ({"stages": [Stage(1), "pose"]}, r"stages\[1\]: got 'pose', expected a Stage"),
+        ({"optimizer": "adam"}, "optimizer: got 'adam', .*torch.optim.Adam"),
+        ({"device": "gpu"}, "device: got 'gpu', expected one of 'cpu'"),
+        ({"tolerance": "1%"}, "tolerance: got '1%'"),
         ({"tolerance": -0.1}, "tolerance: got -0.1"),
         ({"tolerance": 1.0}, "tolerance: got 1.0"),
         ({"tolerance": math.nan}, "tolerance: got nan"),
@@ -394,10 +402,13 @@ def test_what_is_wrong_from_the_beginning_is_an_error_and_no_end():
     scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=np.full((2, 2, 3), 0.5))))
     problem = Problem(scene, Target(np.ones((24, 24, 3))), [Texture(1, size=(1, 4), smoothness=1.0)], still=None)
     assert np.isfinite(fit(problem, [Stage(2)]).losses[0]).all()  # a single row has no neighbors
-    plain = small_scene()
-    both = Problem(plain, Target(np.ones((24, 24, 3))), [Albedo(1), Texture(1, size=(2, 2))], still=None)
-    with pytest.raises(ValueError, match=r"albedo\[1\], textures\[1\]: got both"):
-        fit(both, [Stage(2)])
+
+    class Refusing(Loss):
+        def __call__(self, *_):
+            raise ValueError("images: got none of mine")
+
+    with pytest.raises(ValueError, match="images: got none of mine"):
+        fit(dataclasses.replace(problem, loss=Refusing()), [Stage(2)])
 
 
 # ---------------------------------------------------------------------------------------------- going on

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import warpshadow as ws
+from warpshadow.image import srgb_to_linear
 from warpshadow.inverse import (
     Albedo,
     CameraPose,
@@ -22,10 +23,8 @@ from warpshadow.inverse import (
     Pose,
     Problem,
     Radii,
-    Stage,
     Target,
     Texture,
-    fit,
 )
 from warpshadow.inverse.target import stacked
 
@@ -58,6 +57,14 @@ def noise(*shape: int, seed: int = 0) -> np.ndarray:
     [
         ({"image": np.zeros((4, 5))}, r"image: got shape \(4, 5\)"),
         ({"image": np.zeros((4, 5, 2))}, "image: got shape"),
+        ({"image": np.zeros((4, 5, 3), np.uint8)}, r"image: got values of uint8, .*srgb_to_linear\(values / 255\)"),
+        ({"image": np.zeros((4, 5, 3), np.int64)}, "image: got values of int64"),
+        ({"image": np.zeros((4, 5, 3), bool)}, "image: got ndarray of bool"),
+        ({"image": np.zeros((3, 4, 5))}, r"image: got shape \(3, 4, 5\), .*: channels come last"),
+        ({"image": None}, "image: got None, expected linear RGB"),
+        ({"mask": np.full((4, 5), 255, np.uint8)}, "mask: got values from 255 to 255, .*mask / 255"),
+        ({"mask": "x"}, "mask: no such file: x"),
+        ({"camera": "front"}, "camera: got 'front', expected a Camera"),
         ({"image": np.zeros((0, 5, 3))}, "image: got shape"),
         ({"image": np.full((4, 5, 3), np.nan)}, "image: got 60 NaN"),
         ({"mask": np.ones((5, 4))}, r"mask: got shape \(5, 4\)"),
@@ -69,8 +76,25 @@ def noise(*shape: int, seed: int = 0) -> np.ndarray:
     ],
 )
 def test_a_target_names_what_is_wrong_with_it(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         Target(**{"image": np.zeros((4, 5, 3))} | options)
+
+
+def test_a_target_reads_files_as_fit_files_do(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    straight, alpha = np.full((2, 4, 3), 0.5, np.float32), np.full((2, 4, 1), 0.5, np.float32)
+    ws.write_image("photo.png", np.concatenate([straight, alpha], axis=2))
+    ws.write_image("mask.png", srgb_to_linear(np.full((2, 4), 0.25, np.float32)))
+    target = Target("photo.png", Path("mask.png"))
+    eight_bits = 0.006  # half a step of sRGB where it is steepest
+    np.testing.assert_allclose(target.image[..., :3], 0.25, atol=eight_bits)  # premultiplied
+    np.testing.assert_allclose(target.image[..., 3], 0.5, atol=eight_bits)
+    np.testing.assert_allclose(target.weights(), 0.25, atol=eight_bits)  # as it is stored
+
+
+def test_a_mask_may_be_of_truth_values():
+    mask = np.arange(20).reshape(4, 5) % 2 == 0
+    np.testing.assert_array_equal(Target(np.ones((4, 5, 3)), mask).weights(), mask.astype(np.float32))
 
 
 def test_what_is_masked_out_may_be_anything():
@@ -197,7 +221,7 @@ def test_a_loss_names_what_is_wrong_with_it(options, message):
         (lambda: Texture(1, smoothness=math.inf), "smoothness: got inf"),
         (lambda: Texture(1, size=(0, 4)), r"size: got \(0, 4\)"),
         (lambda: Texture(1, size=(4.0, 4)), r"size: got \(4.0, 4\)"),
-        (lambda: Texture(1, size=8), r"size: got shape \(\)"),
+        (lambda: Texture(1, size=8), "size: got 8, expected height and width in whole texels"),
         (lambda: Pose(0, "euler"), "rotation: got 'euler'"),
         (lambda: Deformation(0, rigidity=-1), "rigidity: got -1"),
         (lambda: Deformation(0, count=0), "count: got 0"),
@@ -212,17 +236,23 @@ def test_a_free_parameter_names_what_is_wrong_with_it(make, message):
 @pytest.mark.parametrize(
     ("free", "message"),
     [
-        (Albedo(2), "body: got 2, expected one of 0, 1"),
-        (Pose(-1), "body: got -1, expected one of 0, 1"),
-        (Radii(0.0), "body: got 0.0"),
+        (Albedo(2), "body: got 2, expected the number of a body, from 0 to 1"),
+        (Pose(7), "body: got 7, expected the number of a body, from 0 to 1"),
         (Texture(0), "body: got 0, whose mesh has no uvs"),
         (Radii(1), "body: got 1, which has no spheres"),
         (Deformation(0), "count: got 4 for 2 nodes"),
     ],
 )
 def test_what_the_scene_does_not_have_cannot_be_free(free, message):
-    with pytest.raises(ValueError, match=message):
-        fit(Problem(small_scene(), Target(noise(24, 24, 3)), free), [Stage(1)])
+    with pytest.raises(ValueError, match=rf"free\[1\]: {message}"):
+        Problem(small_scene(), Target(noise(24, 24, 3)), [Light(), free])
+
+
+@pytest.mark.parametrize("make", [Albedo, Texture, Pose, Deformation, Radii])
+@pytest.mark.parametrize("body", [-1, 0.0, 1.5, True, "bunny", None])
+def test_what_is_no_number_of_a_body_is_refused_by_whatever_is_free_of_one(make, body):
+    with pytest.raises(ValueError, match=f"body: got {body!r}, expected the number of a body, from 0"):
+        make(body)
 
 
 def test_an_albedo_must_be_of_the_kind_that_the_body_has():
@@ -232,15 +262,14 @@ def test_an_albedo_must_be_of_the_kind_that_the_body_has():
     textured = dataclasses.replace(ground, texture=noise(4, 4, 3))
     scene = dataclasses.replace(scene, bodies=(colored, textured))
     for free, message in ((Albedo(0), "expected per_vertex=True"), (Albedo(1), "which has a texture")):
-        problem = Problem(scene, Target(noise(24, 24, 3)), free)
         with pytest.raises(ValueError, match=message):
-            problem.start(problem.setting(CPU))
+            Problem(scene, Target(noise(24, 24, 3)), free)
 
 
 def test_spheres_that_the_method_does_not_use_cannot_be_free():
     scene = small_scene(method="none")
     with pytest.raises(ValueError, match="body: got 0, which has no spheres"):
-        fit(Problem(scene, Target(noise(24, 24, 3)), Radii(0)), [Stage(1)])
+        Problem(scene, Target(noise(24, 24, 3)), Radii(0))
 
 
 # ---------------------------------------------------------------------------------------------- problems
@@ -251,10 +280,14 @@ def test_spheres_that_the_method_does_not_use_cannot_be_free():
     [
         ({"targets": []}, "targets: got none"),
         ({"free": []}, "free: got none"),
-        ({"free": "light"}, r"free\[0\]: got str, expected a Free"),
-        ({"free": [Light(), "pose"]}, r"free\[1\]: got str, expected a Free"),
-        ({"free": Light}, r"free\[0\]: got .*, expected a Free"),
-        ({"targets": [noise(2, 2, 3)]}, r"targets\[0\]: got ndarray, expected a Target"),
+        ({"scene": "scene.toml"}, r"scene: got 'scene.toml', expected a Scene; load_scene\(path\)"),
+        ({"loss": "huber"}, r"loss: got 'huber', expected a Loss, such as Loss\('huber'\)"),
+        ({"still": "none"}, "still: got 'none', expected a Visibility"),
+        ({"free": "light"}, r"free\[0\]: got 'light', expected what is free"),
+        ({"free": [Light(), "pose"]}, r"free\[1\]: got 'pose', expected what is free"),
+        ({"free": Light}, r"free\[0\]: got the class Light, expected what is free, such as Pose\(0\) or Light\(\)"),
+        ({"free": [Light(), Albedo(1), Texture(1)]}, r"free: got Albedo\(1\) and Texture\(1\), expected one"),
+        ({"targets": [noise(2, 2, 3)]}, r"targets\[0\]: got ndarray of .*, expected a Target, as Target\(image\)"),
         ({"free": [Pose(0), Light(), Pose(0, "6d")]}, r"free: got pose\[0\] twice"),
         ({"free": [Light(), Light(None, 64)]}, "free: got light twice"),
         ({"targets": [Target(noise(24, 24, 3)), Target(noise(24, 24, 4))]}, "targets: got images of shapes"),
@@ -311,6 +344,9 @@ def changed(scene: ws.Scene, number: int, **changes) -> ws.Scene:
 def variations() -> dict[str, Problem]:
     """Problems of which each differs from the first in one thing that its result depends on."""
     scene, image = small_scene(), noise(24, 24, 4)
+    bare = scene.bodies[0].mesh
+    wrapped = dataclasses.replace(bare, uvs=np.zeros((1, 2)), uv_faces=np.zeros_like(bare.faces))
+    scene = changed(scene, 0, mesh=wrapped)  # so that either body may have a texture
     problem = Problem(scene, Target(image), [Light(3), Texture(1, size=(1, 23))])
     ball = scene.bodies[0]
     brighter, positions, centers = image.copy(), ball.mesh.positions.copy(), ball.blockers.centers.copy()

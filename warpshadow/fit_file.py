@@ -10,11 +10,9 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from warpshadow import check, tables
-from warpshadow.image import linear_to_srgb, read_image
 from warpshadow.inverse import (
     Albedo,
     CameraPose,
@@ -36,6 +34,7 @@ from warpshadow.inverse import (
     short_adam,
 )
 from warpshadow.inverse.stages import check_stages
+from warpshadow.inverse.target import read_target
 from warpshadow.scene import Scene
 from warpshadow.scene_file import load_scene, parse_camera, parse_visibility
 from warpshadow.tables import Table
@@ -60,7 +59,6 @@ _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Any
     ),
 }
 _STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {"pose": pose_stages, "deformation": deformation_stages}
-_ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 _EXPECTED = {
     bool: "true or false",
     int: "a whole number",
@@ -151,35 +149,14 @@ def _target(table: Table, folder: Path) -> Target:
     check.known_keys("key", table, _TARGET_KEYS)
     if "image" not in table:
         raise ValueError("image: missing, expected a file name")
-    image = _image(tables.file(table, "image", folder))
-    mask = _mask(tables.file(table, "mask", folder)) if "mask" in table else None
+    image = read_target(tables.file(table, "image", folder))
+    mask: Any = tables.file(table, "mask", folder) if "mask" in table else None
     camera = None
     if "camera" in table:
         with tables.located("camera"):
             tables.check_table(table["camera"])
             camera = parse_camera({"size": [image.shape[1], image.shape[0]]} | table["camera"])
     return Target(image, mask, camera)
-
-
-def _image(path: Path) -> np.ndarray:
-    """Linear RGB, or premultiplied RGB with coverage where the file has alpha, which is straight in PNG alone."""
-    pixels = read_image(path)
-    if pixels.shape[2] < 3:
-        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
-    if pixels.shape[2] == 4 and path.suffix.lower() in _ENCODED:
-        pixels[..., :3] *= pixels[..., 3:]
-    return pixels
-
-
-def _mask(path: Path) -> np.ndarray:
-    """Gray as it is stored, 0 to 1: a mask is no light, so that half gray is half."""
-    pixels = read_image(path)
-    has_alpha = pixels.shape[2] in (2, 4)
-    colors = pixels[..., :-1] if has_alpha else pixels
-    if (colors != colors[..., :1]).any() or (has_alpha and (pixels[..., -1] != 1).any()):
-        raise ValueError(f"mask: got colors or transparency in {path}, expected gray")
-    gray = colors[..., 0]
-    return linear_to_srgb(gray) if path.suffix.lower() in _ENCODED else gray
 
 
 # ---------------------------------------------------------------------------------------------- what is free
@@ -200,7 +177,7 @@ def _free(table: Table, scene: Scene) -> list[Free]:
         for where, value in tables.numbered({key: []} | table, key, "free."):
             with tables.located(where):
                 free.append(_make(kind, value))
-                check.choice("body", value["body"], range(len(scene.bodies)))
+                free[-1].check_scene(scene)
     return free
 
 

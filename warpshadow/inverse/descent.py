@@ -7,14 +7,16 @@ import math
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import warp as wp
 
+from warpshadow import check
 from warpshadow.camera import Camera
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.free import Values
@@ -329,14 +331,21 @@ def fit(
     """
     from tqdm import tqdm
 
-    stages = tuple(stages)
+    check.instance("problem", problem, Problem, "a Problem, as Problem(scene, targets, free) makes it")
+    stages = tuple(stages) if isinstance(stages, Iterable) else (stages,)
     check_stages(stages, problem)
-    if not 0 <= tolerance < 1:
+    if not callable(optimizer):
+        raise ValueError(
+            f"optimizer: got {check.described(optimizer)}, expected what makes one of tensors and lr, such as "
+            "torch.optim.Adam"
+        )
+    where = torch.device(wp.device_to_torch(check.device("device", str(device))))
+    if not (check.is_number(tolerance) and 0 <= tolerance < 1):
         raise ValueError(f"tolerance: got {tolerance!r}, expected a part of the loss, 0 or more and below 1")
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
-    descent = _Descent(problem, stages, optimizer, tolerance, seed, torch.device(device), progress)
+    descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
     state = None if checkpoint is None else checkpoints.load(checkpoint)
     if state is None:
         descent.begin_stage()

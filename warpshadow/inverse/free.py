@@ -23,7 +23,7 @@ from warpshadow.directions import check_count, fibonacci
 from warpshadow.inverse.world import Found, Setting, World
 from warpshadow.light import EnvironmentMap
 from warpshadow.renderer import Renderer
-from warpshadow.scene import Visibility
+from warpshadow.scene import SPHERE_METHODS, Body, Scene, Visibility
 from warpshadow.sh import check_order, equirectangular_directions
 from warpshadow.spheres import Spheres
 from warpshadow.texture import fill_unseen
@@ -54,13 +54,13 @@ class Free(abc.ABC):
     def name(self) -> str:
         """What values, messages and files call it."""
 
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError where a scene has no such thing; the message names the argument."""
+        return
+
     @abc.abstractmethod
     def start(self, setting: Setting) -> Values:
-        """Values where the scene has them.
-
-        Raises:
-            ValueError: where the scene has no such thing; the message names the argument.
-        """
+        """Values where the scene has them."""
 
     @abc.abstractmethod
     def place(self, values: Values, setting: Setting, world: World) -> None:
@@ -89,15 +89,34 @@ class Free(abc.ABC):
         return
 
 
+@dataclass(frozen=True)
+class FreeOfBody(Free):
+    """A free parameter of a body.
+
+    Args:
+        body: The body, from 0.
+    """
+
+    body: int
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        if not check.is_integer(self.body) or self.body < 0:
+            raise ValueError(f"body: got {check.described(self.body)}, expected the number of a body, from 0")
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError where a scene has no such body."""
+        check.index("body", self.body, len(scene.bodies), "body")
+
+
 def _check_weight(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name}: got {value!r}, expected a weight of 0 or more")
+    if not (check.is_number(value) and value >= 0):
+        raise ValueError(f"{name}: got {check.described(value)}, expected a weight of 0 or more")
 
 
-def _check_body(body: int, setting: Setting) -> None:
-    check.choice("body", body, range(len(setting.scene.bodies)))
-    if isinstance(body, bool) or not isinstance(body, (int, np.integer)):
-        raise ValueError(f"body: got {body!r}, expected a whole number")
+def _sphere_count(body: Body) -> int:
+    """Spheres of a body, or how many are asked for."""
+    return body.blockers if isinstance(body.blockers, int) else len(body.blockers)
 
 
 # ---------------------------------------------------------------------------------------------- light
@@ -123,7 +142,10 @@ class Light(Free):
     def __post_init__(self) -> None:
         """Validate."""
         if (self.order is None) == (self.directions is None):
-            raise ValueError(f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them")
+            raise ValueError(
+                f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them, such as "
+                "Light(5) or Light(None, directions=512)"
+            )
         if self.directions is not None:
             check_count("directions", self.directions)
         if self.order is not None:
@@ -218,7 +240,7 @@ class Exposure(Free):
 
 
 @dataclass(frozen=True)
-class Albedo(Free):
+class Albedo(FreeOfBody):
     """The reflectance of a body: one color, or one for each vertex.
 
     Args:
@@ -226,7 +248,6 @@ class Albedo(Free):
         per_vertex: A color for each vertex.
     """
 
-    body: int
     per_vertex: bool = False
 
     @property
@@ -234,17 +255,21 @@ class Albedo(Free):
         """What values, messages and files call it."""
         return f"albedo[{self.body}]"
 
-    def start(self, setting: Setting) -> Values:
-        """The body's albedo."""
-        _check_body(self.body, setting)
-        body = setting.scene.bodies[self.body]
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body whose reflectance is of another kind."""
+        super().check_scene(scene)
+        body = scene.bodies[self.body]
         if body.texture is not None:
             raise ValueError(f"body: got {self.body}, which has a texture; expected one without, or Texture")
+        if np.ndim(body.albedo) > 1 and not self.per_vertex:
+            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected per_vertex=True")
+
+    def start(self, setting: Setting) -> Values:
+        """The body's albedo."""
+        body = setting.scene.bodies[self.body]
         colors = np.atleast_2d(body.albedo)
         if self.per_vertex:
             colors = np.broadcast_to(colors, (body.mesh.vertex_count, 3))
-        elif len(colors) > 1:
-            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected per_vertex=True")
         return {"color": setting.tensor(colors)}
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
@@ -262,7 +287,7 @@ class Albedo(Free):
 
 
 @dataclass(frozen=True)
-class Texture(Free):
+class Texture(FreeOfBody):
     """The reflectance of a body as an image, which needs uvs.
 
     Args:
@@ -271,16 +296,16 @@ class Texture(Free):
         smoothness: Weight of the mean square of differences between neighboring texels.
     """
 
-    body: int
     size: tuple[int, int] | None = None
     smoothness: float = 0.0
 
     def __post_init__(self) -> None:
         """Validate."""
+        super().__post_init__()
         if self.size is not None:
-            check.shape("size", np.shape(self.size), (2,))
-            if not all(isinstance(count, (int, np.integer)) and count > 0 for count in self.size):
-                raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels")
+            is_pair = isinstance(self.size, (tuple, list, np.ndarray)) and len(self.size) == 2
+            if not is_pair or not all(check.is_integer(count) and count > 0 for count in self.size):
+                raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels, (256, 256)")
         _check_weight("smoothness", self.smoothness)
 
     @property
@@ -288,14 +313,20 @@ class Texture(Free):
         """What values, messages and files call it."""
         return f"texture[{self.body}]"
 
-    def start(self, setting: Setting) -> Values:
-        """The body's texture, or its color."""
-        _check_body(self.body, setting)
-        body = setting.scene.bodies[self.body]
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that cannot have a texture."""
+        super().check_scene(scene)
+        body = scene.bodies[self.body]
         if body.mesh.uvs is None:
-            raise ValueError(f"body: got {self.body}, whose mesh has no uvs; expected uvs, as mesh.unwrap makes them")
+            raise ValueError(
+                f"body: got {self.body}, whose mesh has no uvs; expected uvs, as warpshadow.mesh.unwrap makes them"
+            )
         if body.texture is None and np.ndim(body.albedo) > 1:
             raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected one color")
+
+    def start(self, setting: Setting) -> Values:
+        """The body's texture, or its color."""
+        body = setting.scene.bodies[self.body]
         image = np.reshape(body.albedo, (1, 1, 3)) if body.texture is None else body.texture
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
         planes = setting.tensor(image).permute(2, 0, 1)[None]
@@ -331,7 +362,7 @@ class Texture(Free):
 
 
 @dataclass(frozen=True)
-class Pose(Free):
+class Pose(FreeOfBody):
     """The pose of a body: a rotation about the middle of its bounding box, a translation, and maybe a scale.
 
     Args:
@@ -344,15 +375,15 @@ class Pose(Free):
 
     moves: ClassVar[bool] = True
 
-    body: int
     rotation: str = "axis-angle"
     scale: bool = False
     spread: float = 0.55
 
     def __post_init__(self) -> None:
         """Validate."""
+        super().__post_init__()
         check.choice("rotation", self.rotation, _NO_TURN)
-        if not (np.isfinite(self.spread) and 0 <= self.spread <= np.pi):
+        if not (check.is_number(self.spread) and 0 <= self.spread <= np.pi):
             raise ValueError(f"spread: got {self.spread!r}, expected an angle from 0 to π")
 
     @property
@@ -362,7 +393,6 @@ class Pose(Free):
 
     def start(self, setting: Setting) -> Values:
         """Where the body is."""
-        _check_body(self.body, setting)
         values = {"turn": setting.tensor(_NO_TURN[self.rotation]), "shift": setting.tensor(np.zeros(3))}
         return values | ({"log_scale": setting.tensor(0.0)} if self.scale else {})
 
@@ -411,7 +441,7 @@ class Pose(Free):
 
 
 @dataclass(frozen=True)
-class Deformation(Free):
+class Deformation(FreeOfBody):
     """The shape of a body, by embedded deformation (Sumner et al. 2007); its spheres are the nodes (the paper, sec. 4).
 
     A node's matrix is a rotation times a symmetric stretch. Values are those of the nodes before they are smoothed over
@@ -429,7 +459,6 @@ class Deformation(Free):
 
     moves: ClassVar[bool] = True
 
-    body: int
     rigidity: float = 1.25
     firmness: float = 0.001
     smoothness: float = 6.0
@@ -437,9 +466,10 @@ class Deformation(Free):
 
     def __post_init__(self) -> None:
         """Validate."""
+        super().__post_init__()
         for name in ("rigidity", "firmness", "smoothness"):
             _check_weight(name, getattr(self, name))
-        if isinstance(self.count, bool) or not isinstance(self.count, (int, np.integer)) or self.count < 1:
+        if not check.is_integer(self.count) or self.count < 1:
             raise ValueError(f"count: got {self.count!r}, expected a whole number of nodes from 1 on")
 
     @property
@@ -447,9 +477,15 @@ class Deformation(Free):
         """What values, messages and files call it."""
         return f"deformation[{self.body}]"
 
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body with too few spheres."""
+        super().check_scene(scene)
+        nodes = _sphere_count(scene.bodies[self.body])
+        if self.count >= nodes:
+            raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
+
     def start(self, setting: Setting) -> Values:
         """The shape as it is."""
-        _check_body(self.body, setting)
         nodes = setting.graph(self.body, self.count).node_positions.shape[0]
         sizes = {"turns": 3, "shifts": 3, "stretches": 6}
         return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
@@ -494,7 +530,7 @@ class Deformation(Free):
 
 
 @dataclass(frozen=True)
-class Radii(Free):
+class Radii(FreeOfBody):
     """The radii of a body's spheres, as factors.
 
     Args:
@@ -504,11 +540,11 @@ class Radii(Free):
 
     moves: ClassVar[bool] = True
 
-    body: int
     persistence: float = 0.0
 
     def __post_init__(self) -> None:
         """Validate."""
+        super().__post_init__()
         _check_weight("persistence", self.persistence)
 
     @property
@@ -516,13 +552,15 @@ class Radii(Free):
         """What values, messages and files call it."""
         return f"radii[{self.body}]"
 
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body without spheres."""
+        super().check_scene(scene)
+        if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.body]):
+            raise ValueError(f"body: got {self.body}, which has no spheres; expected one that casts a shadow")
+
     def start(self, setting: Setting) -> Values:
         """The radii as they are."""
-        _check_body(self.body, setting)
-        count = len(setting.spheres(self.body))
-        if not count:
-            raise ValueError(f"body: got {self.body}, which has no spheres; expected one that casts a shadow")
-        return {"log": setting.tensor(np.zeros(count))}
+        return {"log": setting.tensor(np.zeros(len(setting.spheres(self.body))))}
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Swell and shrink the spheres."""

@@ -1,6 +1,5 @@
 """Losses: how unlike the images of a model are to its targets."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -37,9 +36,9 @@ class Loss:
         """Validate."""
         check.choice("kind", self.kind, KINDS)
         check.choice("reduction", self.reduction, REDUCTIONS)
-        if not 0 < self.delta < math.inf:
+        if not (check.is_number(self.delta) and self.delta > 0):
             raise ValueError(f"delta: got {self.delta!r}, expected a positive number")
-        if not 0 <= self.coverage < math.inf:
+        if not (check.is_number(self.coverage) and self.coverage >= 0):
             raise ValueError(f"coverage: got {self.coverage!r}, expected a weight of 0 or more")
 
     def __call__(self, images: torch.Tensor, targets: torch.Tensor, weights: torch.Tensor, unit: float) -> torch.Tensor:

@@ -14,11 +14,12 @@ from warpshadow import check
 from warpshadow.basis import Basis
 from warpshadow.blockers import scene_blockers
 from warpshadow.camera import Camera
-from warpshadow.inverse.free import Free, Light, Values
+from warpshadow.inverse.free import Albedo, Free, Light, Texture, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene import AUTO, METHODS, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene import AUTO, METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.tables import located
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +46,20 @@ class Problem:
 
     def __post_init__(self) -> None:
         """Validate."""
+        check.instance("scene", self.scene, Scene, SCENE)
+        check.instance("loss", self.loss, Loss, "a Loss, such as Loss('huber')")
+        rays = "a Visibility, such as Visibility('ray-traced'), or None for the scene's"
+        check.instance("still", self.still, (Visibility, type(None)), rays)
         for name in ("targets", "free"):
             items = getattr(self, name)
-            items = tuple(items) if isinstance(items, Sequence) else (items,)
+            items = tuple(items) if isinstance(items, Sequence) and not isinstance(items, str) else (items,)
             if not items:
                 raise ValueError(f"{name}: got none, expected one or more")
             object.__setattr__(self, name, items)
-        for name, kind in (("targets", Target), ("free", Free)):
-            for number, item in enumerate(getattr(self, name)):
-                if not isinstance(item, kind):
-                    raise ValueError(f"{name}[{number}]: got {type(item).__name__}, expected a {kind.__name__}")
+        for number, target in enumerate(self.targets):
+            check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it")
+        for number, each in enumerate(self.free):
+            check.instance(f"free[{number}]", each, Free, "what is free, such as Pose(0) or Light()")
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:
             raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
@@ -62,6 +67,9 @@ class Problem:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(f"free: got {twice[0]} twice, expected it once")
+        for body in range(len(self.scene.bodies)):
+            if {Albedo(body).name, Texture(body).name} <= set(names):
+                raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
         if self.still is not None:
             check.choice("still.method", self.still.method, METHODS)
         if self.scene.visibility.method == AUTO:
@@ -73,6 +81,9 @@ class Problem:
                 'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '
                 'expected "directional", "log-sh" or "none"'
             )
+        for number, each in enumerate(self.free):
+            with located(f"free[{number}]"):
+                each.check_scene(self.scene)
         self.cameras()  # raises for an image of other proportions
 
     @property

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
+from warpshadow import check
 from warpshadow.directions import check_count
 from warpshadow.inverse.problem import Problem
-from warpshadow.scene import Visibility
+from warpshadow.scene import Visibility, check_supersampling
 
 LAST_RATE = 0.1
 """Share of its learning rate that a stage ends with."""
@@ -49,20 +48,20 @@ class Stage:
         """Validate."""
         for name in ("iterations", "candidates"):
             count = getattr(self, name)
-            if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            if not check.is_integer(count) or count < 1:
                 raise ValueError(f"{name}: got {count!r}, expected a whole number from 1 on")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
+        if not (check.is_number(self.learning_rate) and self.learning_rate > 0):
             raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
-        if not (math.isfinite(self.regularization) and self.regularization >= 0):
+        if not (check.is_number(self.regularization) and self.regularization >= 0):
             raise ValueError(f"regularization: got {self.regularization!r}, expected a factor of 0 or more")
-        if not 0 < self.scale <= 1:
+        if not (check.is_number(self.scale) and 0 < self.scale <= 1):
             raise ValueError(f"scale: got {self.scale!r}, expected a part of the image, above 0 and up to 1")
-        if self.softness is not None and not (math.isfinite(self.softness) and self.softness > 0):
+        if self.softness is not None and not (check.is_number(self.softness) and self.softness > 0):
             raise ValueError(f"softness: got {self.softness!r}, expected a positive number of cell radii")
         if self.directions is not None:
             check_count("directions", self.directions)
-        if self.supersampling is not None and self.supersampling not in range(1, 17):
-            raise ValueError(f"supersampling: got {self.supersampling!r}, expected a whole number from 1 to 16")
+        if self.supersampling is not None:
+            check_supersampling(self.supersampling)
 
     def rate(self, iteration: int) -> float:
         """Learning rate of an iteration."""
@@ -82,6 +81,7 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
         raise ValueError("stages: got none, expected one or more")
     visibility, camera = problem.visibility, problem.cameras()[0]
     for number, stage in enumerate(stages):
+        check.instance(f"stages[{number}]", stage, Stage, "a Stage, such as Stage(iterations=200)")
         try:
             stage.visibility(visibility)
             camera.resized(stage.scale)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from warpshadow import check
 from warpshadow.camera import Camera
+from warpshadow.image import linear_to_srgb, read_image
+from warpshadow.tables import located
+
+_ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
     """An image that a fit explains.
 
+    The path of a file, relative to the current folder, stands for what is in it, as in fit files.
+
     Args:
         image: Linear RGB, shape [height, width, 3]; or premultiplied RGB with coverage, [height, width, 4], as
-            renderers make it, and the coverage is explained, too.
+            renderers make it, and the coverage is explained, too; or a file that :func:`read_target` reads.
         mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out what the scene has
-            no body for: the background of a photograph, say.
+            no body for: the background of a photograph, say. Or a file that :func:`read_mask` reads.
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
 
     Raises:
@@ -32,23 +39,35 @@ class Target:
     camera: Camera | None = None
 
     def __post_init__(self) -> None:
-        """Validate, and hold arrays as float32."""
-        image = np.array(self.image, np.float32)
+        """Read files, validate, and hold arrays as float32."""
+        for name, read in (("image", read_target), ("mask", read_mask)):
+            if check.is_path(getattr(self, name)):
+                path = check.file(name, getattr(self, name))
+                with located(name):
+                    object.__setattr__(self, name, read(path))
+        image = check.pixels("image", self.image, expected="linear RGB [height, width, 3], or the path of a picture")
         if image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
-            raise ValueError(f"image: got shape {image.shape}, expected [height, width, 3 or 4]")
+            remedy = check.channels_last(image.shape)
+            raise ValueError(
+                f"image: got shape {image.shape}, expected [height, width, 3 or 4]{remedy and f': {remedy}'}"
+            )
         if self.mask is not None:
-            mask = np.array(self.mask, np.float32)
+            is_bool = np.asarray(self.mask).dtype == bool
+            given = np.asarray(self.mask, np.float32) if is_bool else self.mask
+            mask = check.numbers("mask", given, expected="weights of pixels [height, width], or the path of a picture")
             check.shape("mask", mask.shape, image.shape[:2])
             check.finite("mask", mask)
             if mask.min() < 0 or mask.max() > 1 or not mask.any():
                 raise ValueError(
-                    f"mask: got values from {mask.min():g} to {mask.max():g}, expected 0 to 1, and not 0 alone"
+                    f"mask: got values from {mask.min():g} to {mask.max():g}, expected 0 to 1, and not 0 alone; of "
+                    "8 bits: mask / 255"
                 )
             object.__setattr__(self, "mask", mask)
             image[mask == 0] = 0  # whatever is there
         check.finite("image", image)
         object.__setattr__(self, "image", image)
         size = image.shape[1], image.shape[0]
+        check.instance("camera", self.camera, (Camera, type(None)), "a Camera, or None for the scene's")
         if self.camera is not None and (self.camera.width, self.camera.height) != size:
             raise ValueError(
                 f"image: got {size[0]} × {size[1]} pixels, expected the camera's "
@@ -63,6 +82,27 @@ class Target:
     def weights(self) -> np.ndarray:
         """How much each pixel counts, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
+
+
+def read_target(path: str | Path) -> np.ndarray:
+    """Linear RGB, or premultiplied RGB with coverage where the file has alpha, which is straight in PNG alone."""
+    pixels = read_image(path)
+    if pixels.shape[2] < 3:
+        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
+    if pixels.shape[2] == 4 and Path(path).suffix.lower() in _ENCODED:
+        pixels[..., :3] *= pixels[..., 3:]
+    return pixels
+
+
+def read_mask(path: str | Path) -> np.ndarray:
+    """Gray as it is stored, 0 to 1: a mask is no light, so that half gray is half."""
+    pixels = read_image(path)
+    has_alpha = pixels.shape[2] in (2, 4)
+    colors = pixels[..., :-1] if has_alpha else pixels
+    if (colors != colors[..., :1]).any() or (has_alpha and (pixels[..., -1] != 1).any()):
+        raise ValueError(f"got colors or transparency in {path}, expected gray")
+    gray = colors[..., 0]
+    return linear_to_srgb(gray) if Path(path).suffix.lower() in _ENCODED else gray
 
 
 def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
