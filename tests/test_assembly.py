@@ -160,7 +160,7 @@ def test_a_graph_that_does_not_move_leaves_its_body_as_it_is(device):
 
 def test_what_does_not_fit_is_refused(device):
     assembly = two_bodies(device)
-    with pytest.raises(ValueError, match="^number: got 2, expected one of 0, 1"):
+    with pytest.raises(ValueError, match="^number: got 2, expected the number of a body, from 0 to 1"):
         assembly.graph(2)
     wrong = wp.zeros((1, 7), dtype=wp.vec3, device=device)
     with pytest.raises(ValueError, match=r"^positions: got shape \(1, 7\), expected \[batch, 12\]"):

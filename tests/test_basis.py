@@ -5,7 +5,7 @@ import pytest
 import twins
 
 from warpshadow import directions as cells
-from warpshadow.basis import CellBasis, HarmonicBasis
+from warpshadow.basis import CellBasis, HarmonicBasis, check_basis
 from warpshadow.light import EnvironmentMap, synthetic_sky
 
 # Coefficients are float32 of numbers up to 10.
@@ -76,6 +76,29 @@ def test_light_that_fills_no_order_is_refused_in_cells():
 def test_light_that_fills_no_order_is_refused_in_harmonics(count):
     with pytest.raises(ValueError, match=f"light: got {count} coefficients, expected a square number"):
         HarmonicBasis(4).coefficients(np.zeros((count, 3)))
+
+
+@pytest.mark.parametrize("directions", [128, None, np.zeros((16, 3)), np.ones((16, 2)), np.zeros((0, 3))])
+def test_cells_are_around_unit_vectors(directions):
+    with pytest.raises(ValueError, match=r"^directions: got .*fibonacci\(128\)"):
+        CellBasis(directions)
+
+
+@pytest.mark.parametrize("order", [1, 9, 5.0, True, "5"])
+def test_harmonics_have_an_order_that_the_kernels_are_made_for(order):
+    with pytest.raises(ValueError, match=f"^order: got {order!r}"):
+        HarmonicBasis(order)
+
+
+@pytest.mark.parametrize(
+    ("basis", "remedy"),
+    [(5, r"HarmonicBasis\(5\)"), ("sh", "CellBasis"), (HarmonicBasis, "the class HarmonicBasis")],
+)
+def test_what_is_no_basis_is_refused_with_how_to_make_one(basis, remedy):
+    check_basis(None)
+    check_basis(HarmonicBasis(5))
+    with pytest.raises(ValueError, match=f"^basis: got .*{remedy}"):
+        check_basis(basis)
 
 
 @pytest.mark.parametrize("basis", [HarmonicBasis(3), CellBasis(cells.fibonacci(32))])

@@ -23,6 +23,14 @@ def test_the_common_batch_is_the_one_length_that_is_not_one():
         common_batch({**arrays, "d": np.zeros((3, 2))})
 
 
+def test_lengths_that_differ_are_both_named_with_how_to_pair_them():
+    with pytest.raises(
+        ValueError,
+        match=r"as b has; for all 12 pairs repeat each of b 3 times .*repeat_interleave\(3, 0\), and all of d 4 times",
+    ):
+        common_batch({"a": np.zeros(1), "b": np.zeros(4), "d": np.zeros(3)})
+
+
 @pytest.mark.parametrize("dtype", [wp.vec3, wp.float32])
 def test_parts_lie_after_one_another_for_every_instance(device, dtype):
     parts = [random(device, *shape, dtype=dtype, seed=seed) for seed, shape in enumerate([(1, 2), (3, 4), (3, 1)])]

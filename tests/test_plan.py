@@ -392,7 +392,7 @@ def test_instances_that_differ_in_what_stands_still_are_refused():
 
 def test_a_body_that_moves_is_one_of_the_scenes():
     renderer = Renderer(scene_of("none"))
-    with pytest.raises(ValueError, match="moving: got 3, expected one of 0, 1, 2"):
+    with pytest.raises(ValueError, match="moving: got 3, expected the number of a body, from 0 to 2"):
         renderer.assembly.placed(moving=[3])
 
 

@@ -9,6 +9,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow import lighting, sh
+from warpshadow.assembly import Geometry
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
 from warpshadow.point_sample import PointSample
@@ -239,7 +240,71 @@ def test_pixel_and_vertex_receivers_mix_in_one_image(device):
 def test_a_camera_that_sees_no_body_renders_nothing(device, method, receivers):
     camera = ws.Camera.look_at((0, 0, 5), (0, 0, 10), size=(8, 8))
     scene = scene_of(method, ball(receivers=receivers), camera=camera)
-    np.testing.assert_array_equal(ws.render(scene, device=device), np.zeros((8, 8, 4)))
+    with pytest.warns(UserWarning, match="camera: the image shows nothing of the scene: .* behind the camera"):
+        np.testing.assert_array_equal(ws.render(scene, device=device), np.zeros((8, 8, 4)))
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"near": 50.0}, "near = 50 cuts all of it away, which is .* or less in front of the camera"),
+        ({"target": (50, 0, 4)}, "outside of the frame, at depths from"),
+    ],
+)
+def test_an_image_that_shows_nothing_says_why_once(device, options, reason):
+    camera = ws.Camera.look_at((0, 0, 5), **{"target": (0, 0, 0), "size": (8, 8)} | options)
+    renderer = Renderer(scene_of("none", camera=camera), device=device)
+    with pytest.warns(UserWarning, match=f"camera: the image shows nothing of the scene: .*{reason}") as caught:
+        renderer.render()
+        renderer.draw(view=renderer.view(renderer.assembly.placed()))
+    assert len(caught) == 1
+
+
+def test_a_view_of_several_that_shows_nothing_is_named(device):
+    views = [CAMERA, dataclasses.replace(CAMERA, translation=-CAMERA.translation)]
+    with pytest.warns(UserWarning, match="camera: image 1 of 2 shows nothing of the scene: .* behind"):
+        Renderer(scene_of("none"), cameras=views, device=device).render()
+
+
+def test_moving_geometry_that_leaves_the_image_is_remarked_on():
+    renderer = Renderer(scene_of("none"))
+    positions, *spheres = renderer.geometry
+    away = wp.array(positions.numpy() + (0, 0, 100), dtype=wp.vec3)
+    with pytest.warns(UserWarning, match="camera: the image shows nothing of the scene: .* behind the camera"):
+        renderer.view(Geometry(away, *spheres))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scene": "scene.toml"}, r"scene: got 'scene.toml', expected a Scene; load_scene\(path\) reads one"),
+        ({"basis": 5}, r"basis: got 5, expected HarmonicBasis\(5\)"),
+        ({"cameras": CAMERA}, r"cameras: got Camera, expected a list of Cameras, \[camera\]"),
+        ({"cameras": ["front"]}, r"cameras\[0\]: got 'front', expected a Camera"),
+        ({"device": "gpu"}, "device: got 'gpu', expected one of 'cpu'"),
+    ],
+)
+def test_what_a_renderer_is_not_made_of_is_refused_when_it_is_made(options, message):
+    with pytest.raises(ValueError, match=message):
+        Renderer(**{"scene": scene_of("none")} | options)
+
+
+@pytest.mark.parametrize(
+    ("light", "message"),
+    [
+        ("park.exr", r"light: got 'park.exr', expected an EnvironmentMap, as EnvironmentMap.read\(path\)"),
+        ([[1.0, 1.0, 1.0]] * 4, "light: got list of 4 items, expected an EnvironmentMap"),
+        (np.ones(9), r"light: got shape \(9,\), expected \[order², 3\]"),
+    ],
+)
+def test_what_is_no_light_is_refused(light, message):
+    with pytest.raises(ValueError, match=message):
+        Renderer(scene_of("none")).render(light)
+
+
+def test_the_texels_of_a_body_without_a_texture_are_refused():
+    with pytest.raises(ValueError, match="number: got 0, a body without a texture"):
+        Renderer(scene_of("none")).seen_texels(0)
 
 
 # ---------------------------------------------------------------------------------------------- pixels

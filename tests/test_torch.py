@@ -286,7 +286,10 @@ def test_texels_that_no_pixel_sees_have_a_zero_gradient():
 @pytest.mark.parametrize(
     ("light", "message"),
     [
-        (torch.ones(32, 3, dtype=torch.float64), "light: got torch.float64"),
+        (torch.ones(32, 3, dtype=torch.float64), r"light: got torch.float64, .*: .float\(\) converts it"),
+        (torch.ones(9, 3), r"got shape \(9, 3\), .* cells of 32 directions; for 9 .* basis=HarmonicBasis\(3\)$"),
+        (torch.ones(48, 3), r"for 48 .* basis=CellBasis\(warpshadow.directions.fibonacci\(48\)\)$"),
+        ("park.exr", "light: got 'park.exr', expected an EnvironmentMap"),
         (torch.ones(32, 3, dtype=torch.int32), "light: got torch.int32"),
         (torch.ones(31, 3), r"light: got shape \(31, 3\), expected \[32, 3\]"),
         (torch.ones(32), r"light: got shape \(32,\)"),
@@ -310,7 +313,8 @@ def test_light_that_does_not_fit_is_refused(renderer, light, message):
         ([torch.ones(4, 4, 3), None], r"albedo\[0\]: got shape \(4, 4, 3\), expected \[batch, 162, 3\]"),
         ([torch.ones(0, 3), None], r"albedo\[0\]: got shape \(0, 3\)"),
         ([None, torch.tensor([0.5, float("nan"), 0.5])], r"albedo\[1\]: got 1 NaN"),
-        ([None, [0.5, 0.5, 0.5]], r"albedo\[1\]: got list"),
+        ([None, [0.5, 0.5, 0.5]], r"albedo\[1\]: got list, expected a tensor .*torch.as_tensor"),
+        (torch.ones(2, 3), "albedo: got Tensor of .*, expected a list of 2 items, one for each body"),
     ],
 )
 def test_albedo_that_does_not_fit_is_refused(renderer, albedo, message):
@@ -323,6 +327,7 @@ def test_albedo_that_does_not_fit_is_refused(renderer, albedo, message):
     [
         ([None], "textures: got 1 items, expected 2"),
         ([None, torch.ones(4, 4, 4)], r"textures\[1\]: got shape \(4, 4, 4\), expected \[height, width, 3\]"),
+        ([None, torch.ones(3, 8, 8)], r"textures\[1\]: got shape \(3, 8, 8\), .*: channels come last"),
         ([None, torch.ones(0, 4, 3)], r"textures\[1\]: got shape \(0, 4, 3\)"),
         ([None, torch.ones(4, 4, 3).double()], r"textures\[1\]: got torch.float64"),
         ([torch.ones(4, 4, 3), None], r"textures\[0\]: got an image, but the mesh has no uvs"),
@@ -336,6 +341,60 @@ def test_a_texture_that_does_not_fit_is_refused(renderer, textures, message):
 def test_a_body_has_an_albedo_or_a_texture(renderer):
     with pytest.raises(ValueError, match=r"albedo\[1\], textures\[1\]: got both"):
         renderer(albedo=[None, torch.ones(3)], textures=[None, torch.ones(4, 4, 3)])
+
+
+def test_a_batch_of_poses_and_one_of_cameras_are_both_named_with_how_to_pair_them(renderer):
+    poses = [part.expand(4, *part.shape) for part in renderer.scene_poses()]
+    geometry = renderer.placed(*poses)
+    matrix = torch.tensor(renderer.renderer.cameras[0].clip_matrix(), dtype=torch.float32)
+    matrices = matrix.expand(3, 4, 4)
+    with pytest.raises(ValueError) as caught:
+        renderer(geometry=geometry, clip_matrices=matrices)
+    message = str(caught.value)
+    assert message.startswith("clip_matrices: got a batch of 3, expected 1 or 4, as geometry.positions has")
+    assert "the poses of geometry 3 times in a row, in torch repeat_interleave(3, 0)" in message
+    assert "all of clip_matrices 4 times, repeat(4, 1, …)" in message
+    paired = renderer.placed(*(part.repeat_interleave(3, 0) for part in poses))  # as it says
+    assert renderer(geometry=paired, clip_matrices=matrices.repeat(4, 1, 1)).shape[0] == 12
+
+
+@pytest.mark.parametrize("name", ["light", "albedo", "textures"])
+def test_batches_of_other_arguments_are_named_as_they_were_given(renderer, name):
+    matrix = torch.tensor(renderer.renderer.cameras[0].clip_matrix(), dtype=torch.float32)
+    given = {
+        "light": torch.ones(4, 32, 3),
+        "albedo": [torch.ones(4, 1, 3), None],
+        "textures": [None, torch.ones(4, 2, 2, 3)],
+    }
+    with pytest.raises(ValueError, match=r"got a batch of \d, expected 1 or \d, as .* has") as caught:
+        renderer(**{name: given[name]}, clip_matrices=matrix.expand(3, 4, 4))
+    assert name in str(caught.value) and "clip_matrices" in str(caught.value)
+
+
+def test_a_batch_of_the_renderers_own_cameras_is_named():
+    scene = small_scene()
+    renderer = TorchRenderer(scene, cameras=[scene.camera] * 2)
+    with pytest.raises(ValueError, match="light: got a batch of 3, expected 1 or 2, as cameras has"):
+        renderer(torch.ones(3, 32, 3))
+
+
+@pytest.mark.parametrize("moving", [[1.0], [True], [-1], [2], ["1"], 1])
+def test_bodies_that_move_are_numbers_of_the_scenes(renderer, moving):
+    with pytest.raises(ValueError, match="^moving: got .*, expected "):
+        renderer.placed(*renderer.scene_poses(), moving=moving)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (torch.zeros(3).double(), r"parameters: got torch.float64, .*.float\(\)"),
+        (np.zeros(3), "parameters: got ndarray, expected a tensor"),
+        (torch.tensor(1.0), "parameters: last dimension"),
+    ],
+)
+def test_rotations_of_what_is_no_float32_tensor_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        rotation_matrices(parameters)
 
 
 def test_a_huge_finite_tensor_is_not_mistaken_for_infinity(renderer):
@@ -368,6 +427,7 @@ def test_geometry_that_rays_would_have_to_follow_is_refused():
         ({"rotations": torch.eye(3).expand(3, 3, 3)}, r"rotations: got shape \(3, 3, 3\), expected \[2, 3, 3\]"),
         ({"translations": torch.zeros(2, 2)}, r"translations: got shape \(2, 2\), expected \[2, 3\]"),
         ({"scales": torch.full((2,), float("nan"))}, "scales: got 2 NaN"),
+        ({"scales": torch.tensor([1.0, -1.0])}, r"scales: got 1 values out of range .*: -1\), expected 0 to"),
         ({"translations": torch.zeros(2, 3).double()}, "translations: got torch.float64"),
         (
             {"translations": torch.zeros(3, 2, 3), "rotations": torch.eye(3).expand(2, 2, 3, 3)},

@@ -205,6 +205,8 @@ class Assembly:
         poses = self.poses if poses is None else poses
         rest = self.rest if rest is None else as_geometry("rest", rest)
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
+        if moving is not None:
+            check.instance("moving", moving, Iterable, "a list of the numbers of bodies, such as [0]")
         if moving is None or rest.moving is None:
             return Geometry(
                 poses.points(rest.positions, self._vertex_bodies),
@@ -213,7 +215,7 @@ class Assembly:
             )
         bodies = {*moving, *rest.moving}
         for number in bodies:
-            check.choice("moving", number, range(len(self.scene.bodies)))
+            check.index("moving", number, len(self.scene.bodies), "body")
         vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
         still = self.scene_geometry
         return Geometry(
@@ -255,7 +257,7 @@ class Assembly:
         Raises:
             ValueError: when the body has too few spheres.
         """
-        check.choice("number", number, range(len(self.scene.bodies)))
+        check.index("number", number, len(self.scene.bodies), "body")
         body = self.scene.bodies[number]
         return DeformationGraph.bind(
             body.mesh.positions, self._spheres[number].centers, count=count, device=self.device
@@ -289,7 +291,7 @@ class Assembly:
 
         Differentiable: positions, centers, radii, rest.
         """
-        check.choice("number", number, range(len(self.scene.bodies)))
+        check.index("number", number, len(self.scene.bodies), "body")
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         return Geometry(

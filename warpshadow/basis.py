@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpshadow import sh
-from warpshadow.directions import fibonacci
+from warpshadow import check, sh
+from warpshadow.directions import CHUNK, fibonacci
 from warpshadow.light import EnvironmentMap
 
 
@@ -45,6 +45,16 @@ class CellBasis:
 
     directions: np.ndarray
 
+    def __post_init__(self) -> None:
+        """Validate."""
+        expected = "unit vectors [direction, 3]; warpshadow.directions.fibonacci(128) makes 128"
+        directions = check.numbers("directions", self.directions, expected=expected, dtype=np.float64)
+        check.shape("directions", directions.shape, ("direction", 3), "warpshadow.directions.fibonacci(128) makes 128")
+        if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+            raise ValueError(f"directions: got others than {expected}")
+        directions.setflags(write=False)
+        object.__setattr__(self, "directions", directions)
+
     @property
     def size(self) -> int:
         """Number of coefficients."""
@@ -64,6 +74,27 @@ class CellBasis:
 
 
 Basis = HarmonicBasis | CellBasis
+
+
+def check_basis(basis: object) -> None:
+    """Raise ValueError unless it is a basis, or None; the message says how to make one."""
+    if basis is not None and not isinstance(basis, (HarmonicBasis, CellBasis)):
+        order = basis if check.is_integer(basis) and basis in sh.ORDERS else 5
+        raise ValueError(
+            f"basis: got {check.described(basis)}, expected HarmonicBasis({order}) for {order} bands of spherical "
+            "harmonics, CellBasis(warpshadow.directions.fibonacci(128)) for cells of 128 directions, or None for what "
+            "the method computes in"
+        )
+
+
+def describe_coefficients(basis: Basis, count: int) -> str:
+    """What coefficients in a basis are, for messages to those who gave ``count`` of them."""
+    what = f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
+    order = int(round(np.sqrt(count)))
+    others = [f"HarmonicBasis({order})"] if order in sh.ORDERS and order**2 == count else []
+    others += [f"CellBasis(warpshadow.directions.fibonacci({count}))"] if count and not count % CHUNK else []
+    remedy = f"; for {count} make the renderer with basis={' or '.join(others)}" if others else ""
+    return f"coefficients in renderer.basis, {what}{remedy}"
 
 
 def conversion(basis: Basis, other: Basis) -> np.ndarray | None:

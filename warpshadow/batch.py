@@ -15,11 +15,16 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
     Raises:
         ValueError: naming the array whose length is another.
     """
-    counts = {name: array.shape[0] for name, array in arrays.items() if array is not None}
-    count = next((count for count in counts.values() if count != 1), 1)
+    counts = {name: len(array) for name, array in arrays.items() if array is not None}
+    first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
     for name, got in counts.items():
         if got not in (1, count):
-            raise ValueError(f"{name}: got a batch of {got}, expected 1 or {count}")
+            each, whole = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
+            raise ValueError(
+                f"{name}: got a batch of {got}, expected 1 or {count}, as {first} has; for all {got * count} pairs "
+                f"repeat each of {each} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {whole} "
+                f"{count} times, repeat({count}, 1, …)"
+            )
     return count
 
 

@@ -178,12 +178,9 @@ def _next_attempt(tuning: Tuning, is_inaccurate: bool) -> str:
 
 
 def _device(name: str) -> wp.Device:
-    try:
-        return wp.get_device(name)
-    except ValueError as error:
-        wp.init()
-        known = ", ".join(device.alias for device in wp.get_devices())
-        raise ValueError(f"device: got {name!r}, expected one of {known}") from error
+    from warpshadow import check
+
+    return check.device("device", name)
 
 
 @app.command()

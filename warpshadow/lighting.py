@@ -93,6 +93,7 @@ class Lighting:
             view: The view; None before it is made.
             still: What is known of the bodies that stand still among moving ones; None for nothing yet.
         """
+        _check_light(light)
         light = self._scene.light if light is None else light
         bands = self._free_bands if isinstance(light, wp.array) else self._known_bands(light)
         light_facts = LightFacts(
@@ -130,6 +131,7 @@ class Lighting:
 
     def shade(self, view: View, light: Light | None = None) -> wp.array:
         """Light the receivers of a view, by default in the scene's light: vec3 of shape [batch, receiver]."""
+        _check_light(light)
         light = self._scene.light if light is None else light
         if isinstance(light, np.ndarray):
             check.finite("light", light)
@@ -388,6 +390,17 @@ class Lighting:
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self._assembly.device)
+
+
+def _check_light(light: object) -> None:
+    """Raise ValueError for what is no light, or None."""
+    expected = (
+        "an EnvironmentMap, as EnvironmentMap.read(path) reads it, known SH coefficients as an array [order², 3], or "
+        "free coefficients in renderer.basis as a tensor"
+    )
+    check.instance("light", light, (EnvironmentMap, np.ndarray, wp.array, type(None)), expected)
+    if isinstance(light, np.ndarray):
+        check.shape("light", light.shape, ("order²", 3))
 
 
 def _lit(group: _Group, transfer: wp.array, terms: _Terms) -> wp.array:

@@ -96,8 +96,7 @@ class Reflectance:
         bodies = self._bodies
         colors, images = list(self._scene.colors), list(self._scene.images)
         for name, given in (("albedo", albedo), ("textures", textures)):
-            if given is not None and len(given) != len(bodies):
-                raise ValueError(f"{name}: got {len(given)} items, expected {len(bodies)}, one for each body")
+            check.per_body(name, given, len(bodies))
         for number, color in enumerate(albedo or ()):
             if color is not None:
                 vertex_count = bodies[number].mesh.vertex_count
@@ -186,7 +185,9 @@ class Reflectance:
     def seen_texels(self, view: View, number: int) -> np.ndarray:
         """What each texel of the texture of a body weighs in a view's samples, float32 of shape [height, width]."""
         has_texture = [image is not None for image in self._scene.images]
-        check.choice("number", number, [body for body, has in enumerate(has_texture) if has])
+        check.index("number", number, len(has_texture), "body")
+        if not has_texture[number]:
+            raise ValueError(f"number: got {number}, a body without a texture, expected one that has one")
         pyramids = mip_pyramids(self._scene.present)
         footprints = self._find_footprints(view, pyramids, self._scene.sizes)
         return seen_texels(pyramids, footprints)[sum(has_texture[:number])].sum(axis=0)

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpshadow import film
+from warpshadow import check, film
 from warpshadow.assembly import Assembly, Geometry, as_geometry
-from warpshadow.basis import Basis
+from warpshadow.basis import Basis, check_basis
 from warpshadow.camera import Camera
 from warpshadow.light import EnvironmentMap
 from warpshadow.lighting import Light, Lighting
 from warpshadow.plan import ALBEDO, LIGHT, TEXTURES, Explanation, ImagePlan, Ledger, ViewFacts, plan_image
 from warpshadow.raster import Fragments
 from warpshadow.reflectance import Reflectance
-from warpshadow.scene import AUTO, Scene
+from warpshadow.scene import AUTO, SCENE, Scene
 from warpshadow.silhouette import find_contrasts, smooth_silhouettes
 from warpshadow.tape import unrecorded
 from warpshadow.threads import one_at_a_time
@@ -67,21 +67,24 @@ class Renderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
+        check.instance("scene", scene, Scene, SCENE)
+        check_basis(basis)
+        where = check.device("device", device)
         if scene.visibility.method == AUTO:
             from warpshadow.tuning import resolved  # which renders to find out
 
-            scene = resolved(scene, device=device, progress=progress)
+            scene = resolved(scene, device=where, progress=progress)
         self._arguments = {
             "scene": scene,
             "cameras": cameras,
-            "device": str(wp.get_device(device)),
+            "device": str(where),
             "basis": basis,
             "progress": progress,
         }
         self.scene = scene
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
-        self.device = wp.get_device(device)
+        self.device = where
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
         self._ledger = Ledger()
@@ -391,10 +394,12 @@ def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """Cameras whose images are a batch, checked."""
+    check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
     if not cameras:
         raise ValueError("cameras: got none, expected at least one, or None for the scene's")
     first = cameras[0]
     for number, camera in enumerate(cameras):
+        check.instance(f"cameras[{number}]", camera, Camera, "a Camera")
         if (camera.width, camera.height, camera.near) != (first.width, first.height, first.near):
             raise ValueError(
                 f"cameras[{number}]: got {camera.width} × {camera.height} pixels and near = {camera.near}, "

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow import check, deform
 from warpshadow.assembly import Geometry, as_geometry
-from warpshadow.basis import Basis
+from warpshadow.basis import Basis, describe_coefficients
 from warpshadow.batch import common_batch
 from warpshadow.camera import Camera, compose_clip_matrices
 from warpshadow.deform import Poses, Vec6
@@ -95,16 +95,17 @@ class TorchRenderer(torch.nn.Module):
         """
         renderer, bodies = self.renderer, self.renderer.scene.bodies
         geometry = None if geometry is None else as_geometry("geometry", geometry)
-        arguments = _Arguments(self.device, has_batch=renderer.has_camera_batch and clip_matrices is None)
+        has_cameras = renderer.has_camera_batch and clip_matrices is None
+        arguments = _Arguments(self.device, cameras=renderer.cameras if has_cameras else None)
         if isinstance(light, torch.Tensor):
-            arguments.add("light", light, wp.vec3, (renderer.basis.size,))
+            what = describe_coefficients(renderer.basis, light.shape[-2] if light.ndim > 1 else 0)
+            arguments.add("light", light, wp.vec3, (renderer.basis.size,), what)
         for name, tensor, dtype in zip(Geometry._fields, geometry or (), _GEOMETRY_DTYPES, strict=False):
             arguments.add(f"geometry.{name}", tensor, dtype, getattr(renderer.assembly.rest, name).shape[1:])
         if clip_matrices is not None:
             arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
         for name, tensors in (("albedo", albedo), ("textures", textures)):
-            if tensors is not None and len(tensors) != len(bodies):
-                raise ValueError(f"{name}: got {len(tensors)} items, expected {len(bodies)}, one for each body")
+            check.per_body(name, tensors, len(bodies))
         for number, tensor in enumerate(albedo or ()):
             if tensor is not None:
                 counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
@@ -112,7 +113,8 @@ class TorchRenderer(torch.nn.Module):
                 arguments.add(f"albedo[{number}]", tensor, wp.vec3, shape)
         for number, tensor in enumerate(textures or ()):
             if tensor is not None:
-                arguments.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"))
+                remedy = check.channels_last(np.shape(tensor))
+                arguments.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy)
 
         def draw(*arrays: wp.array) -> wp.array:
             given = dict(zip(arguments.names, arrays, strict=True))
@@ -279,7 +281,8 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
 
     Differentiable: parameters.
     """
-    check.choice("parameters: last dimension", parameters.shape[-1], _ROTATION_PARAMETERS)
+    _check_float32("parameters", parameters)
+    check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
     rows = parameters.reshape(1, -1, *dtype._shape_)
     matrices = apply(deform.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
@@ -289,17 +292,20 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
 class _Arguments:
     """Tensors that become arguments of a function of Warp arrays, checked and with a leading batch dimension."""
 
-    def __init__(self, device: torch.device, *, has_batch: bool = False):
+    def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
         self.device = device
-        self._has_batch = has_batch  # of results
+        self._cameras = cameras  # a batch that there is beside those of tensors
+        self._has_batch = cameras is not None  # of results
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
 
-    def add(self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...]) -> None:
+    def add(
+        self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...], meaning: str = ""
+    ) -> None:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
         shape = (*shape, *getattr(dtype, "_shape_", ()))
-        _check_tensor(name, tensor, self.device, shape)
+        _check_tensor(name, tensor, self.device, shape, meaning)
         has_batch = tensor.ndim > len(shape)
         self._has_batch |= has_batch
         self.names.append(name)
@@ -308,25 +314,40 @@ class _Arguments:
 
     def expand(self) -> None:
         """Repeat tensors with a batch of 1 for every instance of the others."""
-        count = common_batch(dict(zip(self.names, self.tensors, strict=True)))
+        count = self._common_batch()
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
     def apply(self, function: Callable) -> Any:
         """Apply a function of arrays to them; results lose a batch dimension that no tensor had."""
+        self._common_batch()
         results = apply(function, *self.tensors, dtypes=self.dtypes, device=self.device)
         if self._has_batch:
             return results
         return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
 
+    def _common_batch(self) -> int:
+        return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
 
-def _check_tensor(name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...]) -> None:
+
+def _check_float32(name: str, tensor: object) -> None:
+    """Raise ValueError unless it is a tensor of float32."""
+    if not isinstance(tensor, torch.Tensor):
+        raise ValueError(
+            f"{name}: got {type(tensor).__name__}, expected a tensor of torch.float32: "
+            "torch.as_tensor(…, dtype=torch.float32)"
+        )
+    if tensor.dtype != torch.float32:
+        raise ValueError(f"{name}: got {tensor.dtype}, expected a tensor of torch.float32: .float() converts it")
+
+
+def _check_tensor(
+    name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...], meaning: str
+) -> None:
     """Raise ValueError unless a tensor is of float32, finite, on the device, and of the shape or a batch of it."""
-    if not isinstance(tensor, torch.Tensor) or tensor.dtype != torch.float32:
-        got = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
-        raise ValueError(f"{name}: got {got}, expected a tensor of torch.float32")
+    _check_float32(name, tensor)
     if tensor.device != device:
-        raise ValueError(f"{name}: got device {tensor.device}, expected {device}")
-    check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape)
+        raise ValueError(f"{name}: got device {tensor.device}, expected {device}: .to({str(device)!r}) moves it")
+    check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape, meaning)
     if tensor.numel() == 0 and 0 not in shape:
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
     if not _is_capturing(device) and not np.isfinite(float(tensor.detach().sum())):
@@ -354,6 +375,8 @@ def apply(
 
     Differentiable: as the function is, once.
     """
+    for number, tensor in enumerate(tensors):
+        _check_float32(f"tensors[{number}]", tensor)
     wp.init()
     wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
     results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)

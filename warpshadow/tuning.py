@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import tables
+from warpshadow import check, tables
 from warpshadow.blockers import fitted_counts
 from warpshadow.point_sample import PointSample
-from warpshadow.scene import AUTO, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres, is_fitted
 from warpshadow.timing import image_times
 from warpshadow.visibility.zonal_logs import LOGS
@@ -178,11 +178,13 @@ def tune(
     """
     from tqdm import tqdm
 
+    check.instance("scene", scene, Scene, SCENE)
+    device = check.device("device", device)
     given = {"error": error, "milliseconds": milliseconds}
     wanted = next((value for value in given.values() if value is not None), None)
     if wanted is None or None not in given.values():
         raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
-    if not (np.isfinite(wanted) and wanted > 0):
+    if not (check.is_number(wanted) and wanted > 0):
         name = "error" if milliseconds is None else "milliseconds"
         raise ValueError(f"{name}: got {wanted!r}, expected a positive number")
     sample = PointSample(scene, device=device, progress=progress)
@@ -253,7 +255,7 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
     if scene.visibility.method != AUTO:
         return scene
     if scene not in _resolved:
-        _resolved[scene] = _resolve(scene, wp.get_device(device), progress)
+        _resolved[scene] = _resolve(scene, check.device("device", device), progress)
     return _resolved[scene]
 
 

@@ -1,6 +1,7 @@
 """Views: what cameras see of a geometry, made anew only when geometry or cameras changed."""
 
 import functools
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assembly import Assembly, Geometry, exchanged
+from warpshadow.batch import common_batch
 from warpshadow.camera import Camera, to_clip
 from warpshadow.graph import is_readable
 from warpshadow.light import EnvironmentMap
@@ -126,6 +128,7 @@ class Viewer:
         self._scene_view: View | None = None
         self._last: tuple[View, np.ndarray] | None = None  # with its cameras
         self._stills: dict[tuple[int, ...] | None, Still] = {}  # by what moves
+        self._has_warned = False
 
     @functools.cached_property
     def clip_matrices(self) -> wp.array:
@@ -146,6 +149,9 @@ class Viewer:
         if still is None and self._stands(geometry).any():
             still = self._stills[geometry.moving] = Still(self.assembly, geometry, progress=self._progress)
         view = self._made(plan, facts.varying, geometry, clip_matrices, still)
+        device = self.assembly.device
+        if not self._has_warned and (is_readable(device) or (is_scenes and not device.is_capturing)):
+            self._warn_of_empty_images(view)
         if is_scenes:
             self._scene_view = view
         elif view.keeps and is_readable(self.assembly.device):
@@ -204,10 +210,10 @@ class Viewer:
         if geometry is not None:
             for name, array, own in zip(Geometry._fields, geometry, self.assembly.rest, strict=True):
                 check.shape(f"geometry.{name}", array.shape, ("batch", *own.shape[1:]))
-        return (
-            self.assembly.scene_geometry if geometry is None else geometry,
-            self.clip_matrices if clip_matrices is None else clip_matrices,
-        )
+        geometry = self.assembly.scene_geometry if geometry is None else geometry
+        clip_matrices = self.clip_matrices if clip_matrices is None else clip_matrices
+        common_batch({"geometry": geometry.positions, "clip_matrices": clip_matrices})
+        return geometry, clip_matrices
 
     def _expected(self, geometry: Geometry | None, clip_matrices: wp.array | None, stands: np.ndarray) -> ViewFacts:
         """What is known of a view before it is made."""
@@ -318,6 +324,25 @@ class Viewer:
             return vertex_normals(positions, assembly.faces)
         runs = assembly.runs(assembly.first_vertex, still.moving)
         return exchanged(still.normals, runs, lambda a, b: vertex_normals(positions[:, a:b], assembly.faces_of(a, b)))
+
+    def _warn_of_empty_images(self, view: View) -> None:
+        """Say, once, which image shows nothing of the scene, and why."""
+        face_ids = view.fragments.face_ids.numpy()
+        empty = np.flatnonzero(face_ids.max(axis=(1, 2), initial=-1) < 0)
+        if not len(empty):
+            return
+        self._has_warned = True
+        number, near = int(empty[0]), self.cameras[0].near
+        depths = view.clip_positions.numpy()[min(number, len(view.clip_positions) - 1), :, 3]
+        nearest, farthest = float(depths.min()), float(depths.max())
+        if farthest <= 0:
+            reason = f"all of it is behind the camera, by {-farthest:g} or more"
+        elif farthest <= near:
+            reason = f"near = {near:g} cuts all of it away, which is {farthest:g} or less in front of the camera"
+        else:
+            reason = f"it is outside of the frame, at depths from {nearest:g} to {farthest:g}"
+        which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
+        warnings.warn(f"camera: {which} shows nothing of the scene: {reason}", stacklevel=4)
 
 
 def _varying(geometry: Geometry | None, clip_matrices: wp.array | None) -> tuple[str, ...]:
