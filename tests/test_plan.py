@@ -431,7 +431,8 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module == "texture":
-        return "footprints" if "footprints" in key else "reflectance" if "_sample" in key else "mip pyramids"
+        parts = {"footprints": "footprints", "_expose": "exposure", "_sample": "reflectance"}
+        return next((name for part, name in parts.items() if part in key), "mip pyramids")
     if module == "raster":
         return "reflectance" if "interpol" in key else "rasterization"
     if module in ("transfer", "still"):

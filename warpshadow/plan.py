@@ -7,7 +7,7 @@ them, so that what is said to be left out is left out.
 
 import contextlib
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import warp as wp
@@ -262,14 +262,18 @@ class ReflectanceFacts:
         keeps_pyramids: Whether the textures are, and their mip levels have been made.
         texels: Number of texels of the textures of all instances.
         keeps_footprints: Whether the view keeps what its samples cover of textures of such sizes.
+        is_flat: Whether the footprints that are kept take the finest levels alone.
         varying: Which of albedo and textures require a gradient.
+        exposes: Whether samples are exposed as it is found what they reflect; see :func:`exposes_albedo`.
     """
 
     is_scenes: bool
     keeps_pyramids: bool
     texels: int
     keeps_footprints: bool
+    is_flat: bool
     varying: tuple[str, ...]
+    exposes: bool
 
 
 @dataclass(frozen=True)
@@ -279,6 +283,11 @@ class ReflectancePlan(Plan):
     pyramids: Stage
     footprints: Stage
     reflectance: Stage
+
+
+def exposes_albedo(varying: Collection[str]) -> bool:
+    """Whether textures vary, and nothing else does but albedo: samples are exposed as it is found what they reflect."""
+    return TEXTURES in varying and not set(varying) - {ALBEDO, TEXTURES}
 
 
 def plan_reflectance(view: ViewFacts, given: ReflectanceFacts) -> ReflectancePlan:
@@ -292,10 +301,14 @@ def plan_reflectance(view: ViewFacts, given: ReflectanceFacts) -> ReflectancePla
         pyramids = Decision(True, "textures are given, or the scene's are used for the first time")
         if given.keeps_pyramids:
             pyramids = Decision(False, "kept: the scene's textures stand")
+        elif given.is_flat:
+            pyramids = Decision(False, "no sample takes a coarser level of the only texture")
         footprints = Decision(True, "nothing is kept of them")
         if given.keeps_footprints:
             footprints = Decision(False, "kept: geometry, cameras and sizes of textures stand")
         reflectance = Decision(True, "nothing is kept of it" if given.is_scenes else "reflectance is given")
+        if given.exposes:
+            reflectance = Decision(False, "found as samples are exposed: what they receive stands")
     samples = f"{view.samples:,} samples"
     textures = [name for name in given.varying if name == TEXTURES]
     return ReflectancePlan(

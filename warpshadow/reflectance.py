@@ -11,9 +11,27 @@ from warpshadow import check
 from warpshadow.assembly import Assembly
 from warpshadow.batch import concatenate
 from warpshadow.constants import constant
-from warpshadow.plan import ALBEDO, TEXTURES, Ledger, ReflectanceFacts, ReflectancePlan, ViewFacts, plan_reflectance
+from warpshadow.graph import is_readable
+from warpshadow.plan import (
+    ALBEDO,
+    TEXTURES,
+    Ledger,
+    ReflectanceFacts,
+    ReflectancePlan,
+    Stage,
+    ViewFacts,
+    plan_reflectance,
+)
 from warpshadow.raster import interpolate
-from warpshadow.texture import Footprints, Textures, find_footprints, mip_pyramids, sample_albedo, seen_texels
+from warpshadow.texture import (
+    Footprints,
+    Textures,
+    expose_albedo,
+    find_footprints,
+    mip_pyramids,
+    sample_albedo,
+    seen_texels,
+)
 from warpshadow.views import Kept, View
 
 Given = Sequence[wp.array | None] | None
@@ -64,7 +82,9 @@ class Reflectance:
 
     # ------------------------------------------------------------------------------------------ plans
 
-    def plan(self, view: ViewFacts, albedo: Given, textures: Given, kept: Kept | None) -> ReflectancePlan:
+    def plan(
+        self, view: ViewFacts, albedo: Given, textures: Given, kept: Kept | None, *, exposes: bool
+    ) -> ReflectancePlan:
         """What it takes to find what a view's samples reflect; nothing is computed.
 
         Args:
@@ -72,10 +92,11 @@ class Reflectance:
             albedo: As for :meth:`find`.
             textures: As for :meth:`find`.
             kept: What the view keeps; None before it is made.
+            exposes: Whether for :meth:`expose`.
         """
-        return self._plan(view, self._materials(albedo, textures), kept)
+        return self._plan(view, self._materials(albedo, textures), kept, exposes)
 
-    def _plan(self, view: ViewFacts, materials: _Materials, kept: Kept | None) -> ReflectancePlan:
+    def _plan(self, view: ViewFacts, materials: _Materials, kept: Kept | None, exposes: bool) -> ReflectancePlan:
         is_scenes_color = _same(materials.colors, self._scene.colors)
         has_scenes_textures = _same(materials.images, self._scene.images)
         varies = {
@@ -87,7 +108,9 @@ class Reflectance:
             keeps_pyramids=has_scenes_textures and self._scene_pyramids is not None,
             texels=sum(image.size for image in materials.present),
             keeps_footprints=kept is not None and materials.sizes in kept.footprints,
+            is_flat=kept is not None and kept.footprints.get(materials.sizes, (None, None))[1] == 0,
             varying=tuple(name for name, does in varies.items() if does),
+            exposes=exposes,
         )
         return plan_reflectance(view, given)
 
@@ -125,11 +148,8 @@ class Reflectance:
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
         """
-        materials = self._materials(albedo, textures)
-        for name, given in (("albedo", albedo), ("textures", textures)):
-            arrays = {f"{name}[{number}]": array for number, array in enumerate(given or ())}
-            check.finite_arrays(arrays)
-        plan = self._plan(view.facts, materials, view.kept)
+        materials = self._given(albedo, textures)
+        plan = self._plan(view.facts, materials, view.kept, exposes=False)
         if not plan.reflectance:
             assert view.kept.reflectance is not None
             return view.kept.reflectance
@@ -139,29 +159,65 @@ class Reflectance:
             view.kept.reflectance = reflected
         return reflected
 
+    def expose(self, view: View, white: wp.array, exposure: Stage, albedo: Given, textures: Given) -> wp.array:
+        """Expose a view's samples as it is found what they reflect: vec4 of shape [batch, height, width].
+
+        Args:
+            view: The view, which stands, as does what its samples receive.
+            white: The samples if every surface were white.
+            exposure: The stage.
+            albedo: As for :meth:`find`.
+            textures: As for :meth:`find`, one at least.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+        """
+        materials = self._given(albedo, textures)
+        plan = self._plan(view.facts, materials, view.kept, exposes=True)
+        vertex_albedo = self._vertex_albedo(materials)
+        pyramids, footprints = self._textures(plan, view, materials)
+        with self._ledger.timed(exposure, [vertex_albedo, *materials.present]):
+            return expose_albedo(view.fragments, self._assembly.faces, vertex_albedo, pyramids, footprints, white)
+
+    def _given(self, albedo: Given, textures: Given) -> _Materials:
+        """The scene's, with what is given in their place, of finite numbers."""
+        materials = self._materials(albedo, textures)
+        for name, given in (("albedo", albedo), ("textures", textures)):
+            arrays = {f"{name}[{number}]": array for number, array in enumerate(given or ())}
+            check.finite_arrays(arrays)
+        return materials
+
     def _sample(self, plan: ReflectancePlan, view: View, materials: _Materials) -> wp.array:
         timed, faces = self._ledger.timed, self._assembly.faces
-        is_scenes = _same(materials.colors, self._scene.colors)
-        vertex_albedo = self._scene_vertex_albedo if is_scenes else self._join(materials.colors)
+        vertex_albedo = self._vertex_albedo(materials)
         present = materials.present
         if not present:
             with timed(plan.reflectance, [vertex_albedo, view.clip_positions]):
                 return interpolate(view.fragments, faces, vertex_albedo)
-        with timed(plan.pyramids, present):
-            pyramids = self._pyramids(plan, view, materials)
-        with timed(plan.footprints, [view.clip_positions]):
-            footprints = self._footprints(plan, view, pyramids, materials.sizes)
+        pyramids, footprints = self._textures(plan, view, materials)
         with timed(plan.reflectance, [vertex_albedo, *present, view.clip_positions]):
             return sample_albedo(view.fragments, faces, vertex_albedo, pyramids, footprints)
 
+    def _vertex_albedo(self, materials: _Materials) -> wp.array:
+        """Reflectance of all vertices."""
+        if _same(materials.colors, self._scene.colors):
+            return self._scene_vertex_albedo
+        return self._join(materials.colors)
+
+    def _textures(self, plan: ReflectancePlan, view: View, materials: _Materials) -> tuple[Textures, Footprints]:
+        """Mip levels of the textures, and what each sample covers of them."""
+        with self._ledger.timed(plan.pyramids, materials.present):
+            pyramids = self._pyramids(plan, view, materials)
+        with self._ledger.timed(plan.footprints, [view.clip_positions]):
+            return pyramids, self._footprints(plan, view, pyramids, materials.sizes)
+
     def _pyramids(self, plan: ReflectancePlan, view: View, materials: _Materials) -> Textures:
         """Mip levels: the scene's are kept, and of others only those are made that kept footprints take."""
-        if not plan.pyramids:
-            assert self._scene_pyramids is not None
-            return self._scene_pyramids
         if _same(materials.images, self._scene.images):
-            self._scene_pyramids = mip_pyramids(materials.present)
-            return self._scene_pyramids
+            if plan.pyramids:
+                self._scene_pyramids = mip_pyramids(materials.present)
+            if self._scene_pyramids is not None:
+                return self._scene_pyramids
         coarsest = None if plan.footprints else self._coarsest_level(view, materials.sizes)
         return mip_pyramids(materials.present, coarsest=coarsest)
 
@@ -171,15 +227,15 @@ class Reflectance:
             return view.kept.footprints[sizes][0]
         footprints = self._find_footprints(view, pyramids, sizes)
         if view.keeps:
-            view.kept.footprints = {sizes: (footprints, None)}
+            coarsest = footprints.coarsest_level() if is_readable(self._assembly.device) else None
+            view.kept.footprints = {sizes: (footprints, coarsest)}
         return footprints
 
     def _coarsest_level(self, view: View, sizes: tuple) -> int | None:
-        """Coarsest level that kept footprints take: worth waiting for a GPU once it is clear that they stand."""
+        """Coarsest level that kept footprints take; for a GPU's it waits once it is clear that they stand."""
         footprints, coarsest = view.kept.footprints[sizes]
         if coarsest is None and view.keeps:
-            coarsest = footprints.coarsest_level()
-            view.kept.footprints[sizes] = footprints, coarsest
+            view.kept.footprints[sizes] = footprints, footprints.coarsest_level()
         return coarsest
 
     def seen_texels(self, view: View, number: int) -> np.ndarray:

@@ -18,9 +18,9 @@ from warpshadow.basis import Basis, check_basis
 from warpshadow.camera import Camera
 from warpshadow.light import EnvironmentMap
 from warpshadow.lighting import Light, Lighting
-from warpshadow.plan import ALBEDO, LIGHT, TEXTURES, Explanation, ImagePlan, Ledger, ViewFacts, plan_image
+from warpshadow.plan import ALBEDO, LIGHT, TEXTURES, Explanation, Ledger, ViewFacts, exposes_albedo, plan_image
 from warpshadow.raster import Fragments
-from warpshadow.reflectance import Reflectance
+from warpshadow.reflectance import Given, Reflectance
 from warpshadow.scene import AUTO, SCENE, Scene
 from warpshadow.silhouette import find_contrasts, smooth_silhouettes
 from warpshadow.tape import unrecorded
@@ -285,11 +285,15 @@ class Renderer:
         """
         view = self._own(view)
         lit = self.shade(light, view)
-        reflected = self.reflect(albedo, textures, view)
-        plan, timed = self._plan_image(view.facts, light, albedo, textures), self._ledger.timed
+        varying = _varying(view.facts, light, albedo, textures)
+        plan, timed = plan_image(view.facts, varying, supersampling=self.scene.supersampling), self._ledger.timed
         receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
-        with timed(plan.exposure, [lit, reflected, clip_positions]):
-            samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
+        if exposes_albedo(varying):
+            samples = self._reflectance.expose(view, self._white(view, lit), plan.exposure, albedo, textures)
+        else:
+            reflected = self.reflect(albedo, textures, view)
+            with timed(plan.exposure, [lit, reflected, clip_positions]):
+                samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
         contrasts = None
         if plan.contrasts:
             with timed(plan.contrasts):
@@ -300,6 +304,17 @@ class Renderer:
             return smoothed
         with timed(plan.averaging, [smoothed]):
             return film.average(smoothed, self.scene.supersampling)
+
+    def _white(self, view: View, lit: wp.array) -> wp.array:
+        """The samples of a view if every surface were white, kept while its shading is."""
+        if view.kept.white is None or view.kept.white[1] is not lit:
+            _, height, width = view.fragments.face_ids.shape
+            albedo = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.device)
+            white = film.expose(view.receivers.fragments, view.receivers.faces, lit, albedo)
+            if not view.keeps:
+                return white
+            view.kept.white = white, lit
+        return view.kept.white[0]
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -358,28 +373,25 @@ class Renderer:
         else:
             prospect = Prospect(None, self._own(view).facts, view, view.still)
         _, facts, view, still = prospect
+        kept = None if view is None else view.kept
+        varying = _varying(facts, light, colors, images)
         plans = [
             prospect.plan,
             self._lighting.plan(facts, light, view=view, still=still),
-            self._reflectance.plan(facts, colors, images, None if view is None else view.kept),
-            self._plan_image(facts, light, colors, images),
+            self._reflectance.plan(facts, colors, images, kept, exposes=exposes_albedo(varying)),
+            plan_image(facts, varying, supersampling=self.scene.supersampling),
         ]
         stages = [stage for plan in plans if plan is not None for stage in plan.stages()]
         return Explanation(stages, self._ledger.timings, is_host=self.device.is_cpu)
 
-    def _plan_image(
-        self,
-        view: ViewFacts,
-        light: Light | None,
-        albedo: Sequence[wp.array | None] | None,
-        textures: Sequence[wp.array | None] | None,
-    ) -> ImagePlan:
-        """What it takes to make an image of what a view's samples receive and reflect."""
-        given = {LIGHT: [light], ALBEDO: albedo or (), TEXTURES: textures or ()}
-        varying = [
-            name for name, arrays in given.items() if any(getattr(array, "requires_grad", False) for array in arrays)
-        ]
-        return plan_image(view, [*view.varying, *varying], supersampling=self.scene.supersampling)
+
+def _varying(view: ViewFacts, light: Light | None, albedo: Given, textures: Given) -> list[str]:
+    """What requires a gradient."""
+    given = {LIGHT: [light], ALBEDO: albedo or (), TEXTURES: textures or ()}
+    return [
+        *view.varying,
+        *(name for name, arrays in given.items() if any(getattr(array, "requires_grad", False) for array in arrays)),
+    ]
 
 
 def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:

@@ -224,7 +224,7 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
             by default all.
 
     Returns:
-        All levels, those beyond the coarsest unwritten.
+        All levels, those beyond the coarsest unwritten or left out. One image without coarser levels is not copied.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -241,6 +241,8 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
     sizes = tuple(image.shape[1:] for image in images)
     device = images[0].device
     layout = _layout(sizes, str(device))
+    if len(images) == 1 and coarsest == 0:
+        return Textures(rows(images[0]), layout.device_levels, layout.device_level_counts, sizes)
     texels = wp.empty(
         (common_batch({f"images[{number}]": image for number, image in enumerate(images)}), layout.texel_count),
         dtype=wp.vec3,
@@ -496,9 +498,9 @@ def _reach(count: float):
 
 
 @wp.func
-def _weight(probe: int, count: float):
-    """Weight of a probe: the part of the line in its stretch of one width, so outer ones fade in as it grows."""
-    return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0) / count
+def _share(probe: int, count: float):
+    """What a probe weighs of ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
+    return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0)
 
 
 @wp.struct
@@ -514,34 +516,151 @@ class _Cell:
 
 
 @wp.func
-def _cell(level: wp.vec3i, u: float, v: float):
-    """Find the texels around a uv, which repeats outside of [0, 1]."""
-    width = level[1]
-    height = level[2]
-    x = (u - wp.floor(u)) * float(width) - 0.5
-    y = (1.0 - (v - wp.floor(v))) * float(height) - 0.5
+def _place(level: wp.vec3i, uv: wp.vec2):
+    """Where a uv lies in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
+    x = (uv[0] - wp.floor(uv[0])) * float(level[1]) - 0.5
+    y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(level[2]) - 0.5
+    return wp.vec2(x, y)
+
+
+@wp.func
+def _repeated(texel: int, count: int):
+    """The texel among ``count`` that one outside of them repeats."""
+    return (texel % count + count) % count
+
+
+@wp.func
+def _cell(level: wp.vec3i, x: float, y: float):
+    """Find the texels around a place in a level, as `_place` has it or beside that."""
+    cell = _Cell()
+    cell.s = x - wp.floor(x)
+    cell.t = y - wp.floor(y)
     left = int(wp.floor(x))
     top = int(wp.floor(y))
-    cell = _Cell()
-    cell.s = x - float(left)
-    cell.t = y - float(top)
-    right = wp.where(left + 1 < width, left + 1, 0)
-    bottom = wp.where(top + 1 < height, top + 1, 0)
-    left = wp.where(left < 0, width - 1, left)
-    top = wp.where(top < 0, height - 1, top)
-    cell.above_left = level[0] + top * width + left
-    cell.above_right = level[0] + top * width + right
-    cell.below_left = level[0] + bottom * width + left
-    cell.below_right = level[0] + bottom * width + right
+    right = left + 1
+    bottom = top + 1
+    if wp.min(left, top) < 0 or right >= level[1] or bottom >= level[2]:  # few do, and remainders take long
+        left = _repeated(left, level[1])
+        right = _repeated(right, level[1])
+        top = _repeated(top, level[2])
+        bottom = _repeated(bottom, level[2])
+    above = level[0] + top * level[1]
+    below = level[0] + bottom * level[1]
+    cell.above_left = above + left
+    cell.above_right = above + right
+    cell.below_left = below + left
+    cell.below_right = below + right
     return cell
 
 
 @wp.func
-def _bilinear(texels: wp.array(dtype=wp.vec3), cell: _Cell):
-    """Interpolate between four texels."""
-    above = (1.0 - cell.s) * texels[cell.above_left] + cell.s * texels[cell.above_right]
-    below = (1.0 - cell.s) * texels[cell.below_left] + cell.s * texels[cell.below_right]
-    return (1.0 - cell.t) * above + cell.t * below
+def _filtered(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4):
+    """Mean of a level over the probes of a footprint, each bilinear between four texels."""
+    place = _place(level, uv)
+    reach = _reach(line[3])
+    color = wp.vec3()
+    for probe in range(-reach, reach + 1):
+        x = place[0] + float(probe) * line[0] * float(level[1])
+        y = place[1] - float(probe) * line[1] * float(level[2])
+        cell = _cell(level, x, y)
+        below = _share(probe, line[3]) * cell.t
+        above = _share(probe, line[3]) - below
+        color += (
+            (above * (1.0 - cell.s)) * texels[cell.above_left]
+            + (above * cell.s) * texels[cell.above_right]
+            + (below * (1.0 - cell.s)) * texels[cell.below_left]
+            + (below * cell.s) * texels[cell.below_right]
+        )
+    return color / line[3]
+
+
+@wp.func
+def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4, adj_color: wp.vec3):
+    """Add to the gradients of a level's texels: the adjoint of `_filtered`, by what is filtered."""
+    place = _place(level, uv)
+    reach = _reach(line[3])
+    adj_sum = adj_color / line[3]
+    for probe in range(-reach, reach + 1):
+        x = place[0] + float(probe) * line[0] * float(level[1])
+        y = place[1] - float(probe) * line[1] * float(level[2])
+        cell = _cell(level, x, y)
+        below = _share(probe, line[3]) * cell.t
+        above = _share(probe, line[3]) - below
+        wp.atomic_add(adj_texels, cell.above_left, (above * (1.0 - cell.s)) * adj_sum)
+        wp.atomic_add(adj_texels, cell.above_right, (above * cell.s) * adj_sum)
+        wp.atomic_add(adj_texels, cell.below_left, (below * (1.0 - cell.s)) * adj_sum)
+        wp.atomic_add(adj_texels, cell.below_right, (below * cell.s) * adj_sum)
+
+
+@wp.func
+def _color(
+    sample: int,
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    vertex_albedo: wp.array(dtype=wp.vec3),
+    texels: wp.array(dtype=wp.vec3),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array(dtype=wp.int32),
+    uvs: wp.array(dtype=wp.vec2),
+    probes: wp.array(dtype=wp.vec4),
+):
+    """What a sample reflects."""
+    texture = texture_ids[sample]
+    color = wp.vec3()
+    if texture >= 0:
+        line = probes[sample]
+        level, coarse_part = _level_of(line[2], level_counts[texture])
+        color = _filtered(texels, levels[texture, level], uvs[sample], line)
+        if coarse_part > 0.0:
+            coarse = _filtered(texels, levels[texture, level + 1], uvs[sample], line)
+            color = (1.0 - coarse_part) * color + coarse_part * coarse
+    else:
+        face = face_ids[sample]
+        if face >= 0:
+            weights = barycentrics[sample]
+            color = (
+                weights[0] * vertex_albedo[faces[face][0]]
+                + weights[1] * vertex_albedo[faces[face][1]]
+                + weights[2] * vertex_albedo[faces[face][2]]
+            )
+    return color
+
+
+@wp.func
+def _color_adjoint(
+    sample: int,
+    face_ids: wp.array(dtype=wp.int32),
+    barycentrics: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array(dtype=wp.int32),
+    uvs: wp.array(dtype=wp.vec2),
+    probes: wp.array(dtype=wp.vec4),
+    instance: int,
+    adj_color: wp.vec3,
+    adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
+    adj_texels: wp.array2d(dtype=wp.vec3),
+):
+    """The adjoint of `_color` by what reflects."""
+    texture = texture_ids[sample]
+    if texture >= 0:
+        if adj_texels:
+            adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
+            line = probes[sample]
+            level, coarse_part = _level_of(line[2], level_counts[texture])
+            _scatter(adj_of_instance, levels[texture, level], uvs[sample], line, (1.0 - coarse_part) * adj_color)
+            if coarse_part > 0.0:
+                _scatter(adj_of_instance, levels[texture, level + 1], uvs[sample], line, coarse_part * adj_color)
+    elif adj_vertex_albedo:
+        face = face_ids[sample]
+        if face >= 0:
+            row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
+            weights = barycentrics[sample]
+            for corner in range(3):
+                wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
 
 
 @wp.kernel(enable_backward=False)
@@ -564,46 +683,69 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples."""
-    instance, thread = split_row(first_row + wp.tid(), albedo.shape[1] // run)
+    instance, thread = split_row(first_row + wp.tid(), texture_ids.shape[1] // run)
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    fragment = wp.min(instance, face_ids.shape[0] - 1)
+    of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
+    of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
     for sample in range(thread * run, (thread + 1) * run):
-        texture = texture_ids[footprint, sample]
-        color = wp.vec3()
-        if texture >= 0:
-            of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-            line = probes[footprint, sample]
-            level, coarse_part = _level_of(line[2], level_counts[texture])
-            reach = _reach(line[3])
-            for probe in range(-reach, reach + 1):
-                u = uvs[footprint, sample][0] + float(probe) * line[0]
-                v = uvs[footprint, sample][1] + float(probe) * line[1]
-                value = (1.0 - coarse_part) * _bilinear(of_instance, _cell(levels[texture, level], u, v))
-                if coarse_part > 0.0:
-                    value += coarse_part * _bilinear(of_instance, _cell(levels[texture, level + 1], u, v))
-                color += _weight(probe, line[3]) * value
-        else:
-            fragment = wp.min(instance, face_ids.shape[0] - 1)
-            face = face_ids[fragment, sample]
-            if face >= 0:
-                of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
-                weights = barycentrics[fragment, sample]
-                color = (
-                    weights[0] * of_vertices[faces[face][0]]
-                    + weights[1] * of_vertices[faces[face][1]]
-                    + weights[2] * of_vertices[faces[face][2]]
-                )
-        albedo[instance, sample] = color
+        albedo[instance, sample] = _color(
+            sample,
+            face_ids[fragment],
+            barycentrics[fragment],
+            faces,
+            of_vertices,
+            of_instance,
+            levels,
+            level_counts,
+            texture_ids[footprint],
+            uvs[footprint],
+            probes[footprint],
+        )
 
 
-@wp.func
-def _scatter(adj_texels: wp.array(dtype=wp.vec3), cell: _Cell, adj_color: wp.vec3):
-    """Add to the gradients of four texels: the adjoint of `_bilinear`, by what is interpolated."""
-    adj_above = (1.0 - cell.t) * adj_color
-    adj_below = cell.t * adj_color
-    wp.atomic_add(adj_texels, cell.above_left, (1.0 - cell.s) * adj_above)
-    wp.atomic_add(adj_texels, cell.above_right, cell.s * adj_above)
-    wp.atomic_add(adj_texels, cell.below_left, (1.0 - cell.s) * adj_below)
-    wp.atomic_add(adj_texels, cell.below_right, cell.s * adj_below)
+@wp.kernel(enable_backward=False)
+def _expose(
+    first_row: int,
+    worker: int,
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    vertex_albedo: wp.array2d(dtype=wp.vec3),
+    texels: wp.array2d(dtype=wp.vec3),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array2d(dtype=wp.int32),
+    uvs: wp.array2d(dtype=wp.vec2),
+    probes: wp.array2d(dtype=wp.vec4),
+    run: int,
+    white: wp.array2d(dtype=wp.vec4),
+    # out
+    samples: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a run of samples."""
+    instance, thread = split_row(first_row + wp.tid(), texture_ids.shape[1] // run)
+    footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    fragment = wp.min(instance, face_ids.shape[0] - 1)
+    of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
+    of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
+    lit = wp.min(instance, white.shape[0] - 1)
+    for sample in range(thread * run, (thread + 1) * run):
+        color = _color(
+            sample,
+            face_ids[fragment],
+            barycentrics[fragment],
+            faces,
+            of_vertices,
+            of_instance,
+            levels,
+            level_counts,
+            texture_ids[footprint],
+            uvs[footprint],
+            probes[footprint],
+        )
+        samples[instance, sample] = wp.cw_mul(white[lit, sample], wp.vec4(color[0], color[1], color[2], 1.0))
 
 
 @wp.kernel(enable_backward=False)
@@ -626,36 +768,72 @@ def _sample_adjoint_by_albedo(
     """A thread owns a run of samples: the adjoint of `_sample` by what reflects."""
     instance, thread = wp.tid()
     footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    fragment = wp.min(instance, face_ids.shape[0] - 1)
     for sample in range(thread * run, (thread + 1) * run):
-        texture = texture_ids[footprint, sample]
-        adj_color = adj_albedo[instance, sample]
-        if texture >= 0:
-            if adj_texels:
-                adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
-                line = probes[footprint, sample]
-                level, coarse_part = _level_of(line[2], level_counts[texture])
-                reach = _reach(line[3])
-                for probe in range(-reach, reach + 1):
-                    u = uvs[footprint, sample][0] + float(probe) * line[0]
-                    v = uvs[footprint, sample][1] + float(probe) * line[1]
-                    share = _weight(probe, line[3]) * adj_color
-                    _scatter(adj_of_instance, _cell(levels[texture, level], u, v), (1.0 - coarse_part) * share)
-                    if coarse_part > 0.0:
-                        _scatter(adj_of_instance, _cell(levels[texture, level + 1], u, v), coarse_part * share)
-        elif adj_vertex_albedo:
-            fragment = wp.min(instance, face_ids.shape[0] - 1)
-            face = face_ids[fragment, sample]
-            if face >= 0:
-                row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
-                weights = barycentrics[fragment, sample]
-                for corner in range(3):
-                    wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
+        _color_adjoint(
+            sample,
+            face_ids[fragment],
+            barycentrics[fragment],
+            faces,
+            levels,
+            level_counts,
+            texture_ids[footprint],
+            uvs[footprint],
+            probes[footprint],
+            instance,
+            adj_albedo[instance, sample],
+            adj_vertex_albedo,
+            adj_texels,
+        )
+
+
+@wp.kernel(enable_backward=False)
+def _expose_adjoint(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    levels: wp.array2d(dtype=wp.vec3i),
+    level_counts: wp.array(dtype=wp.int32),
+    texture_ids: wp.array2d(dtype=wp.int32),
+    uvs: wp.array2d(dtype=wp.vec2),
+    probes: wp.array2d(dtype=wp.vec4),
+    run: int,
+    white: wp.array2d(dtype=wp.vec4),
+    adj_samples: wp.array2d(dtype=wp.vec4),
+    # out
+    adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
+    adj_texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of samples: the adjoint of `_expose` by what reflects."""
+    instance, thread = wp.tid()
+    footprint = wp.min(instance, texture_ids.shape[0] - 1)
+    fragment = wp.min(instance, face_ids.shape[0] - 1)
+    lit = wp.min(instance, white.shape[0] - 1)
+    for sample in range(thread * run, (thread + 1) * run):
+        adj_color = wp.cw_mul(white[lit, sample], adj_samples[instance, sample])
+        _color_adjoint(
+            sample,
+            face_ids[fragment],
+            barycentrics[fragment],
+            faces,
+            levels,
+            level_counts,
+            texture_ids[footprint],
+            uvs[footprint],
+            probes[footprint],
+            instance,
+            wp.vec3(adj_color[0], adj_color[1], adj_color[2]),
+            adj_vertex_albedo,
+            adj_texels,
+        )
 
 
 @wp.func
-def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, u: float, v: float, adj_color: wp.vec3):
-    """Derivatives of a level's color by u and v, and the color itself, each times ``adj_color``."""
-    cell = _cell(level, u, v)
+def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, step: wp.vec2, adj_color: wp.vec3):
+    """Derivatives of a level's color by u and v, a step from a uv, and the color itself, each times ``adj_color``."""
+    place = _place(level, uv)
+    cell = _cell(level, place[0] + step[0] * float(level[1]), place[1] - step[1] * float(level[2]))
     above_left = wp.dot(texels[cell.above_left], adj_color)
     above_right = wp.dot(texels[cell.above_right], adj_color)
     below_left = wp.dot(texels[cell.below_left], adj_color)
@@ -701,13 +879,13 @@ def _sample_adjoint_by_place(
             adj_v = float(0.0)
             adj_line = wp.vec4()
             for probe in range(-reach, reach + 1):
-                u = uvs[footprint, sample][0] + float(probe) * line[0]
-                v = uvs[footprint, sample][1] + float(probe) * line[1]
-                weight = _weight(probe, count)
-                slopes = _slopes(of_instance, levels[texture, level], u, v, adj_color)
+                uv = uvs[footprint, sample]
+                step = float(probe) * wp.vec2(line[0], line[1])
+                weight = _share(probe, count) / count
+                slopes = _slopes(of_instance, levels[texture, level], uv, step, adj_color)
                 adj_width = float(0.0)
                 if coarse_part > 0.0:
-                    coarse = _slopes(of_instance, levels[texture, level + 1], u, v, adj_color)
+                    coarse = _slopes(of_instance, levels[texture, level + 1], uv, step, adj_color)
                     adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
                     slopes += coarse_part * (coarse - slopes)
                 # as the line grows, the outermost probes gain half a width each, and all share a longer line
@@ -758,34 +936,23 @@ def sample_albedo(
 
     Differentiable: textures, footprints, vertex_albedo, barycentrics of the fragments.
     """
-    check.shape("vertex_albedo", vertex_albedo.shape, ("batch", "vertex"))
-    check.shape("footprints", footprints.uvs.shape, ("batch", *fragments.face_ids.shape[1:]))
+    arrays = {"fragments": fragments.barycentrics, "vertex_albedo": vertex_albedo, "textures": textures.texels}
+    _check_samples(arrays, fragments, footprints)
     reflecting = [vertex_albedo, textures.texels]
     placed = [fragments.barycentrics, footprints.uvs, footprints.probes]
-    names = ["vertex_albedo", "textures", "fragments", "footprints"]
-    batch_count = common_batch(dict(zip(names, [*reflecting, *placed[:2]], strict=True)))
     albedo = wp.empty(
-        (batch_count, *fragments.face_ids.shape[1:]),
+        (common_batch(arrays | {"footprints": footprints.uvs}), *fragments.face_ids.shape[1:]),
         dtype=wp.vec3,
         device=vertex_albedo.device,
         requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
     )
+    seen = _seen(textures, footprints)
     face_ids, barycentrics = rows(fragments.face_ids), rows(fragments.barycentrics)
-    _, height, width = albedo.shape
-    run = run_length(albedo.device, width)
-    dim = batch_count, height * width // run
-    seen = [*_seen(textures, footprints), run]
-    launch_slices(
-        _sample,
-        dim=[dim[0] * dim[1]],
-        cost=_SAMPLE_COST * run,
-        inputs=[face_ids, barycentrics, faces, *reflecting, *seen],
-        outputs=[rows(albedo)],
-        device=albedo.device,
-    )
+    _launch_samples(_sample, [face_ids, barycentrics, faces, *reflecting, *seen], albedo)
 
     def adjoint() -> None:
         adj_albedo = rows(albedo.grad)
+        dim = _threads(albedo)
         if any(array.requires_grad for array in reflecting):
             inputs = [face_ids, barycentrics, faces, *seen, adj_albedo]
             _launch(_sample_adjoint_by_albedo, dim, inputs, [array.grad for array in reflecting])
@@ -797,10 +964,75 @@ def sample_albedo(
     return albedo
 
 
-def _seen(textures: Textures, footprints: Footprints) -> list[wp.array]:
-    """What kernels take of textures, but for the texels, and of footprints."""
+def expose_albedo(
+    fragments: Fragments,
+    faces: wp.array,
+    vertex_albedo: wp.array,
+    textures: Textures,
+    footprints: Footprints,
+    white: wp.array,
+) -> wp.array:
+    """Expose samples as it is found what they reflect, where all else stands still.
+
+    It is :func:`sample_albedo` and :func:`warpshadow.film.expose` in one: neither albedo nor its gradient is written.
+
+    Args:
+        fragments, faces, vertex_albedo, textures, footprints: As for :func:`sample_albedo`.
+        white: The samples if every surface were white, of :func:`warpshadow.film.expose`, vec4 of shape
+            [batch, height, width]; a batch of 1 serves every instance.
+
+    Returns:
+        Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: textures, vertex_albedo. Not: fragments, footprints, white.
+    """
+    arrays = {"fragments": fragments.face_ids, "vertex_albedo": vertex_albedo, "textures": textures.texels}
+    _check_samples(arrays, fragments, footprints)
+    check.shape("white", white.shape, ("batch", *fragments.face_ids.shape[1:]))
+    reflecting = [vertex_albedo, textures.texels]
+    samples = wp.empty(
+        (common_batch(arrays | {"footprints": footprints.uvs, "white": white}), *white.shape[1:]),
+        dtype=wp.vec4,
+        device=vertex_albedo.device,
+        requires_grad=any(array.requires_grad for array in reflecting),
+    )
+    seen = [*_seen(textures, footprints), rows(white)]
+    inputs = [rows(fragments.face_ids), rows(fragments.barycentrics), faces]
+    _launch_samples(_expose, [*inputs, *reflecting, *seen], samples)
+
+    def adjoint() -> None:
+        adjoints = [array.grad for array in reflecting]
+        _launch(_expose_adjoint, _threads(samples), [*inputs, *seen, rows(samples.grad)], adjoints)
+
+    record_adjoint(adjoint, [*reflecting, samples])
+    return samples
+
+
+def _check_samples(arrays: dict[str, wp.array], fragments: Fragments, footprints: Footprints) -> None:
+    check.shape("vertex_albedo", arrays["vertex_albedo"].shape, ("batch", "vertex"))
+    check.shape("footprints", footprints.uvs.shape, ("batch", *fragments.face_ids.shape[1:]))
+
+
+def _threads(samples: wp.array) -> tuple[int, int]:
+    """Instances and the runs of samples of each."""
+    batch_count, height, width = samples.shape
+    return batch_count, height * width // run_length(samples.device, width)
+
+
+def _launch_samples(kernel: wp.Kernel, inputs: list, samples: wp.array) -> None:
+    device, dim = samples.device, _threads(samples)
+    cost = _SAMPLE_COST * run_length(device, samples.shape[2])
+    launch_slices(kernel, dim=[dim[0] * dim[1]], cost=cost, inputs=inputs, outputs=[rows(samples)], device=device)
+
+
+def _seen(textures: Textures, footprints: Footprints) -> list:
+    """What kernels take of textures, but for the texels, and of footprints; and how many samples a thread owns."""
     images = footprints.texture_ids, footprints.uvs, footprints.probes
-    return [textures.levels, textures.level_counts, *map(rows, images)]
+    run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
+    return [textures.levels, textures.level_counts, *map(rows, images), run]
 
 
 # ---------------------------------------------------------------------------------------------------- export
@@ -824,11 +1056,9 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     layout = _layout(textures.sizes, str(device))
     batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
     weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
-    _, height, width = footprints.uvs.shape
-    run = run_length(footprints.uvs.device, width)
-    ones = wp.ones((batch_count, height * width), dtype=wp.vec3, device=device)
-    inputs = [None, None, None, *_seen(textures, footprints), run, ones]
-    _launch(_sample_adjoint_by_albedo, (batch_count, height * width // run), inputs, [None, weights])
+    ones = wp.ones((batch_count, *footprints.uvs.shape[1:]), dtype=wp.vec3, device=device)
+    inputs = [None, None, None, *_seen(textures, footprints), rows(ones)]
+    _launch(_sample_adjoint_by_albedo, _threads(ones), inputs, [None, weights])
     images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
     for number, image in enumerate(images):
         _add_to_image(image, weights, layout, number, footprints.coarsest_level())

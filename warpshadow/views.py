@@ -35,6 +35,7 @@ class Kept:
         transfer: Transfer vectors to the renderer's basis, one array for each group of receivers.
         reflectance: Of the samples in the scene.
         footprints: By the sizes of the textures, with the coarsest level that is taken, once it is known.
+        white: The samples if every surface were white, and the shading that they received.
     """
 
     shading: wp.array | None = None
@@ -42,6 +43,7 @@ class Kept:
     transfer: list[wp.array] | None = None
     reflectance: wp.array | None = None
     footprints: dict[tuple, tuple[Footprints, int | None]] = field(default_factory=dict)
+    white: tuple[wp.array, wp.array] | None = None
 
 
 class _ViewFields(NamedTuple):
