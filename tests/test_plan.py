@@ -426,7 +426,6 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         after = {
             "_find_contrasts": "contrasts",
             "blend": "smoothing",
-            "_add_kernel": "smoothing",
             "_measure_adjoint": "smoothing",
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")

@@ -83,6 +83,31 @@ def expand(array: wp.array, instances: int) -> wp.array:
     return concatenate([array], array.shape[1:], instances=instances)
 
 
-def rows(images: wp.array | None) -> wp.array | None:
+@functools.cache
+def _add_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # in
+        values: wp.array2d(dtype=dtype),
+        # out
+        totals: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns a total."""
+        batch, item = wp.tid()
+        totals[batch, item] = totals[batch, item] + values[batch, item]
+
+    return add
+
+
+def accumulate(values: wp.array, totals: wp.array) -> None:
+    """Add values [batch, item] to totals, off the tape; on a CPU NumPy does, twice as fast as a kernel."""
+    if totals.device.is_cpu:
+        totals.numpy()[...] += values.numpy()
+        return
+    kernel = _add_kernel(totals.dtype)
+    wp.launch(kernel, dim=totals.shape, inputs=[values], outputs=[totals], device=totals.device, record_tape=False)
+
+
+def rows(images: Any) -> Any:
     """View images [batch, height, width] as [batch, sample]; None stays None."""
     return None if images is None else images.reshape((images.shape[0], -1))

@@ -135,11 +135,10 @@ class Lighting:
         light = self._scene.light if light is None else light
         if isinstance(light, np.ndarray):
             check.finite("light", light)
+        kept = self._kept_shading(view, light)
+        if kept is not None:  # as the plan says, which takes longer to make than all else here
+            return kept
         plan = self._plan_of(view, light)
-        if not plan.shading:
-            shading = self._kept_shading(view, light)
-            assert shading is not None
-            return shading
         if isinstance(light, wp.array):
             return self._shade_free(plan, view, light)
         shading = self._trace(plan, view, light) if self.is_traced else self._shade_known(plan, view, light)

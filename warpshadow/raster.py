@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
-from warpshadow.batch import common_batch
+from warpshadow.batch import common_batch, rows
 from warpshadow.parallel import launch_differentiable
 
 MAX_SIZE = 1 << 15
@@ -55,6 +55,11 @@ class Fragments:
     face_ids: wp.array
     barycentrics: wp.array
     sides: wp.array | None = None
+
+    @functools.cached_property
+    def rows(self) -> list[wp.array]:
+        """The arrays as [batch, pixel]."""
+        return [rows(self.face_ids), rows(self.barycentrics)]
 
 
 def run_length(device: wp.Device, width: int) -> int:

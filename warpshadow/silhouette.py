@@ -34,6 +34,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
+from warpshadow.batch import accumulate
 from warpshadow.raster import Fragments, run_length
 from warpshadow.tape import record_adjoint
 
@@ -754,22 +755,6 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
     return blend_adjoint
 
 
-@functools.cache
-def _add_kernel(dtype: type) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def add(
-        # in
-        values: wp.array(dtype=dtype),
-        # out
-        totals: wp.array(dtype=dtype),
-    ):
-        """A thread owns a value."""
-        i = wp.tid()
-        totals[i] = totals[i] + values[i]
-
-    return add
-
-
 @wp.kernel(enable_backward=False)
 def _find_contrasts(
     # in
@@ -917,33 +902,27 @@ def smooth_silhouettes(
     smoothed = wp.clone(image, requires_grad=False)
     smoothed.requires_grad = image.requires_grad or clip_positions.requires_grad
     instances = (image.shape[0] // batch_count, batch_count * height * width)
+    flat, flat_smoothed = image.reshape(instances), smoothed.reshape(instances)
     wp.launch(
         _blend_kernel(image.dtype),
         dim=(instances[0], pixels.size),
-        inputs=[image.reshape(instances), pixels, shares, width],
-        outputs=[smoothed.reshape(instances)],
+        inputs=[flat, pixels, shares, width],
+        outputs=[flat_smoothed],
         device=device,
         record_tape=False,
     )
 
     def adjoint() -> None:
-        adj_image = adj_areas = None
+        adj_areas = None
         if image.requires_grad:
-            adj_image = image.grad.reshape(instances)
-            wp.launch(
-                _add_kernel(image.dtype),
-                dim=image.size,
-                inputs=[smoothed.grad.flatten()],
-                outputs=[image.grad.flatten()],
-                device=device,
-            )
+            accumulate(flat_smoothed.grad, flat.grad)
         if clip_positions.requires_grad:
             adj_areas = wp.zeros(shares.shape, dtype=wp.float32, device=device)
         wp.launch(
             _blend_adjoint_kernel(image.dtype),
             dim=(instances[0], pixels.size),
-            inputs=[image.reshape(instances), pixels, shares, width, contrasts, smoothed.grad.reshape(instances)],
-            outputs=[adj_image, adj_areas],
+            inputs=[flat, pixels, shares, width, contrasts, flat_smoothed.grad],
+            outputs=[flat.grad, adj_areas],
             device=device,
         )
         if clip_positions.requires_grad:

@@ -73,6 +73,11 @@ class Footprints:
     uvs: wp.array
     probes: wp.array
 
+    @functools.cached_property
+    def rows(self) -> list[wp.array]:
+        """The arrays as [batch, sample]."""
+        return [*map(rows, (self.texture_ids, self.uvs, self.probes))]
+
     def coarsest_level(self) -> int:
         """Coarsest level that a probe takes, if textures have that many; it waits for the device."""
         width = self.probes.numpy()[..., 2].max(initial=1.0)
@@ -558,20 +563,22 @@ def _filtered(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, lin
     """Mean of a level over the probes of a footprint, each bilinear between four texels."""
     place = _place(level, uv)
     reach = _reach(line[3])
+    scale = 1.0 / line[3]
     color = wp.vec3()
     for probe in range(-reach, reach + 1):
         x = place[0] + float(probe) * line[0] * float(level[1])
         y = place[1] - float(probe) * line[1] * float(level[2])
         cell = _cell(level, x, y)
-        below = _share(probe, line[3]) * cell.t
-        above = _share(probe, line[3]) - below
+        share = scale * _share(probe, line[3])
+        below = share * cell.t
+        above = share - below
         color += (
             (above * (1.0 - cell.s)) * texels[cell.above_left]
             + (above * cell.s) * texels[cell.above_right]
             + (below * (1.0 - cell.s)) * texels[cell.below_left]
             + (below * cell.s) * texels[cell.below_right]
         )
-    return color / line[3]
+    return color
 
 
 @wp.func
@@ -579,7 +586,7 @@ def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, 
     """Add to the gradients of a level's texels: the adjoint of `_filtered`, by what is filtered."""
     place = _place(level, uv)
     reach = _reach(line[3])
-    adj_sum = adj_color / line[3]
+    adj_sum = (1.0 / line[3]) * adj_color
     for probe in range(-reach, reach + 1):
         x = place[0] + float(probe) * line[0] * float(level[1])
         y = place[1] - float(probe) * line[1] * float(level[2])
@@ -946,18 +953,15 @@ def sample_albedo(
         device=vertex_albedo.device,
         requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
     )
-    seen = _seen(textures, footprints)
-    face_ids, barycentrics = rows(fragments.face_ids), rows(fragments.barycentrics)
-    _launch_samples(_sample, [face_ids, barycentrics, faces, *reflecting, *seen], albedo)
+    seen, dim, flat = _seen(textures, footprints), _threads(albedo), rows(albedo)
+    _launch_samples(_sample, dim, [*fragments.rows, faces, *reflecting, *seen], flat)
 
     def adjoint() -> None:
-        adj_albedo = rows(albedo.grad)
-        dim = _threads(albedo)
         if any(array.requires_grad for array in reflecting):
-            inputs = [face_ids, barycentrics, faces, *seen, adj_albedo]
+            inputs = [*fragments.rows, faces, *seen, flat.grad]
             _launch(_sample_adjoint_by_albedo, dim, inputs, [array.grad for array in reflecting])
         if any(array.requires_grad for array in placed):
-            inputs = [face_ids, faces, *reflecting, *seen, adj_albedo]
+            inputs = [fragments.rows[0], faces, *reflecting, *seen, flat.grad]
             _launch(_sample_adjoint_by_place, dim, inputs, [rows(array.grad) for array in placed])
 
     record_adjoint(adjoint, [*reflecting, *placed, albedo])
@@ -999,13 +1003,12 @@ def expose_albedo(
         device=vertex_albedo.device,
         requires_grad=any(array.requires_grad for array in reflecting),
     )
-    seen = [*_seen(textures, footprints), rows(white)]
-    inputs = [rows(fragments.face_ids), rows(fragments.barycentrics), faces]
-    _launch_samples(_expose, [*inputs, *reflecting, *seen], samples)
+    seen, dim, flat = [*_seen(textures, footprints), rows(white)], _threads(samples), rows(samples)
+    _launch_samples(_expose, dim, [*fragments.rows, faces, *reflecting, *seen], flat)
 
     def adjoint() -> None:
-        adjoints = [array.grad for array in reflecting]
-        _launch(_expose_adjoint, _threads(samples), [*inputs, *seen, rows(samples.grad)], adjoints)
+        inputs = [*fragments.rows, faces, *seen, flat.grad]
+        _launch(_expose_adjoint, dim, inputs, [array.grad for array in reflecting])
 
     record_adjoint(adjoint, [*reflecting, samples])
     return samples
@@ -1022,17 +1025,16 @@ def _threads(samples: wp.array) -> tuple[int, int]:
     return batch_count, height * width // run_length(samples.device, width)
 
 
-def _launch_samples(kernel: wp.Kernel, inputs: list, samples: wp.array) -> None:
-    device, dim = samples.device, _threads(samples)
-    cost = _SAMPLE_COST * run_length(device, samples.shape[2])
-    launch_slices(kernel, dim=[dim[0] * dim[1]], cost=cost, inputs=inputs, outputs=[rows(samples)], device=device)
+def _launch_samples(kernel: wp.Kernel, dim: tuple[int, int], inputs: list, samples: wp.array) -> None:
+    """Launch for all samples [batch, sample]."""
+    cost = _SAMPLE_COST * samples.shape[1] / dim[1]
+    launch_slices(kernel, [dim[0] * dim[1]], cost=cost, inputs=inputs, outputs=[samples], device=samples.device)
 
 
 def _seen(textures: Textures, footprints: Footprints) -> list:
     """What kernels take of textures, but for the texels, and of footprints; and how many samples a thread owns."""
-    images = footprints.texture_ids, footprints.uvs, footprints.probes
     run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
-    return [textures.levels, textures.level_counts, *map(rows, images), run]
+    return [textures.levels, textures.level_counts, *footprints.rows, run]
 
 
 # ---------------------------------------------------------------------------------------------------- export

@@ -396,17 +396,19 @@ class _WarpFunction(torch.autograd.Function):
         *tensors: torch.Tensor,
     ):
         arguments = [
-            wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=is_wanted)
-            for tensor, dtype, is_wanted in zip(tensors, dtypes, wants, strict=True)
+            wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+            for tensor, dtype in zip(tensors, dtypes, strict=True)
         ]
         # streams are the device's, as Warp has it, not a thread's
         with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
+            for argument, is_wanted in zip(arguments, wants, strict=True):
+                argument.requires_grad = is_wanted  # here, so that a graph that is captured zeroes the gradient
             results = function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
         outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
         if any(wants):
             ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
-            ctx.tape, ctx.arguments, ctx.results = tape, arguments, results
+            ctx.tape, ctx.arguments, ctx.results, ctx.is_played = tape, arguments, results, False
             pairs = zip(outputs, results, strict=True)
             ctx.mark_non_differentiable(*(output for output, result in pairs if not result.requires_grad))
         return outputs
@@ -416,6 +418,9 @@ class _WarpFunction(torch.autograd.Function):
     def backward(ctx, *gradients: torch.Tensor):
         ctx.saved_tensors  # noqa: B018
         with one_call, _current_stream(gradients[0].device), unrecorded():
+            if ctx.is_played:  # before, gradients are zero
+                ctx.tape.zero()
+            ctx.is_played = True
             # copies, since memory shared with torch is reused behind the tape's back
             for result, gradient in zip(ctx.results, gradients, strict=True):
                 if result.requires_grad:
@@ -425,7 +430,6 @@ class _WarpFunction(torch.autograd.Function):
                 wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
                 for argument in ctx.arguments
             ]
-            ctx.tape.zero()
         return None, None, None, None, *found
 
 
