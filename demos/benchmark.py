@@ -109,12 +109,15 @@ def main(device: str, runs: int) -> None:
 
     free_matrices = wp.clone(clip_matrices, requires_grad=True)
 
+    def draw_smoothly(matrices: wp.array = clip_matrices) -> wp.array:
+        clip = to_clip(renderer.geometry.positions, matrices)
+        fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
+        found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.surfaces)
+        return smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)
+
     def draw_and_back() -> None:
         with wp.Tape() as tape:
-            clip = to_clip(renderer.geometry.positions, free_matrices)
-            fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
-            found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.surfaces)
-            image = smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)
+            image = draw_smoothly(free_matrices)
         image.grad.fill_(1.0)
         tape.backward()
         tape.zero()
@@ -125,7 +128,8 @@ def main(device: str, runs: int) -> None:
         "directional, forward and backward": shade_directional_and_back,
         "log-SH, forward and backward": shade_log_sh_and_back,
         "project, rasterize and interpolate": draw,
-        "rasterize, interpolate, smooth, forward and backward": draw_and_back,
+        "project, rasterize, interpolate and smooth": draw_smoothly,
+        "the same, forward and backward": draw_and_back,
         "image of bodies that have moved, directional": whole_image(renderer),
         "image from the scene, set-up included": from_scratch,
         "iteration of a light fit in torch": fit_light,
@@ -137,11 +141,16 @@ def main(device: str, runs: int) -> None:
     print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs} [ms]")
     counts = sorted({1, ws.thread_count()}) if renderer.device.is_cpu else [1]
     functions = [on_threads(count, function) for function in rows.values() for count in counts]
-    times = iter(median_times(functions, runs))
+    flat = median_times(functions, runs)
     ws.set_thread_count(None)
+    times = {label: flat[k * len(counts) : (k + 1) * len(counts)] for k, label in enumerate(rows)}
     print(f"  {'threads':54}" + "".join(f"{count:8}" for count in counts))
-    for label in rows:
-        print(f"  {label:54}" + "".join(f"{next(times):8.1f}" for _ in counts))
+    for label, row in times.items():
+        print(f"  {label:54}" + "".join(f"{milliseconds:8.1f}" for milliseconds in row))
+    without, forward, both = (times[label] for label in rows if label.startswith(("project", "the same")))
+    for label, base in (("forward and backward / forward", forward), ("the same / forward, not smoothed", without)):
+        ratios = [longer / shorter for longer, shorter in zip(both, base, strict=True)]
+        print(f"  {label:54}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
 
 
 def time_fits(device: str) -> None:

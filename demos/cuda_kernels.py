@@ -51,7 +51,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (
             raster._interpolation,
-            silhouette._add_kernel,
+            raster._interpolation_adjoint,
+            batch._add_kernel,
             silhouette._blend_kernel,
             silhouette._blend_adjoint_kernel,
         )

@@ -17,13 +17,11 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import warp as wp
-
-from warpshadow.tape import record_adjoint
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
@@ -132,34 +130,6 @@ def launch_slices(
     _launch(kernel, dim, cost, arguments, sums_at, device, workers)
 
 
-def launch_differentiable(
-    kernel: wp.Kernel,
-    dim: Sequence[int],
-    *,
-    cost: float,
-    inputs: Sequence[Any],
-    outputs: Sequence[wp.array],
-    gathered: Collection[int] = (),
-    device: wp.Device,
-) -> None:
-    """Launch a kernel that Warp differentiates, on the tape if an input requires a gradient, both ways in slices.
-
-    Args:
-        kernel, dim, cost, device: As for :func:`launch_slices`.
-        inputs, outputs: Arguments after ``first_row`` and ``worker``.
-        gathered: Which of the inputs are read anywhere, so that all rows add to their gradients; counted from 0.
-    """
-    arguments = {"inputs": [0, _worker(device), *inputs], "outputs": [*outputs]}
-    _launch(kernel, dim, cost, arguments, {}, device, thread_count())
-
-    def adjoint() -> None:
-        adjoints = [value.grad if isinstance(value, wp.array) else value for value in arguments["inputs"]]
-        both = {**arguments, "adj_inputs": adjoints, "adj_outputs": [output.grad for output in outputs]}
-        _launch(kernel, dim, 2 * cost, both, {2 + k: inputs[k].grad for k in gathered}, device, thread_count())
-
-    record_adjoint(adjoint, [*(value for value in inputs if isinstance(value, wp.array)), *outputs])
-
-
 def _worker(device: wp.Device) -> int:
     return 0 if device.is_cpu else -1
 
@@ -173,8 +143,8 @@ def _launch(
     device: wp.Device,
     workers: int,
 ) -> None:
-    """Launch a kernel, or its adjoint if there are adjoint arguments; sums by their places among the arguments."""
-    options = {"device": device, "record_tape": False, "adjoint": "adj_inputs" in arguments}
+    """Launch a kernel; sums by their places among the arguments."""
+    options = {"device": device, "record_tape": False}
     total = math.prod(dim)
     summed = {place: array for place, array in sums.items() if array is not None}
     most = _SLICES_PER_THREAD * workers
@@ -191,12 +161,11 @@ def _launch(
     slices: list[wp.Launch] = []
     for number, (first, end) in enumerate(itertools.pairwise(starts)):
         piece = copy.copy(command)
-        for name in ("params", "fwd_args", "adj_args"):
-            setattr(piece, name, list(getattr(command, name)))
+        piece.params, piece.fwd_args = list(command.params), list(command.fwd_args)
         piece.set_dim([end - first, *dim[1:]])
         piece.set_param_at_index(0, first)
         for place, parts in own.items():
-            piece.set_param_at_index(place, parts[number], adjoint=options["adjoint"])
+            piece.set_param_at_index(place, parts[number])
         slices.append(piece)
     _share(slices, workers)
     for place, parts in own.items():

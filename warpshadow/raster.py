@@ -15,7 +15,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.batch import common_batch, rows
-from warpshadow.parallel import launch_differentiable
+from warpshadow.parallel import launch_slices, split_row
+from warpshadow.tape import record_adjoint
 
 MAX_SIZE = 1 << 15
 """Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
@@ -392,9 +393,18 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
     return wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)  # edge-on, drawn only because its vertices snapped
 
 
-@wp.func_grad(_weights)
-def _adj_weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_ret: wp.vec3):
-    """Derivative by hand: the kernel's backward pass takes 1.2 ms instead of 1.7 ms (40 000 pixels on a CPU).
+@wp.struct
+class _Pulls:
+    """Gradients to the x, y and w of the corners of a face."""
+
+    a: wp.vec3
+    b: wp.vec3
+    c: wp.vec3
+
+
+@wp.func
+def _weights_adjoint(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_weights: wp.vec3):
+    """The adjoint of `_weights`.
 
     With volumes v, their sum t and weights w = v/t: dL/dv_i = (dL/dw_i - Σ_j w_j dL/dw_j) / t, but 0 where
     v_i is clamped. A volume of exactly 0, on an edge, is not clamped: meshes aligned with the pixels would
@@ -407,85 +417,166 @@ def _adj_weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2, adj_ret: wp.v
     side = wp.sign(volumes[0] + volumes[1] + volumes[2])
     inside = wp.max(side * volumes, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
+    pulls = _Pulls()
     if total > TINY_VOLUME:
         scale = side / total
-        mean = wp.dot(inside, adj_ret) / total
-        adj_a = wp.where(side * volumes[0] < 0.0, 0.0, scale * (adj_ret[0] - mean))
-        adj_b = wp.where(side * volumes[1] < 0.0, 0.0, scale * (adj_ret[1] - mean))
-        adj_c = wp.where(side * volumes[2] < 0.0, 0.0, scale * (adj_ret[2] - mean))
+        mean = wp.dot(inside, adj_weights) / total
+        adj_a = wp.where(side * volumes[0] < 0.0, 0.0, scale * (adj_weights[0] - mean))
+        adj_b = wp.where(side * volumes[1] < 0.0, 0.0, scale * (adj_weights[1] - mean))
+        adj_c = wp.where(side * volumes[2] < 0.0, 0.0, scale * (adj_weights[2] - mean))
         ax = adj_c * at_b[1] - adj_b * at_c[1]
         ay = adj_b * at_c[0] - adj_c * at_b[0]
         bx = adj_a * at_c[1] - adj_c * at_a[1]
         by = adj_c * at_a[0] - adj_a * at_c[0]
         cx = adj_b * at_a[1] - adj_a * at_b[1]
         cy = adj_a * at_b[0] - adj_b * at_a[0]
-        wp.adjoint[a] += wp.vec4(ax, ay, 0.0, -(ray[0] * ax + ray[1] * ay))
-        wp.adjoint[b] += wp.vec4(bx, by, 0.0, -(ray[0] * bx + ray[1] * by))
-        wp.adjoint[c] += wp.vec4(cx, cy, 0.0, -(ray[0] * cx + ray[1] * cy))
+        pulls.a = wp.vec3(ax, ay, -(ray[0] * ax + ray[1] * ay))
+        pulls.b = wp.vec3(bx, by, -(ray[0] * bx + ray[1] * by))
+        pulls.c = wp.vec3(cx, cy, -(ray[0] * cx + ray[1] * cy))
+    return pulls
 
 
-@wp.kernel
+@wp.func
+def _ray(column: int, row: int, width: int, height: int):
+    """Center of a pixel, in normalized device coordinates."""
+    x = float(2 * column + 1 - width) / float(width)
+    y = float(2 * row + 1 - height) / float(height)
+    return wp.vec2(x, y)
+
+
+@wp.kernel(enable_backward=False)
 def _barycentrics(
     first_row: int,
     worker: int,
     # in
-    face_ids: wp.array(dtype=wp.int32),
+    face_ids: wp.array2d(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array2d(dtype=wp.vec4),
     width: int,
-    height: int,
+    run: int,
     # out
-    barycentrics: wp.array(dtype=wp.vec3),
+    barycentrics: wp.array2d(dtype=wp.vec3),
 ):
-    """One thread owns one pixel; barycentrics are zero before."""
-    pixel = first_row + wp.tid()
-    face = face_ids[pixel]
-    if face >= 0:
-        instance = _instance(pixel, width * height, clip_positions.shape[0])
-        corners = faces[face]
-        a = clip_positions[instance, corners[0]]
-        b = clip_positions[instance, corners[1]]
-        c = clip_positions[instance, corners[2]]
-        row = pixel / width
-        x = float(2 * (pixel - row * width) + 1 - width) / float(width)
-        y = float(2 * (row - instance * height) + 1 - height) / float(height)
-        barycentrics[pixel] = _weights(a, b, c, wp.vec2(x, y))
+    """A thread owns a run of pixels; barycentrics are zero before."""
+    instance, thread = split_row(first_row + wp.tid(), face_ids.shape[1] // run)
+    clip = clip_positions[instance]
+    height = face_ids.shape[1] // width
+    row = thread * run / width
+    for pixel in range(thread * run, (thread + 1) * run):
+        face = face_ids[instance, pixel]
+        if face >= 0:
+            corners = faces[face]
+            ray = _ray(pixel - row * width, row, width, height)
+            barycentrics[instance, pixel] = _weights(clip[corners[0]], clip[corners[1]], clip[corners[2]], ray)
+
+
+@wp.kernel(enable_backward=False)
+def _barycentrics_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    width: int,
+    run: int,
+    adj_barycentrics: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_clip_positions: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a run of pixels."""
+    instance, thread = split_row(first_row + wp.tid(), face_ids.shape[1] // run)
+    clip = clip_positions[instance]
+    adj_clip = adj_clip_positions[instance]
+    height = face_ids.shape[1] // width
+    row = thread * run / width
+    for pixel in range(thread * run, (thread + 1) * run):
+        face = face_ids[instance, pixel]
+        if face >= 0:
+            i = faces[face]
+            ray = _ray(pixel - row * width, row, width, height)
+            pulls = _weights_adjoint(clip[i[0]], clip[i[1]], clip[i[2]], ray, adj_barycentrics[instance, pixel])
+            wp.atomic_add(adj_clip, i[0], wp.vec4(pulls.a[0], pulls.a[1], 0.0, pulls.a[2]))
+            wp.atomic_add(adj_clip, i[1], wp.vec4(pulls.b[0], pulls.b[1], 0.0, pulls.b[2]))
+            wp.atomic_add(adj_clip, i[2], wp.vec4(pulls.c[0], pulls.c[1], 0.0, pulls.c[2]))
 
 
 @functools.cache
-def _interpolation(dtype: type):
+def _interpolation(dtype: type) -> wp.Kernel:
     """Kernel of `interpolate` for attributes of one dtype."""
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", enable_backward=False)
     def interpolate(
         first_row: int,
         worker: int,
         # in
-        face_ids: wp.array(dtype=wp.int32),
-        barycentrics: wp.array(dtype=wp.vec3),
+        face_ids: wp.array2d(dtype=wp.int32),
+        barycentrics: wp.array2d(dtype=wp.vec3),
         faces: wp.array(dtype=wp.vec3i),
         attributes: wp.array2d(dtype=dtype),
-        pixels_per_instance: int,
+        run: int,
         # out
-        image: wp.array(dtype=dtype),
+        image: wp.array2d(dtype=dtype),
     ):
-        """One thread owns one pixel; the image is zero before."""
-        pixel = first_row + wp.tid()
-        instance = _instance(pixel, pixels_per_instance, attributes.shape[0])
-        seen = pixel
-        if face_ids.shape[0] == pixels_per_instance:
-            seen = pixel - instance * pixels_per_instance
-        face = face_ids[seen]
-        if face >= 0:
-            corners = faces[face]
-            weights = barycentrics[seen]
-            image[pixel] = (
-                weights[0] * attributes[instance, corners[0]]
-                + weights[1] * attributes[instance, corners[1]]
-                + weights[2] * attributes[instance, corners[2]]
-            )
+        """A thread owns a run of pixels; the image is zero before."""
+        instance, thread = split_row(first_row + wp.tid(), image.shape[1] // run)
+        view = wp.min(instance, face_ids.shape[0] - 1)
+        own = attributes[wp.min(instance, attributes.shape[0] - 1)]
+        for pixel in range(thread * run, (thread + 1) * run):
+            face = face_ids[view, pixel]
+            if face >= 0:
+                corners = faces[face]
+                weights = barycentrics[view, pixel]
+                image[instance, pixel] = (
+                    weights[0] * own[corners[0]] + weights[1] * own[corners[1]] + weights[2] * own[corners[2]]
+                )
 
     return interpolate
+
+
+@functools.cache
+def _interpolation_adjoint(dtype: type) -> wp.Kernel:
+    """Its adjoint."""
+    inner = wp.mul if dtype is wp.float32 else wp.dot
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def interpolate_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        face_ids: wp.array2d(dtype=wp.int32),
+        barycentrics: wp.array2d(dtype=wp.vec3),
+        faces: wp.array(dtype=wp.vec3i),
+        attributes: wp.array2d(dtype=dtype),
+        run: int,
+        adj_image: wp.array2d(dtype=dtype),
+        # out
+        adj_barycentrics: wp.array2d(dtype=wp.vec3),
+        adj_attributes: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns a run of pixels of all instances."""
+        thread = first_row + wp.tid()
+        for instance in range(adj_image.shape[0]):
+            view = wp.min(instance, face_ids.shape[0] - 1)
+            row = wp.min(instance, attributes.shape[0] - 1)
+            for pixel in range(thread * run, (thread + 1) * run):
+                face = face_ids[view, pixel]
+                if face >= 0:
+                    corners = faces[face]
+                    seed = adj_image[instance, pixel]
+                    if adj_barycentrics:
+                        adj_barycentrics[view, pixel] = adj_barycentrics[view, pixel] + wp.vec3(
+                            inner(seed, attributes[row, corners[0]]),
+                            inner(seed, attributes[row, corners[1]]),
+                            inner(seed, attributes[row, corners[2]]),
+                        )
+                    if adj_attributes:
+                        weights = barycentrics[view, pixel]
+                        wp.atomic_add(adj_attributes, row, corners[0], weights[0] * seed)
+                        wp.atomic_add(adj_attributes, row, corners[1], weights[1] * seed)
+                        wp.atomic_add(adj_attributes, row, corners[2], weights[2] * seed)
+
+    return interpolate_adjoint
 
 
 def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:
@@ -533,16 +624,24 @@ def barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) 
     check.shape("clip_positions", clip_positions.shape, (face_ids.shape[0], "vertex"))
     device = clip_positions.device
     weights = wp.zeros(face_ids.shape, dtype=wp.vec3, device=device, requires_grad=clip_positions.requires_grad)
-    _, height, width = face_ids.shape
-    launch_differentiable(
-        _barycentrics,
-        dim=[face_ids.size],
-        cost=_PIXEL_COST,
-        inputs=[face_ids.flatten(), faces, clip_positions, width, height],
-        gathered=[2],
-        outputs=[weights.flatten()],
-        device=device,
-    )
+    width, flat = face_ids.shape[2], rows(weights)
+    run = run_length(device, width)
+    dim, cost = [face_ids.size // run], _PIXEL_COST * run
+    inputs = [rows(face_ids), faces, clip_positions, width, run]
+    launch_slices(_barycentrics, dim, cost=cost, inputs=inputs, outputs=[flat], device=device)
+
+    def adjoint() -> None:
+        launch_slices(
+            _barycentrics_adjoint,
+            dim,
+            cost=3 * cost,
+            inputs=[*inputs, flat.grad],
+            outputs=[],
+            sums=[clip_positions.grad],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [clip_positions, weights])
     return weights
 
 
@@ -572,21 +671,31 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         device=face_ids.device,
         requires_grad=attributes.requires_grad or fragments.barycentrics.requires_grad,
     )
-    launch_differentiable(
+    device, flat = face_ids.device, rows(image)
+    run = run_length(device, image.shape[2])
+    run_count, cost = flat.shape[1] // run, _PIXEL_COST * run
+    inputs = [*fragments.rows, faces, attributes, run]
+    launch_slices(
         _interpolation(attributes.dtype),
-        dim=[image.size],
-        cost=_PIXEL_COST,
-        inputs=[
-            face_ids.flatten(),
-            fragments.barycentrics.flatten(),
-            faces,
-            attributes,
-            face_ids.shape[1] * face_ids.shape[2],
-        ],
-        gathered=[1, 3] if instances > face_ids.shape[0] else [3],
-        outputs=[image.flatten()],
-        device=face_ids.device,
+        [instances * run_count],
+        cost=cost,
+        inputs=inputs,
+        outputs=[flat],
+        device=device,
     )
+
+    def adjoint() -> None:
+        launch_slices(
+            _interpolation_adjoint(attributes.dtype),
+            [run_count],
+            cost=cost * instances,
+            inputs=[*inputs, flat.grad],
+            outputs=[rows(fragments.barycentrics.grad)],
+            sums=[attributes.grad],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [fragments.barycentrics, attributes, image])
     return image
 
 

@@ -49,6 +49,9 @@ LEAST_OPENING = 1e-4
 # Rasterization moves vertices by up to 1/8192 pixel, so an edge may be this far on the wrong side of a center [pixels].
 _SNAP = 1.0 / 2048.0
 
+# In place of the silhouette between two pixels, which may be none (−1).
+_UNKNOWN = -2
+
 # In place of an edge's vertices.
 _NOTHING = -1
 _INTERSECTION = -2
@@ -295,15 +298,22 @@ def _add_edge_if_seen(
     faces: wp.array(dtype=wp.vec3i),
     neighbors: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array(dtype=wp.vec4),
+    between: wp.array2d(dtype=wp.int32),
     crossing_count: wp.array(dtype=wp.int32),
     crossings: wp.array(dtype=wp.vec4i),
     claims: wp.array(dtype=wp.int32),
 ):
-    """Add an edge that passes between a pixel and its neighbor if it is what they see."""
+    """Add an edge that passes between a pixel and its neighbor if it is what they see.
+
+    Several edges do, from both of their faces, so what is between them is kept.
+    """
     if face_ids[pixel] != face_ids[_neighbor(pixel, side, width)]:
-        found = _silhouette_between(
-            pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip_positions
-        )
+        found = between[side / 2, pixel]
+        if found == _UNKNOWN:
+            found = _silhouette_between(
+                pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip_positions
+            )
+            between[side / 2, pixel] = found
         if found == half_edge:
             _add_crossing(pixel, side, edge, width, crossing_count, crossings, claims)
 
@@ -336,6 +346,7 @@ def _find_edges(
     height: int,
     strip_count: int,
     # out
+    between: wp.array2d(dtype=wp.int32),
     crossing_count: wp.array(dtype=wp.int32),
     crossings: wp.array(dtype=wp.vec4i),
     claims: wp.array(dtype=wp.int32),
@@ -385,6 +396,7 @@ def _find_edges(
                             faces,
                             neighbors,
                             clip,
+                            between,
                             crossing_count,
                             crossings,
                             claims,
@@ -559,11 +571,12 @@ def find_silhouettes(
     crossings = wp.empty(2 * face_ids.size, dtype=wp.vec4i, device=device)
     claims = wp.empty(face_ids.size, dtype=wp.int32, device=device)
     strip_count = _strip_count(device)
+    between = wp.full((2, face_ids.size), _UNKNOWN, dtype=wp.int32, device=device)
     wp.launch(
         _find_edges,
         dim=(batch_count, faces.shape[0], strip_count),
         inputs=[face_ids, barycentrics, faces, neighbors, clip_positions, width, height, strip_count],
-        outputs=[crossing_count, crossings, claims],
+        outputs=[between, crossing_count, crossings, claims],
         device=device,
         record_tape=False,
     )
