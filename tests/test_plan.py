@@ -170,6 +170,27 @@ def test_free_light_over_a_given_geometry_has_the_gradient_that_it_has_over_the_
     assert torch.equal(gradients[0], gradients[1]) and torch.equal(gradients[1], gradients[2])
 
 
+def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_beside_cameras():
+    """Alone, samples are exposed as it is found what they reflect, in light that is kept; lights take turns."""
+    renderer, random = TorchRenderer(scene_of()), np.random.default_rng(7)
+    texture, colors, weights = (
+        torch.tensor(random.uniform(size=shape), dtype=torch.float32) for shape in ((8, 8, 3), (162, 3), (24, 24, 4))
+    )
+    texture.requires_grad_(), colors.requires_grad_()
+    cameras = torch.tensor(renderer.renderer.clip_matrices.numpy()[0], requires_grad=True)
+    coefficients = torch.tensor(free_light(renderer.renderer).numpy()[0])
+    other = ws.synthetic_sky((0.4, 0.8, 0.1), height=32, sun_radius=8)
+    for light in (None, other, None, coefficients, 2 * coefficients, other):
+        results = []
+        for clip_matrices in (None, cameras):
+            given = {"albedo": [None, colors, None], "textures": [None, None, texture], "clip_matrices": clip_matrices}
+            image = renderer(light, **given)
+            gradients = torch.autograd.grad((image * weights).sum(), [texture, colors])
+            results.append([value.detach().numpy() for value in (image, *gradients)])
+        for alone, beside in zip(*results, strict=True):
+            assert_near(alone, beside, 10 * FLOAT32)
+
+
 # ---------------------------------------------------------------------------------------------- moving bodies
 
 

@@ -11,6 +11,7 @@ from warpshadow.mesh import plane
 from warpshadow.raster import Fragments
 from warpshadow.texture import (
     Footprints,
+    expose_albedo,
     fill_unseen,
     find_footprints,
     mip_pyramids,
@@ -570,6 +571,51 @@ def test_gradients_of_reflectance_are_central_differences_of_the_twin(device, ve
                 sums.append(np.sum(weights * bodies.albedo_twin(*moved)))
             expected.append((sums[0] - sums[1]) / 2e-6)
         assert relative(np.array(got), np.array(expected)) < GRADIENT, number
+
+
+@pytest.mark.parametrize("lights", [1, 2])
+def test_samples_exposed_at_once_are_albedo_times_what_they_receive_both_ways(device, poisoned_outputs, lights):
+    """Against the twin in float64, in which they are linear in what reflects, and so exact differences."""
+    bodies, random = Bodies(device), np.random.default_rng(5)
+    width, height = bodies.size
+    clip, uvs, *reflecting = bodies.variables(requires_grad=True)
+    clip.requires_grad = uvs.requires_grad = False
+    faces = bodies.topology(bodies.faces)
+    fragments = Fragments(bodies.face_ids, raster.barycentrics(bodies.face_ids, faces, clip))
+    texture_of_face = bodies.put(bodies.texture_of_face, wp.int32)
+    uv_faces = bodies.topology(bodies.uv_faces)
+    white = random.uniform(size=(lights, height, width, 4)).astype(np.float32)
+    white[..., 3] = 1.0
+
+    def exposed(vertex_albedo, *images):
+        pyramids = mip_pyramids(images)
+        footprints = find_footprints(fragments, faces, clip, uvs, uv_faces, texture_of_face, pyramids)
+        return expose_albedo(fragments, faces, vertex_albedo, pyramids, footprints, bodies.put(white, wp.vec4))
+
+    def twin(*values):
+        albedo = bodies.albedo_twin(bodies.clip_positions, bodies.uvs[None], *values)
+        return white * np.concatenate([albedo, np.ones_like(albedo[..., :1])], axis=-1)
+
+    values = [array.numpy().astype(np.float64) for array in reflecting]
+    assert np.abs(exposed(*reflecting).numpy() - twin(*values)).max() < SAMPLE
+    weights = random.normal(size=(2, height, width, 4)).astype(np.float32)
+    for number, gradient in enumerate(tape_gradients(exposed, reflecting, weights)):
+        directions = random.normal(size=(8, *values[number].shape))
+        sums = [
+            [
+                np.sum(weights * twin(*values[:number], values[number] + step * d, *values[number + 1 :]))
+                for d in directions
+            ]
+            for step in (0.5, -0.5)
+        ]
+        assert relative([np.sum(gradient * d) for d in directions], np.subtract(*sums)) < GRADIENT, number
+
+
+def test_one_image_without_coarser_levels_is_not_copied(device):
+    image = wp.array(np.random.default_rng(0).uniform(size=(1, 8, 8, 3)), dtype=wp.vec3, device=device)
+    assert mip_pyramids([image], coarsest=0).texels.ptr == image.ptr
+    assert mip_pyramids([image], coarsest=1).texels.ptr != image.ptr
+    assert mip_pyramids([image, image], coarsest=0).texels.shape == (1, 2 * (64 + 16 + 4 + 1))
 
 
 def test_a_round_footprint_has_a_gradient(device):
