@@ -7,7 +7,7 @@ import pytest
 import twins
 import warp as wp
 
-from warpshadow.lanes import MODULE_OPTIONS, lane_functions, lane_type
+from warpshadow.lanes import lane_functions, lane_type, module_options
 from warpshadow.visibility.cones import BLEND, FADE, TINY_RADIUS, cone_function
 
 # cos θ and sin²θ where they are exact: a few float32 roundings.
@@ -25,7 +25,9 @@ def cone_kernel(lanes, is_fused):
     Lane = lane_type(lanes)
     load, cone = lane_functions(lanes).load, cone_function(lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS | (FUSED if is_fused else {}), enable_backward=False)
+    options = module_options(lanes) | (FUSED if is_fused else {})
+
+    @wp.kernel(module="unique", module_options=options, enable_backward=False)
     def write_cones(
         # in
         offsets: wp.array(dtype=wp.vec3),

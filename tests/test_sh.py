@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.special import roots_legendre
 
 from warpshadow import sh, sh_kernels
-from warpshadow.lanes import MODULE_OPTIONS, lane_functions, lane_type
+from warpshadow.lanes import lane_functions, lane_type, module_options
 
 # Float64 recurrences and quadratures of low degree: a few hundred roundings.
 EXACT = 1e-12
@@ -272,7 +272,7 @@ def turn_and_multiply_kernel(order, lanes):
     load, load_rows, store_rows = fn.load, fn.load_rows, fn.store_rows
     add_rotated_zonal, multiply = sh_kernels.add_rotated_zonal(order, lanes), sh_kernels.multiply(order, lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def turn_and_multiply(
         # in
         zonals: wp.array2d(dtype=wp.float32),

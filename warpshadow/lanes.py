@@ -1,33 +1,148 @@
 """Lanes: how one thread works on several receivers at once.
 
 Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
-a thread owns a *group* of receivers and holds each quantity as one vector with a lane for every receiver: 16 lanes on
-a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …]; only scratch is [batch,
-group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
+a thread owns a *group* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
+vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
+only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
+
+How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
+are, so the width is among the flags. ``python demos/benchmark.py --lanes`` times what else could be chosen.
 """
 
+import contextlib
 import functools
-from typing import NamedTuple
+import os
+import warnings
+from typing import Any, NamedTuple
 
 import warp as wp
 
+from warpshadow import check
 from warpshadow.directions import CHUNK
 from warpshadow.parallel import split_row
+
+LANES_VARIABLE = "WARPSHADOW_LANES"
+BITS_VARIABLE = "WARPSHADOW_VECTOR_BITS"
+"""Environment variables that replace what follows from the CPU."""
+
+LANE_COUNTS = (1, 2, 4, 8, 16)
+REGISTER_BITS = (128, 256, 512)
 
 Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
 """Coefficients of one receiver that reach the vector units together."""
 
-MODULE_OPTIONS = {"max_unroll": 1, "cpu_compiler_flags": "-march=native -fno-unroll-loops -fno-slp-vectorize"}
-"""Options of modules whose kernels loop over lanes.
+_FLOAT_BITS = 32
 
-Unrolled by Warp, such loops take ten times as long to compile. Unrolled by the compiler, they are put together again
-as far as it finds what belongs together; left alone, each becomes a vector instruction, and kernels run twice as fast.
+_HOST_FLAG = "-march=native"
+
+_WHOLE_LOOPS = ("-fno-unroll-loops", "-fno-slp-vectorize")
+"""Flags that leave loops alone, so that one over lanes becomes a vector instruction.
+
+Unrolled by the compiler, loops are put together again as far as it finds what belongs together: on a Zen 4, 16 lanes
+take 1.2 to 1.7 times as long then. But a loop of more than a register stays in memory unless it is unrolled, and takes
+four to eight times as long.
 """
+
+
+@functools.cache
+def _diagnostics() -> dict[str, Any]:
+    """Warp's report about the machine; empty where it fails."""
+    try:
+        with contextlib.redirect_stdout(None):
+            return wp.print_diagnostics()
+    except Exception:  # nothing but speed depends on it
+        return {}
+
+
+def cpu_name() -> str:
+    """LLVM's name of the CPU that kernels are compiled for."""
+    return _diagnostics().get("cpu_name", "unknown")
+
+
+def _cpu_features() -> frozenset[str]:
+    """What LLVM finds that the CPU can do, by its names; empty where Warp does not tell."""
+    return frozenset(_diagnostics().get("cpu_features", ()))
+
+
+def _own_flags() -> str:
+    """Warp's flags for all CPU kernels, which those of a module replace."""
+    flags = getattr(wp.config, "cpu_compiler_flags", None)
+    return _HOST_FLAG if flags is None else flags
+
+
+def _from_environment(name: str, choices: tuple[int, ...]) -> int | None:
+    """What an environment variable says; None if it says nothing.
+
+    Raises:
+        ValueError: for what is not among the choices.
+    """
+    text = os.environ.get(name)
+    if not text:
+        return None
+    check.choice(name, text, map(str, choices))
+    return int(text)
+
+
+def register_bits() -> int:
+    """Width of the vector registers that kernels with lanes are compiled for [bits]."""
+    forced = _from_environment(BITS_VARIABLE, REGISTER_BITS)
+    if forced is not None:
+        return forced
+    features = _cpu_features() if _HOST_FLAG in _own_flags().split() else frozenset()
+    return 512 if "avx512f" in features else 256 if "avx" in features else 128
 
 
 def lane_count(device: wp.DeviceLike) -> int:
     """Receivers of one thread: a vector register's worth on a CPU, one on a GPU."""
-    return 16 if wp.get_device(device).is_cpu else 1
+    if not wp.get_device(device).is_cpu:
+        return 1
+    return _from_environment(LANES_VARIABLE, LANE_COUNTS) or register_bits() // _FLOAT_BITS
+
+
+def compiler_flags(lanes: int) -> str:
+    """The compiler's flags for CPU kernels with a number of lanes.
+
+    Loops are left whole where those over lanes fit a register, and so do those over bands, of which there are 8 at
+    most. Elsewhere Warp's own flags unroll them: with registers of 128 bits they are up to twice as fast.
+    """
+    own, bits = _own_flags(), register_bits()
+    if _HOST_FLAG not in own.split():
+        return own  # for any CPU of the kind
+    is_whole = lanes * _FLOAT_BITS <= bits and bits >= 8 * _FLOAT_BITS
+    base, loops = (_HOST_FLAG, _WHOLE_LOOPS) if is_whole else (own, ())
+    return _accepted_flags(base, (*loops, f"-mprefer-vector-width={bits}"))
+
+
+@functools.cache
+def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
+    """Join flags, but for those that the compiler refuses, of which a warning tells."""
+    if _builds(" ".join((base, *flags))):
+        return " ".join((base, *flags))
+    refused = [flag for flag in flags if not _builds(f"{base} {flag}")]
+    message = f"Warp's compiler refuses {' '.join(refused)}: kernels are built without, and may be slow"
+    warnings.warn(message, stacklevel=2)
+    return " ".join((base, *(flag for flag in flags if flag not in refused)))
+
+
+def _builds(flags: str) -> bool:
+    """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
+
+    @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
+    def do_nothing(): ...
+
+    try:
+        wp.launch(do_nothing, dim=1, device="cpu", record_tape=False)
+    except Exception:  # Warp raises no other
+        return False
+    return True
+
+
+def module_options(lanes: int) -> dict[str, Any]:
+    """Options of modules whose kernels loop over lanes.
+
+    Unrolled by Warp, such loops take ten times as long to compile.
+    """
+    return {"max_unroll": 1} | ({"cpu_compiler_flags": compiler_flags(lanes)} if lanes > 1 else {})
 
 
 def group_count(vertex_count: int, lanes: int) -> int:

@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.directions import CHUNK
-from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks
+from warpshadow.lanes import Chunk, as_chunks
 from warpshadow.parallel import launch_slices, split_row
 from warpshadow.tape import record_adjoint
 
@@ -16,7 +16,7 @@ _COEFFICIENT_COST = 0.4
 """Nanoseconds that a coefficient of a receiver takes."""
 
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options({"max_unroll": 1})
 
 
 @wp.kernel(enable_backward=False)

@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow import check, sh
 from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
-from warpshadow.lanes import MODULE_OPTIONS, Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type
+from warpshadow.lanes import Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type, module_options
 from warpshadow.parallel import Scratch, launch_slices, scratch_place, split_row
 from warpshadow.sh_kernels import (
     PRODUCT_COST,
@@ -30,7 +30,7 @@ from warpshadow.tape import record_adjoint
 _CELL_COST = 0.3
 """Nanoseconds that a cell of a receiver takes."""
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options({"max_unroll": 1})
 
 
 @functools.cache
@@ -41,7 +41,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transfer_sh(
         first_row: int,
         worker: int,
@@ -92,7 +92,7 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transfer_sh_adjoint(
         first_row: int,
         worker: int,

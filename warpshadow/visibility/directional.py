@@ -17,7 +17,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.directions import BUNDLE, CHUNK, cell_radius, check_count, edge_width
-from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.lanes import group_count, lane_count, lane_functions, lane_type, module_options
 from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.tape import record_adjoint
 from warpshadow.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
@@ -113,7 +113,7 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     reaches, rises = reach_function(lanes), rise_function(lanes)
     find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit(
         first_row: int,
         worker: int,
@@ -262,7 +262,7 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
     reaches, rises = reach_function(lanes), rise_function(lanes)
     find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit_adjoint(
         first_row: int,
         worker: int,

@@ -31,7 +31,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check, sh
-from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.lanes import group_count, lane_count, lane_functions, lane_type, module_options
 from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import multiply, product_table
 from warpshadow.tape import record_adjoint
@@ -296,7 +296,7 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
     measure, approximate = _measure_function(order, lanes), _base_function(order, base, lanes)
     square_held = _square_function(order, lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh(
         first_row: int,
         worker: int,
@@ -367,7 +367,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
     measure, factors = _measure_function(order, lanes), _factor_function(base, lanes)
     square_held_adjoint = _square_adjoint_function(order, lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh_adjoint(
         first_row: int,
         worker: int,

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow import check, sh
 from warpshadow.directions import cell_radius
-from warpshadow.lanes import MODULE_OPTIONS, group_count, lane_count, lane_functions, lane_type
+from warpshadow.lanes import group_count, lane_count, lane_functions, lane_type, module_options
 from warpshadow.parallel import Scratch, launch_slices, scratch_place
 from warpshadow.sh_kernels import (
     PRODUCT_COST,
@@ -80,7 +80,7 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     cone, horizon, look_up_ = relative_cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
     add_rotated_zonal_ = add_rotated_zonal(order, lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh(
         first_row: int,
         worker: int,
@@ -154,7 +154,7 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
     look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
     rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh_adjoint(
         first_row: int,
         worker: int,
@@ -370,7 +370,7 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
     add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
     UNIT = wp.constant(float(np.sqrt(4 * np.pi)))  # the coefficient of the constant function 1
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def multiply_spheres(
         first_row: int,
         worker: int,
