@@ -119,6 +119,24 @@ def test_launches_from_several_python_threads_do_not_meet():
     assert not failures
 
 
+def test_threads_that_get_no_core_are_not_waited_for():
+    parallel.set_thread_count(2)
+    is_over = threading.Event()
+    blocked = [parallel._pool(2).submit(is_over.wait) for _ in range(2)]  # all threads of the pool
+    try:
+        found = []
+        launch = threading.Thread(target=lambda: found.append(spread(np.arange(1000))), daemon=True)
+        launch.start()
+        launch.join(60)
+        assert found, "the launch waits for a thread that has not begun"
+        np.testing.assert_array_equal(found[0][0], np.arange(1000.0) ** 2)
+        assert set(found[0][1]) == {0}
+    finally:
+        is_over.set()
+        for other in blocked:
+            other.result()
+
+
 def shaded_with_gradients(method, forward=None, backward=None):
     """Shading of 3000 receivers in a batch of two, and its gradients, as bytes."""
     parts = [twins.random_scene(seed, vertex_count=3000, sphere_count=40) for seed in (0, 1)]

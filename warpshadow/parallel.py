@@ -176,7 +176,8 @@ def _share(slices: Sequence[wp.Launch], workers: int) -> None:
     """Run slices on the calling thread and those of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
-    kernel to kernel; one that is done takes over from the end of another's part.
+    kernel to kernel; one that is done takes over from the end of another's part. Threads that got no core before all
+    was taken are not waited for.
     """
     count = min(workers, len(slices))
     bounds = [len(slices) * worker // count for worker in range(count + 1)]
@@ -198,4 +199,5 @@ def _share(slices: Sequence[wp.Launch], workers: int) -> None:
         work(0)
     finally:
         for other in others:
-            other.result()
+            if not other.cancel():
+                other.result()
