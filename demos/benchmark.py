@@ -1,6 +1,8 @@
 """Time the stages of rendering the bunny scene, and how long their kernels take to compile.
 
     make bench       or        python demos/benchmark.py [--compile]
+    python demos/benchmark.py --lanes    other numbers of lanes, and widths of registers, than those that are chosen
+    python demos/benchmark.py --busy     README's loop in torch beside processes that compute
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
@@ -9,17 +11,20 @@ on all cores (or what WARPSHADOW_NUM_THREADS says).
 """
 
 import argparse
+import contextlib
 import dataclasses
 import itertools
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 
 import torch
 import warp as wp
-from scenes import on_ground, shipped_mesh
+from lane_choice import compare, cpu_text
+from scenes import bunny_scene
 
 import warpshadow as ws
 from warpshadow import inverse
@@ -138,6 +143,8 @@ def main(device: str, runs: int) -> None:
         "iteration of 8 pose fits in a batch": fit_poses,
     }
     vertex_count, sphere_count = points.shape[1], radii.shape[1]
+    if renderer.device.is_cpu:
+        print(cpu_text())
     print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs} [ms]")
     counts = sorted({1, ws.thread_count()}) if renderer.device.is_cpu else [1]
     functions = [on_threads(count, function) for function in rows.values() for count in counts]
@@ -179,11 +186,55 @@ def on_threads(count: int, function: Callable[[], object]) -> Callable[[], objec
     return run
 
 
-def bunny_scene() -> ws.Scene:
-    """The bunny on a plane of 64 × 64 quads that casts no shadow, under a sky with a sun."""
-    ground = ws.Body(ws.plane(6.0, 64), blockers=0)
-    scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky(), ground=ground)
-    return dataclasses.replace(scene, supersampling=1)
+def time_busy(runs: int) -> None:
+    """Mean iterations of README's loop in torch, on an idle machine and beside more busy processes than cores."""
+    ws.quiet()
+    scene = bunny_scene()
+    scene = dataclasses.replace(scene, camera=scene.camera.resized(0.5), supersampling=2)
+    renderer = TorchRenderer(scene, basis=HarmonicBasis(5))
+    light = torch.full((25, 3), 0.1, requires_grad=True)
+    ground = torch.full((256, 256, 3), 0.5, requires_grad=True)
+    with torch.no_grad():
+        target = 0.9 * renderer(light, textures=[None, ground])
+
+    def seconds(free: tuple[torch.Tensor, ...]) -> float:
+        optimizer = torch.optim.Adam(free, lr=1e-4)
+        start = 0.0
+        for iteration in range(runs + 2):
+            if iteration == 2:  # the first find what stands
+                start = time.perf_counter()
+            optimizer.zero_grad()
+            image = renderer(light if light in free else None, textures=[None, ground if ground in free else None])
+            torch.nn.functional.mse_loss(image, target).backward()
+            optimizer.step()
+        return (time.perf_counter() - start) / runs
+
+    rows = {"light": (light,), "texture": (ground,), "light and texture": (light, ground)}
+    counts = sorted({1, torch.get_num_threads()})
+    processes = (os.cpu_count() or 1) + 1
+    print(cpu_text())
+    print(f"128 × 128 pixels, means of {runs} iterations [ms]; busy: beside {processes} processes that compute")
+    print(f"  {'':20}{'threads of torch':>18}{'idle':>8}{'busy':>8}{'ratio':>8}")
+    for label, free in rows.items():
+        for count in counts:
+            torch.set_num_threads(count)
+            idle = 1e3 * seconds(free)
+            with computing(processes):
+                busy = 1e3 * seconds(free)
+            print(f"  {label:20}{count:18}{idle:8.1f}{busy:8.1f}{busy / idle:8.1f}", flush=True)
+
+
+@contextlib.contextmanager
+def computing(count: int) -> Iterator[None]:
+    """Have a number of processes compute meanwhile."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        time.sleep(1.0)  # they are there
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def time_compilation(device: str) -> None:
@@ -222,7 +273,14 @@ if __name__ == "__main__":
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
     parser.add_argument("--runs", type=int, default=15, help="timed runs of each row")
     parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
+    parser.add_argument("--lanes", action="store_true", help="compare lanes; exit 1 if the choice is 15%% too slow")
+    parser.add_argument("--busy", action="store_true", help="time README's loop in torch beside other processes")
     arguments = parser.parse_args()
+    if arguments.lanes:
+        sys.exit(0 if compare() else 1)
+    if arguments.busy:
+        time_busy(arguments.runs)
+        sys.exit()
     main(arguments.device, arguments.runs)
     time_fits(arguments.device)
     if arguments.compile:

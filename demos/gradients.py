@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from benchmark import bunny_scene
+from scenes import bunny_scene
 
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices

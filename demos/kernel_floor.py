@@ -20,7 +20,7 @@ import argparse
 from typing import NamedTuple
 
 import numpy as np
-from benchmark import bunny_scene
+from scenes import bunny_scene
 
 import warpshadow as ws
 from warpshadow.directions import edge_width, fibonacci

@@ -9,7 +9,7 @@ beside those that do; and with it what ten times the size would cost. Memory is 
 the process has before it (Linux only). All is drawn in OUTPUT/scaling.png. ``--most`` leaves out larger sizes.
 
 vertices   a ball of 64 spheres on a ground, half of the vertices each, 256 × 256 pixels
-spheres    the bunny scene of benchmark.py with fits of stage 1 (the first run fits them: 3 min)
+spheres    the bunny scene of scenes.py with fits of stage 1 (the first run fits them: 3 min)
 pixels     the bunny scene with 64 spheres
 bodies     balls of 642 vertices and 16 spheres on a ground, side by side
 batch      poses of a ball of 642 vertices and 16 spheres, 64 × 64 pixels
@@ -33,8 +33,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from benchmark import bunny_scene
-from scenes import on_ground, shipped_mesh
+from scenes import bunny_scene, on_ground, shipped_mesh
 
 import warpshadow as ws
 from warpshadow.assembly import Geometry

@@ -1,5 +1,6 @@
 """What the demos share: meshes that ship with Warp, a body on a ground, and the error of an image."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,13 @@ def on_ground(
     body = ws.Body(mesh, albedo=(0.75, 0.62, 0.5), blockers=blockers, scale=scale, translation=-scale * foot)
     camera = ws.Camera.look_at((1.6, 2.6, 4.6), (0, 0.75, 0), fov_y=36, size=(256, 256))
     return ws.Scene((body, ground or ws.Body(ws.plane(6.0, 64))), light, camera)
+
+
+def bunny_scene() -> ws.Scene:
+    """The bunny on a plane of 64 × 64 quads that casts no shadow, under a sky with a sun."""
+    ground = ws.Body(ws.plane(6.0, 64), blockers=0)
+    scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky(), ground=ground)
+    return dataclasses.replace(scene, supersampling=1)
 
 
 def image_error(image: np.ndarray, truth: np.ndarray) -> float:

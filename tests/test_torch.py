@@ -1,7 +1,10 @@
 """Rendering with tensors: the same image, exact gradients, nothing shared by accident, nothing kept too long."""
 
 import dataclasses
+import os
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -639,3 +642,34 @@ def test_a_camera_that_a_call_is_given_replaces_several():
     renderer = TorchRenderer(scene, cameras=[camera, camera])
     matrix = torch.tensor(camera.clip_matrix(), dtype=torch.float32)
     assert torch.equal(renderer(clip_matrices=matrix), renderer()[1])
+
+
+SLEEPERS = """
+import os, torch, warp as wp
+wp.config.quiet = True
+from warpshadow.torch import apply
+torch.set_num_threads(2)
+threads = lambda: len(os.listdir("/proc/self/task"))
+before = threads()
+for _ in range(3):
+    apply(lambda array: wp.clone(array), torch.zeros(3), dtypes=[wp.float32])
+print(threads() - before, torch.get_num_threads())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
+@pytest.mark.parametrize("policy", [None, "active"])
+def test_openmp_has_more_threads_than_cores_so_that_those_that_wait_sleep(policy):
+    """Unless the environment says how to wait; and torch keeps its number of threads."""
+    environment = {name: text for name, text in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    if policy is not None:
+        environment["OMP_WAIT_POLICY"] = policy
+    run = subprocess.run(
+        [sys.executable, "-c", SLEEPERS], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    more, team = map(int, run.stdout.split()[-2:])
+    assert team == 2
+    if policy is None:
+        assert more >= 2 * len(os.sched_getaffinity(0))  # each begins a team of two and stays
+    else:
+        assert more < 2

@@ -4,6 +4,10 @@ While geometry and camera stand still, visibility and rasterization are computed
 mesh included; an iteration is then a matrix product and a gather.
 """
 
+import functools
+import os
+import sys
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -378,9 +382,38 @@ def apply(
     for number, tensor in enumerate(tensors):
         _check_float32(f"tensors[{number}]", tensor)
     wp.init()
+    if torch.get_num_threads() > 1:
+        _let_waiting_threads_sleep()
     wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
     results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)
     return results if len(results) > 1 else results[0]
+
+
+@functools.cache
+def _let_waiting_threads_sleep() -> None:
+    """Let the threads of torch's OpenMP sleep where they wait for each other, rather than spin.
+
+    They spin for milliseconds before they sleep, which is quickest if each has a core to itself. Beside other work, or
+    the threads of our own pool, they use up their share of the cores by spinning, and the thread that all wait for is
+    the last to run: each operation on more than 32 768 numbers then takes tens of milliseconds. GNU's OpenMP spins for
+    microseconds once it has more threads than there are cores (its manual, GOMP_SPINCOUNT). So it is given some that
+    sleep for good. No setting of torch changes; and what the environment says about waiting is left alone.
+    """
+    is_said = "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ
+    if is_said or sys.platform != "linux" or not torch.backends.openmp.is_available():
+        return
+    others = torch.get_num_threads() - 1  # that a team has beside the thread that begins it
+    started = [threading.Event() for _ in range(-(-len(os.sched_getaffinity(0)) // others))]
+
+    def begin_team(is_started: threading.Event) -> None:
+        torch.zeros(1 << 17).add_(1.0)
+        is_started.set()
+        threading.Event().wait()  # a team ends with the thread that began it
+
+    for event in started:
+        threading.Thread(target=begin_team, args=(event,), name="warpshadow-sleeper", daemon=True).start()
+    for event in started:
+        event.wait()
 
 
 class _WarpFunction(torch.autograd.Function):
