@@ -197,19 +197,19 @@ def time_busy(runs: int) -> None:
     with torch.no_grad():
         target = 0.9 * renderer(light, textures=[None, ground])
 
-    def seconds(free: tuple[torch.Tensor, ...]) -> float:
-        optimizer = torch.optim.Adam(free, lr=1e-4)
+    def seconds(has_light: bool, has_texture: bool) -> float:
+        given = light if has_light else None, [None, ground if has_texture else None]
+        optimizer = torch.optim.Adam([light] * has_light + [ground] * has_texture, lr=1e-4)
         start = 0.0
         for iteration in range(runs + 2):
             if iteration == 2:  # the first find what stands
                 start = time.perf_counter()
             optimizer.zero_grad()
-            image = renderer(light if light in free else None, textures=[None, ground if ground in free else None])
-            torch.nn.functional.mse_loss(image, target).backward()
+            torch.nn.functional.mse_loss(renderer(given[0], textures=given[1]), target).backward()
             optimizer.step()
         return (time.perf_counter() - start) / runs
 
-    rows = {"light": (light,), "texture": (ground,), "light and texture": (light, ground)}
+    rows = {"light": (True, False), "texture": (False, True), "light and texture": (True, True)}
     counts = sorted({1, torch.get_num_threads()})
     processes = (os.cpu_count() or 1) + 1
     print(cpu_text())
@@ -218,9 +218,9 @@ def time_busy(runs: int) -> None:
     for label, free in rows.items():
         for count in counts:
             torch.set_num_threads(count)
-            idle = 1e3 * seconds(free)
+            idle = 1e3 * seconds(*free)
             with computing(processes):
-                busy = 1e3 * seconds(free)
+                busy = 1e3 * seconds(*free)
             print(f"  {label:20}{count:18}{idle:8.1f}{busy:8.1f}{busy / idle:8.1f}", flush=True)
 
 

@@ -3,8 +3,8 @@
     python demos/benchmark.py --lanes       (this file, run by itself, times the choice that the environment says)
 
 Directional visibility, log-SH and exponentiation, forward and backward, of the bunny scene's receivers and spheres, on
-one thread; its processor time, least of several runs, so that other work on the machine counts little. Each choice has a
-process of its own, all of them twice in turn.
+one thread; its processor time, least of several runs, so that other work on the machine counts little. Each choice has
+a process of its own.
 """
 
 import itertools
@@ -31,7 +31,7 @@ from warpshadow.visibility.exponential import exponentiate
 SLACK = 1.15
 """Times the best choice's time that the chosen one may take."""
 
-RUNS = 7
+RUNS = 9
 
 
 def cpu_text() -> str:
@@ -81,21 +81,20 @@ def time_stages(runs: int = RUNS) -> dict[str, float]:
 
 def compare() -> bool:
     """Print what each choice takes; whether the chosen one is as good as the best, but for the slack."""
+    ws.quiet()
     wp.init()
     chosen = lanes.lane_count("cpu"), lanes.register_bits()
     print(cpu_text())
     widths = [bits for bits in lanes.REGISTER_BITS if bits <= chosen[1]]
-    times: dict[tuple[int, int], dict[str, float]] = {}
-    for _, choice in itertools.product(range(2), itertools.product((4, 8, 16), widths)):
-        found = _time_choice(*choice)
-        before = times.get(choice, found)
-        times[choice] = {name: min(found[name], before[name]) for name in found}
-        print(".", end="", flush=True)
-    totals = {choice: sum(stages.values()) for choice, stages in times.items()}
-    print("\n  lanes  bits" + "".join(f"{name:>16}" for name in times[chosen]) + f"{'total [ms]':>16}")
-    for (count, bits), stages in times.items():
-        cells = "".join(f"{milliseconds:16.1f}" for milliseconds in (*stages.values(), totals[count, bits]))
-        print(f"{count:7}{bits:6}{cells}{'  chosen' if (count, bits) == chosen else ''}")
+    totals: dict[tuple[int, int], float] = {}
+    print(
+        "  lanes  bits" + "".join(f"{name:>16}" for name in ("directional", "log-SH", "exponentiation", "total [ms]"))
+    )
+    for count, bits in itertools.product(sorted({4, 8, 16, chosen[0]}), widths):
+        times = _time_choice(count, bits).values()
+        totals[count, bits] = sum(times)
+        cells = "".join(f"{milliseconds:16.1f}" for milliseconds in (*times, totals[count, bits]))
+        print(f"{count:7}{bits:6}{cells}{'  chosen' if (count, bits) == chosen else ''}", flush=True)
     ratio = totals[chosen] / min(totals.values())
     print(f"the choice takes {ratio:.2f} times as long as the best")
     return ratio <= SLACK
@@ -103,7 +102,7 @@ def compare() -> bool:
 
 def _time_choice(count: int, bits: int) -> dict[str, float]:
     environment = os.environ | {lanes.LANES_VARIABLE: str(count), lanes.BITS_VARIABLE: str(bits)}
-    run = subprocess.run([sys.executable, __file__], env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    run = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=True)
     return json.loads(run.stdout.splitlines()[-1])
 
 
