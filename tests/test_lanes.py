@@ -11,8 +11,8 @@ from warpshadow.transfer import sh_transfer
 from warpshadow.visibility import directional, log_sh
 from warpshadow.visibility.exponential import exponentiate
 
-OPAQUE = 1e-3  # transmittance where a group of receivers stops looking: another group may look further
-ROUNDING = 2e-5  # relative L2: sums of other lanes in another order
+OPAQUE = 1e-4  # relative L2: where less than this passes, a group of receivers looks no further, and others may
+ROUNDING = 2e-6  # relative L2: sums over the lanes, in another order
 NATIVE = "-march=native"
 OWN = f"{NATIVE} -mllvm=-inline-threshold=9000"
 
