@@ -10,7 +10,7 @@ import warp as wp
 from warp._src.context import user_modules  # Warp has no public way to list them
 
 import warpshadow
-from warpshadow import batch, raster, silhouette, transfer
+from warpshadow import batch, lanes, raster, silhouette, transfer
 from warpshadow.visibility import directional, exponential, log_sh
 
 LANES = 1
@@ -59,6 +59,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
     **{f"_copy_kernel {dtype.__name__}": partial(batch._copy_kernel, dtype) for dtype in (wp.float32, wp.vec3)},
+    "_empty_kernel": partial(lanes._empty_kernel, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""
 
