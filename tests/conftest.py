@@ -1,4 +1,4 @@
-"""Fixtures shared by the tests: devices, and the optional data of real meshes, maps and golden values."""
+"""What the tests share: devices, golden values, and the optional data of real meshes and maps."""
 
 from pathlib import Path
 
@@ -12,18 +12,38 @@ warpshadow.quiet()
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
+def pytest_addoption(parser):
+    parser.addoption("--devices", help="run only tests that take a device, on these: cuda:0, or cpu,cuda:0")
+
+
 def pytest_generate_tests(metafunc):
-    """Run a test that takes ``device`` once on every device that is available."""
+    """Run a test that takes ``device`` once on every device that is available, or that was asked for."""
     if "device" in metafunc.fixturenames:
         wp.init()
-        metafunc.parametrize("device", [device.alias for device in wp.get_devices()])
+        asked = metafunc.config.getoption("devices")
+        aliases = asked.split(",") if asked else [device.alias for device in wp.get_devices()]
+        metafunc.parametrize("device", aliases)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out tests that take no device, where devices were asked for."""
+    if config.getoption("devices"):
+        others = [item for item in items if "device" not in item.fixturenames]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if "device" in item.fixturenames]
+
+
+@pytest.fixture(scope="session")
+def golden_data() -> Path:
+    """Folder of values computed in float64; its README says of what."""
+    return Path(__file__).parent / "data"
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of real meshes, environment maps and golden values."""
+    """Folder of real meshes and environment maps."""
     if not SHARED_DATA.is_dir():
-        pytest.skip("shared/data (real meshes, environment maps, golden values) is not beside this checkout")
+        pytest.skip("shared/data (real meshes, environment maps) is not beside this checkout")
     return SHARED_DATA
 
 

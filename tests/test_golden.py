@@ -21,8 +21,8 @@ DIRECTIONAL = 2e-6
 
 
 @pytest.fixture(scope="module")
-def golden(shared_data):
-    with np.load(shared_data / "golden_visibility.npz") as data:
+def golden(golden_data):
+    with np.load(golden_data / "golden_visibility.npz") as data:
         return {name: data[name].astype(float) for name in data}
 
 

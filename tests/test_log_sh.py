@@ -83,8 +83,8 @@ def test_eigen_logs_are_those_of_the_twin(order):
     assert np.abs(difference).max() < 1e-10  # float64; eigenvectors of near eigenvalues
 
 
-def test_zonal_logs_are_the_golden_ones(shared_data):
-    golden = json.loads((shared_data / "golden_zonal.json").read_text())
+def test_zonal_logs_are_the_golden_ones(golden_data):
+    golden = json.loads((golden_data / "golden_zonal.json").read_text())
     for angle, logs in golden.items():
         cosine = np.cos(np.radians(float(angle)))
         assert np.abs(-zonal_logs.CAP_DEPTH * zonal_logs.zonal_cap(8, cosine) - logs["cap"]).max() < ZONAL
@@ -99,8 +99,8 @@ def upright(angles, radius=1.0):
 
 
 @pytest.mark.parametrize("log", LOGS)
-def test_one_sphere_straight_up_gives_the_golden_zonal_log(log, shared_data, device):
-    golden = json.loads((shared_data / "golden_zonal.json").read_text())
+def test_one_sphere_straight_up_gives_the_golden_zonal_log(log, golden_data, device):
+    golden = json.loads((golden_data / "golden_zonal.json").read_text())
     points, centers, radii = upright(np.radians([float(angle) for angle in golden]))
     rows = accumulate(points, None, centers, radii, device, order=8, log=log)
     at_zero = [band**2 + band for band in range(8)]
