@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test lint types install-check bench clean
+.PHONY: demo test quick lint types install-check bench gpu clean
 
 demo: $(INSTALLED)
 	$(BIN)/python demos/bunny.py
@@ -12,8 +12,16 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest
 
+# the inner loop: what is not marked slow
+quick: $(INSTALLED)
+	$(BIN)/python -m pytest -m "not slow" --exitfirst
+
 bench: $(INSTALLED)
 	$(BIN)/python demos/benchmark.py
+
+# on a machine with an NVIDIA GPU: correctness, speed and floors beside the CPU's, in out/gpu
+gpu: $(INSTALLED)
+	$(BIN)/python demos/gpu_report.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

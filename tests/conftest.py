@@ -1,5 +1,6 @@
 """What the tests share: devices, golden values, and the optional data of real meshes and maps."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,13 @@ import warpshadow
 
 warpshadow.quiet()
 
+START = time.monotonic()
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_addoption(parser):
     parser.addoption("--devices", help="run only tests that take a device, on these: cuda:0, or cpu,cuda:0")
+    parser.addoption("--seconds", type=float, help="begin no further test after so many seconds")
 
 
 def pytest_generate_tests(metafunc):
@@ -31,6 +34,19 @@ def pytest_collection_modifyitems(config, items):
         others = [item for item in items if "device" not in item.fixturenames]
         config.hook.pytest_deselected(items=others)
         items[:] = [item for item in items if "device" in item.fixturenames]
+
+
+def pytest_runtest_teardown(item):
+    """End the session after this test, once its time is up."""
+    seconds = item.config.getoption("seconds")
+    if seconds is not None and time.monotonic() - START > seconds:
+        item.session.shouldstop = f"{seconds:.0f} s are over"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def note_of_tests(request, record_testsuite_property):
+    """A JUnit report says how many tests there were to run, as well as which were run."""
+    record_testsuite_property("collected", request.session.testscollected)
 
 
 @pytest.fixture(scope="session")

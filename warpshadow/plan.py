@@ -356,10 +356,22 @@ class Timing:
 
 
 class Ledger:
-    """How long each stage took when it last ran."""
+    """How long each stage took when it last ran.
+
+    Attributes:
+        timings: By the stages' names.
+        waits: Whether a stage begins and ends with the device idle. On a GPU times are of its work then, and an image
+            takes longer.
+    """
 
     def __init__(self) -> None:
         self.timings: dict[str, Timing] = {}
+        self.waits = False
+
+    def _now(self) -> float:
+        if self.waits:
+            wp.synchronize()
+        return time.perf_counter()
 
     @contextlib.contextmanager
     def timed(self, stage: Stage, inputs: Iterable[wp.array | None] = (), *, continues: bool = False) -> Iterator[None]:
@@ -374,20 +386,20 @@ class Ledger:
             yield
             return
         inputs = list(inputs) if stage.backward else []
-        start = time.perf_counter()
+        start = self._now()
         timing = Timing(0.0)
 
         def end_adjoint() -> None:
             assert timing.backward is not None
-            timing.backward += time.perf_counter()
+            timing.backward += self._now()
 
         def start_adjoint() -> None:
-            timing.backward = -time.perf_counter()
+            timing.backward = -self._now()
 
         record_adjoint(end_adjoint, inputs)  # the tape plays back from the end
         yield
         record_adjoint(start_adjoint, inputs)
-        timing.forward = time.perf_counter() - start
+        timing.forward = self._now() - start
         if continues and stage.name in self.timings:
             timing.forward += self.timings[stage.name].forward
         self.timings[stage.name] = timing

@@ -50,6 +50,7 @@ class Renderer:
         scene: The scene; a method "auto" has been replaced by what was chosen.
         cameras: Those that see the scene.
         has_camera_batch: Whether they were given as a batch.
+        ledger: How long stages took; with ``ledger.waits``, stages on a GPU are waited for.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -87,10 +88,10 @@ class Renderer:
         self.device = where
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
-        self._ledger = Ledger()
-        self._viewer = Viewer(self.assembly, self.cameras, self._ledger, progress=progress)
-        self._lighting = Lighting(self.assembly, basis, self._ledger, progress=progress)
-        self._reflectance = Reflectance(self.assembly, self._ledger)
+        self.ledger = Ledger()
+        self._viewer = Viewer(self.assembly, self.cameras, self.ledger, progress=progress)
+        self._lighting = Lighting(self.assembly, basis, self.ledger, progress=progress)
+        self._reflectance = Reflectance(self.assembly, self.ledger)
         self.basis = self._lighting.basis
 
     def __getstate__(self) -> dict[str, Any]:
@@ -286,7 +287,7 @@ class Renderer:
         view = self._own(view)
         lit = self.shade(light, view)
         varying = _varying(view.facts, light, albedo, textures)
-        plan, timed = plan_image(view.facts, varying, supersampling=self.scene.supersampling), self._ledger.timed
+        plan, timed = plan_image(view.facts, varying, supersampling=self.scene.supersampling), self.ledger.timed
         receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
         if exposes_albedo(varying):
             samples = self._reflectance.expose(view, self._white(view, lit), plan.exposure, albedo, textures)
@@ -382,7 +383,7 @@ class Renderer:
             plan_image(facts, varying, supersampling=self.scene.supersampling),
         ]
         stages = [stage for plan in plans if plan is not None for stage in plan.stages()]
-        return Explanation(stages, self._ledger.timings, is_host=self.device.is_cpu)
+        return Explanation(stages, self.ledger.timings, is_host=self.device.is_cpu or self.ledger.waits)
 
 
 def _varying(view: ViewFacts, light: Light | None, albedo: Given, textures: Given) -> list[str]:

@@ -1,0 +1,323 @@
+"""What a GPU computes and how fast, beside this machine's CPU: one table to paste, and the same as JSON.
+
+    make gpu      or      python demos/gpu_report.py [--devices cuda:0] [--folder out/gpu]
+
+For each device, in this order, so that what takes longest comes last:
+
+- images and all gradients of a small scene, against those of the CPU, with every method;
+- the same launches under compute-sanitizer, where it is on the path;
+- stages of a pose iteration, each waited for, beside the least that their arithmetic and bytes allow an H200;
+- the benchmark, on the device and on the CPU;
+- every test that takes a device.
+
+It needs no network, and ends within ten minutes: what there was no time for is in the report. The exit status is 1 if
+anything is wrong. ``--devices cpu`` tries it where there is no GPU.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import benchmark
+import kernel_floor
+import numpy as np
+import torch
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.torch import TorchRenderer, rotation_matrices
+
+AGREEMENT = 1e-4
+"""Largest relative L2 difference between devices that is taken for rounding."""
+
+SECONDS = 570
+"""Time for all of it."""
+
+SHARES = {"sanitizer": 0.2, "benchmark": 0.5}
+"""Most of what is left of the time that a part may take."""
+
+CASES = [
+    *((method, "vertex") for method in ("directional", "log-sh", "none", "ray-traced")),
+    ("directional", "pixel"),
+    ("log-sh", "pixel"),
+]
+"""Methods, and the ground's receivers, that are compared."""
+
+FLOORS = {
+    "clip positions": ["project"],
+    "rasterization": ["rasterize", "visible faces, barycentrics"],
+    "silhouettes": ["silhouettes found", "silhouettes listed"],
+    "normals": ["normals"],
+    "visibility": ["visibility, directional"],
+    "transfer": ["transfer, directional"],
+    "shading": ["shading, directional"],
+    "reflectance": ["albedo"],
+    "exposure": ["exposed"],
+    "smoothing": ["contrasts and smoothing"],
+}
+"""Stages as a renderer explains them, and as ``kernel_floor.py`` counts them."""
+
+
+# ------------------------------------------------------------------------------------------------ agreement
+
+
+def small_scene(method: str, receivers: str) -> ws.Scene:
+    """Two bodies on a textured ground, large enough for slices, silhouettes and every kind of receiver."""
+    rng = np.random.default_rng(0)
+
+    def body(x: float, albedo: tuple[float, float, float]) -> ws.Body:
+        spheres = ws.Spheres(rng.uniform(-0.3, 0.3, (20, 3)), rng.uniform(0.2, 0.35, 20))
+        return ws.Body(ws.icosphere(0.5, 3), albedo=albedo, blockers=spheres, translation=(x, 0.6, 0))
+
+    ground = ws.Body(ws.plane(4.0, 24), texture=rng.uniform(0.1, 0.9, (16, 16, 3)), blockers=0, receivers=receivers)
+    camera = ws.Camera.look_at((0.3, 2.0, 3.5), (0, 0.4, 0), size=(48, 40))
+    visibility = ws.Visibility(method, samples=64)
+    return ws.Scene(
+        (body(-0.6, (0.8, 0.5, 0.3)), body(0.6, (0.2, 0.6, 0.7)), ground), ws.synthetic_sky(), camera, visibility
+    )
+
+
+def image_and_gradients(scene: ws.Scene, device: str) -> dict[str, np.ndarray]:
+    """An image of the scene, and what a fixed weighting of it has as gradients to all that may be free."""
+    torch_device = torch.device("cpu" if device == "cpu" else device)
+
+    def random(*shape: int, seed: int, scale: float = 1.0) -> torch.Tensor:
+        return (scale * torch.rand(shape, generator=torch.Generator().manual_seed(seed))).to(torch_device)
+
+    renderer = TorchRenderer(scene, device=torch_device)
+    free = {
+        "light": random(renderer.renderer.basis.size, 3, seed=1),
+        "albedo": random(3, seed=2),
+        "texture": random(16, 16, 3, seed=3),
+    }
+    rotations, translations, scales = renderer.scene_poses()
+    method, body = scene.visibility.method, scene.bodies[0]
+    moves = method != "ray-traced"  # rays have no derivative
+    if moves:
+        free |= {"turns": random(3, 3, seed=4, scale=0.2), "translations": translations, "scales": scales}
+        free |= {
+            "positions": torch.tensor(body.mesh.positions),
+            "clip matrix": torch.tensor(scene.camera.clip_matrix()),
+        }
+    if method in ("directional", "log-sh"):
+        free |= {"centers": torch.tensor(body.blockers.centers), "radii": torch.tensor(body.blockers.radii)}
+    free = {name: value.to(torch_device, torch.float32, copy=True).requires_grad_() for name, value in free.items()}
+    geometry = None
+    if moves:
+        rest = renderer.deformed(0, free["positions"], free.get("centers"), free.get("radii"))
+        turned = rotation_matrices(free["turns"]) @ rotations
+        geometry = renderer.placed(turned, free["translations"], free["scales"], rest=rest)
+    image = renderer(
+        free["light"],
+        albedo=[free["albedo"], None, None],
+        textures=[None, None, free["texture"]],
+        geometry=geometry,
+        clip_matrices=free.get("clip matrix"),
+    )
+    (image * random(*image.shape, seed=5)).sum().backward()
+    results = {"image": image} | {name: value.grad for name, value in free.items()}
+    return {name: value.detach().cpu().numpy() for name, value in results.items()}
+
+
+def agreement(device: str) -> Iterator[tuple[str, str, float]]:
+    """Relative L2 differences from the CPU: method and receivers, what, how much."""
+    for method, receivers in CASES:
+        scene = small_scene(method, receivers)
+        expected, got = image_and_gradients(scene, "cpu"), image_and_gradients(scene, device)
+        for name, value in expected.items():
+            yield f"{method}, {receivers} receivers", name, relative(got[name], value)
+
+
+def relative(got: np.ndarray, expected: np.ndarray) -> float:
+    """Relative L2 difference; infinite where either is not finite."""
+    if not (np.isfinite(got).all() and np.isfinite(expected).all()):
+        return float("inf")
+    scale = np.linalg.norm(expected.astype(float))
+    return float(np.linalg.norm(got.astype(float) - expected) / scale) if scale else float(np.abs(got).max())
+
+
+# ------------------------------------------------------------------------------------------------ other parts
+
+
+def sanitize(device: str, seconds: float) -> str:
+    """Launch what :func:`agreement` launches under compute-sanitizer, and say how that ended."""
+    tool = shutil.which("compute-sanitizer")
+    if tool is None or not device.startswith("cuda"):
+        return "left out: " + ("compute-sanitizer is not on the path" if tool is None else "not a CUDA device")
+    script = f"import gpu_report; [gpu_report.image_and_gradients(gpu_report.small_scene(m, 'vertex'), {device!r})"
+    script += " for m in ('directional', 'log-sh', 'ray-traced')]"
+    command = [tool, "--error-exitcode", "9", sys.executable, "-c", script]
+    try:
+        run = subprocess.run(command, cwd=Path(__file__).parent, timeout=seconds, capture_output=True, text=True)
+    except subprocess.TimeoutExpired:
+        return f"left out: not done after {seconds:.0f} s"
+    if run.returncode:
+        return f"failed ({run.returncode}): " + " ".join((run.stdout + run.stderr).split())[-600:]
+    return "clean"
+
+
+def stages(device: str, runs: int = 10) -> list[dict[str, float | str]]:
+    """Stages of a pose iteration on the bunny scene: milliseconds, each waited for, and the floors of an H200."""
+    scene = benchmark.bunny_scene()
+    size, rising, reached = kernel_floor.measure(scene)
+    floors = {stage.name: stage for stage in kernel_floor.stages(size, rising, reached)}
+    items = kernel_floor.counts(size)
+    renderer = TorchRenderer(scene, device="cpu" if device == "cpu" else device)
+    renderer.renderer.ledger.waits = True
+    rotations, translations, scales = renderer.scene_poses()
+    translations.requires_grad_()
+    times: dict[str, list[tuple[float, float]]] = {}
+    for _ in range(runs + 1):
+        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
+        for name, timing in renderer.renderer.ledger.timings.items():
+            times.setdefault(name, []).append((1e3 * timing.forward, 1e3 * (timing.backward or 0.0)))
+    rows: list[dict[str, float | str]] = []
+    for name, each in times.items():
+        forward, backward = np.median(each[1:], axis=0)
+        parts = [floors[part] for part in FLOORS.get(name, [])]
+        least = [
+            1e3 * sum(kernel_floor.floor(getattr(part, way), items[part.item]) for part in parts)
+            for way in ("forward", "backward")
+        ]
+        rows.append(
+            {
+                "stage": name,
+                "forward": float(forward),
+                "floor of forward": least[0],
+                "backward": float(backward),
+                "floor of backward": least[1],
+            }
+        )
+    return rows
+
+
+def run_tests(device: str, seconds: float, folder: Path) -> dict[str, int | list[str]]:
+    """Run every test that takes a device; what was not reached in time is counted."""
+    report = folder / f"tests_{device.replace(':', '_')}.xml"
+    command = [sys.executable, "-m", "pytest", "--devices", device, "--seconds", str(int(seconds))]
+    command += ["-p", "no:cacheprovider", f"--junitxml={report}"]
+    run = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    if not report.exists():
+        return {"passed": 0, "failed": [f"pytest: {(run.stdout + run.stderr)[-600:]}"], "skipped": 0, "not reached": 0}
+    cases = list(ElementTree.parse(report).iter("testcase"))
+    failed = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
+    skipped = [case for case in cases if case.find("skipped") is not None]
+    collected = next(iter(ElementTree.parse(report).iter("property")), None)
+    total = len(cases) if collected is None else int(collected.get("value", len(cases)))
+    return {
+        "passed": len(cases) - len(failed) - len(skipped),
+        "failed": [f"{case.get('classname')}.{case.get('name')}" for case in failed],
+        "skipped": len(skipped),
+        "not reached": total - len(cases),
+    }
+
+
+def report(device: str, folder: Path, seconds: float) -> dict:
+    """All parts for one device."""
+    end = time.monotonic() + seconds
+
+    def left(part: str = "") -> float:
+        return SHARES.get(part, 1.0) * (end - time.monotonic())
+
+    result: dict = {"device": wp.get_device(device).name, "alias": device}
+
+    def part(name: str, function: Callable[[], object]) -> None:
+        print(f"{device}: {name} …", file=sys.stderr, flush=True)
+        start = time.monotonic()
+        try:
+            result[name] = function()
+        except Exception as error:  # the other parts are worth having, and this one is reported
+            result[name] = {"error": f"{type(error).__name__}: {error}"}
+        print(f"  {time.monotonic() - start:.0f} s", file=sys.stderr)
+
+    part("agreement", lambda: list(agreement(device)))
+    part("sanitizer", lambda: sanitize(device, left("sanitizer")))
+    part("stages", lambda: stages(device))
+    part(
+        "benchmark", lambda: {name: benchmark.measure(name, seconds=left("benchmark") / 2) for name in ("cpu", device)}
+    )
+    part("tests", lambda: run_tests(device, left() - 20, folder))
+    return result
+
+
+def faults(result: dict) -> list[str]:
+    """What is wrong in a report."""
+    wrong = [f"{name}: {part['error']}" for name, part in result.items() if isinstance(part, dict) and "error" in part]
+    if isinstance(result["agreement"], list):
+        wrong += [
+            f"{case}: {name} differs by {error:.1e}" for case, name, error in result["agreement"] if error > AGREEMENT
+        ]
+    if result["sanitizer"] not in ("clean",) and not str(result["sanitizer"]).startswith("left out"):
+        wrong.append(f"sanitizer: {result['sanitizer']}")
+    return wrong + list(result["tests"].get("failed", []))
+
+
+# ------------------------------------------------------------------------------------------------ table
+
+
+def table(result: dict) -> str:
+    """A device's report in Markdown."""
+    lines = [f"### {result['device']} ({result['alias']}) beside {benchmark.cpu_name()}", ""]
+    for name, part in result.items():
+        if isinstance(part, dict) and "error" in part:
+            lines += [f"{name}: {part['error']}", ""]
+    if isinstance(result["agreement"], list):
+        worst: dict[str, tuple[float, str, float]] = {}
+        for case, name, error in result["agreement"]:
+            image = error if name == "image" else worst[case][0]
+            _, at, most = worst.get(case, (0.0, "", -1.0))
+            worst[case] = (image, name, error) if name != "image" and error > most else (image, at, most)
+        lines += ["| relative L2 difference from the CPU | image | worst gradient |", "| --- | --- | --- |"]
+        lines += [f"| {case} | {image:.1e} | {error:.1e} ({at}) |" for case, (image, at, error) in worst.items()]
+        lines += [""]
+    lines += [f"compute-sanitizer: {result['sanitizer']}", ""]
+    if isinstance(result["stages"], list):
+        lines += ["| stage of a pose iteration, ms | forward (floor) | backward (floor) |", "| --- | --- | --- |"]
+        for row in result["stages"]:
+            cells = (f"{row[way]:.3f} ({row[f'floor of {way}']:.3f})" for way in ("forward", "backward"))
+            lines += [f"| {row['stage']} | " + " | ".join(cells) + " |"]
+        lines += [""]
+    if "error" not in result["benchmark"]:
+        columns = list(result["benchmark"])
+        lines += ["| benchmark, ms | " + " | ".join(columns) + " |", "| --- |" + " --- |" * len(columns)]
+        for label in result["benchmark"][columns[0]]:
+            lines += [f"| {label} | " + " | ".join(f"{result['benchmark'][at][label]:.2f}" for at in columns) + " |"]
+        lines += [""]
+    if "error" not in result["tests"]:
+        tests = result["tests"]
+        lines += [
+            f"tests that take a device: {tests['passed']} passed, {len(tests['failed'])} failed, "
+            f"{tests['skipped']} skipped, {tests['not reached']} not reached"
+        ]
+    lines += ["", *(f"**wrong:** {fault}" for fault in faults(result))]
+    return "\n".join(lines).rstrip()
+
+
+def main(devices: list[str], folder: Path) -> int:
+    ws.quiet()
+    wp.init()
+    devices = devices or [device.alias for device in wp.get_cuda_devices()]
+    if not devices:
+        print("There is no CUDA device here; --devices cpu tries the report on the CPU.")
+        return 1
+    folder.mkdir(parents=True, exist_ok=True)
+    results = [report(device, folder, SECONDS / len(devices)) for device in devices]
+    (folder / "report.json").write_text(json.dumps(results, indent=1) + "\n")
+    text = "\n\n".join(map(table, results))
+    (folder / "report.md").write_text(text + "\n")
+    print(text)
+    return 1 if any(map(faults, results)) else 0
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--devices", nargs="+", default=[], help="all CUDA devices by default")
+    parser.add_argument("--folder", type=Path, default=Path("out/gpu"), help="where report.json and report.md go")
+    arguments = parser.parse_args()
+    sys.exit(main(arguments.devices, arguments.folder))
