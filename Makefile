@@ -9,12 +9,15 @@ INSTALLED := $(VENV)/installed
 demo: $(INSTALLED)
 	$(BIN)/python demos/bunny.py
 
+# a process a core; those of a file share its kernels
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 # the inner loop: what is not marked slow
 quick: $(INSTALLED)
-	$(BIN)/python -m pytest -m "not slow" --exitfirst
+	$(PYTEST) -m "not slow" --exitfirst
 
 bench: $(INSTALLED)
 	$(BIN)/python demos/benchmark.py
