@@ -432,10 +432,10 @@ def test_any_finite_light_gives_finite_shading_and_gradients(light, order):
 METHODS = ("directional", "log-sh", "none", "ray-traced")
 
 
-def small_scene(method, *, scale=1.0, light=1.0, texel=0.5):
+def small_scene(method, *, scale=1.0, light=1.0):
     """A ball over a textured ground, whatever its size, in constant light or in harmonics."""
     ball = ws.Body(ws.icosphere(0.5, 1), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 0.6 * scale, 0))
-    ground = ws.Body(ws.plane(4.0, 4), blockers=0, texture=np.full((4, 4, 3), texel))
+    ground = ws.Body(ws.plane(4.0, 4), blockers=0, texture=np.full((4, 4, 3), 0.5))
     bodies = [dataclasses.replace(body, scale=scale) for body in (ball, ground)]
     eye, target = np.array([0.3, 2, 3.5]) * scale, np.array([0, 0.4, 0]) * scale
     camera = ws.Camera.look_at(eye, target, size=(12, 8), near=0.01 * scale)
@@ -444,10 +444,10 @@ def small_scene(method, *, scale=1.0, light=1.0, texel=0.5):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_light_colors_and_scenes_up_to_the_bound_give_finite_images_by_every_method(method):
+def test_light_and_scenes_up_to_the_bound_give_finite_images_by_every_method(method):
     harmonics = np.random.default_rng(0).choice([-LARGEST, LARGEST], (16, 3))
     for light in (LARGEST, harmonics):
-        assert np.isfinite(ws.render(small_scene(method, light=light, texel=LARGEST))).all()
+        assert np.isfinite(ws.render(small_scene(method, light=light))).all()
     expected = ws.render(small_scene(method))
     for scale in (2.0**-20, 2.0**40):
         assert np.abs(ws.render(small_scene(method, scale=scale)) - expected).max() < VALUE
@@ -466,7 +466,6 @@ def test_every_method_refuses_what_is_beyond_the_bound_by_the_name_of_the_argume
         ("light", lambda: small_scene(method, light=np.full((16, 3), beyond))),
         ("light", lambda: renderer.render(free[:16])),
         ("light", lambda: renderer.draw(put(free, wp.vec3))),
-        ("texture", lambda: small_scene(method, texel=beyond)),
         ("scale", lambda: small_scene(method, scale=beyond)),
         ("eye", lambda: ws.Camera.look_at((0, 0, beyond), (0, 0, 0))),
         ("near", lambda: ws.Camera.look_at((0, 0, 1), (0, 0, 0), near=beyond)),
