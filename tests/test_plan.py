@@ -445,7 +445,7 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         return VISIBILITY
     if module == "silhouette":
         after = {
-            "_find_contrasts": "contrasts",
+            "_find_edge_colors": "contrasts",
             "blend": "smoothing",
             "_measure_adjoint": "smoothing",
         }
@@ -457,6 +457,8 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         return "reflectance" if "interpol" in key else "rasterization"
     if module in ("transfer", "still"):
         return "shading" if "_light_cells" in key else "transfer"
+    if module == "slopes":
+        return "contrasts"
     if module == "film":
         return "averaging" if "average" in key else "exposure"
     same = {name: name for name in ("receivers", "shading", "sides")}

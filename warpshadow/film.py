@@ -13,7 +13,7 @@ _SAMPLE_COST = 5.0
 
 
 @wp.func
-def _received(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
+def received(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
     """Shading at a point of a face."""
     result = weights[0] * shading[instance, corners[0]]
     result += weights[1] * shading[instance, corners[1]]
@@ -43,7 +43,7 @@ def _expose(
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         if face >= 0:
-            received = _received(faces[face], barycentrics[view, sample], lit, shading)
+            received = received(faces[face], barycentrics[view, sample], lit, shading)
             color = wp.cw_mul(received, albedo[reflected, sample])
             samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
 
@@ -87,7 +87,7 @@ def _expose_adjoint(
                     wp.atomic_add(adj_shading, lit, corners[1], weights[1] * adj_received)
                     wp.atomic_add(adj_shading, lit, corners[2], weights[2] * adj_received)
                 if adj_albedo:
-                    received = _received(corners, weights, lit, shading)
+                    received = received(corners, weights, lit, shading)
                     adj_albedo[reflected, sample] = adj_albedo[reflected, sample] + wp.cw_mul(adj_color, received)
                 if adj_barycentrics:
                     adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + wp.vec3(
@@ -97,7 +97,9 @@ def _expose_adjoint(
                     )
 
 
-def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
+def expose(
+    fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array, *, at_points: bool = True
+) -> wp.array:
     """Multiply the light that the samples receive, interpolated from the receivers, with what they reflect.
 
     Args:
@@ -106,6 +108,8 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
             Any batch, that of the fragments included, may be 1 and then serves every instance.
+        at_points: Whether barycentrics get their gradient, which is that of the faces at the points that samples see;
+            else it is left to :func:`warpshadow.slopes.pull_surfaces`.
 
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
@@ -144,7 +148,7 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
             dim=[run_count],
             cost=2 * cost * samples.shape[0],
             inputs=[*factors, rows(samples.grad)],
-            outputs=[rows(fragments.barycentrics.grad), rows(albedo.grad)],
+            outputs=[rows(fragments.barycentrics.grad) if at_points else None, rows(albedo.grad)],
             sums=[shading.grad],
             device=shading.device,
         )

@@ -331,14 +331,16 @@ class ImagePlan(Plan):
 def plan_image(view: ViewFacts, varying: Sequence[str], *, supersampling: int) -> ImagePlan:
     """Plan an image, given all that requires a gradient."""
     always = Decision(True, "light or reflectance may have changed")
-    contrasts = Decision(bool(view.placed_by), "silhouettes that move pull by the colors on both sides")
+    contrasts = Decision(
+        bool(view.placed_by), "surfaces that move pull by how colors change on them and across silhouettes"
+    )
     if not contrasts:
         contrasts = Decision(False, "no gradient moves silhouettes")
     averaging = always if supersampling > 1 else Decision(False, "a pixel has one sample")
     samples = f"{view.samples:,} samples"
     return ImagePlan(
         _stage("exposure", always, varying, samples),
-        _stage("contrasts", contrasts, (), samples),
+        _stage("contrasts", contrasts, view.placed_by, samples),
         _stage("smoothing", always, varying, samples),
         _stage("averaging", averaging, varying, samples),
     )

@@ -22,7 +22,8 @@ from warpshadow.plan import ALBEDO, LIGHT, TEXTURES, Explanation, Ledger, ViewFa
 from warpshadow.raster import Fragments
 from warpshadow.reflectance import Given, Reflectance
 from warpshadow.scene import AUTO, SCENE, Scene
-from warpshadow.silhouette import find_contrasts, smooth_silhouettes
+from warpshadow.silhouette import find_edge_colors, smooth_silhouettes
+from warpshadow.slopes import pull_surfaces
 from warpshadow.tape import unrecorded
 from warpshadow.threads import one_at_a_time
 from warpshadow.views import Prospect, View, Viewer
@@ -294,13 +295,27 @@ class Renderer:
         else:
             reflected = self.reflect(albedo, textures, view)
             with timed(plan.exposure, [lit, reflected, clip_positions]):
-                samples = film.expose(receivers.fragments, receivers.faces, lit, reflected)
-        contrasts = None
+                samples = film.expose(
+                    receivers.fragments, receivers.faces, lit, reflected, at_points=not plan.contrasts
+                )
+        edge_colors = None
         if plan.contrasts:
-            with timed(plan.contrasts):
-                contrasts = find_contrasts(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
+            with timed(plan.contrasts, [clip_positions]):
+                edge_colors = find_edge_colors(
+                    samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected
+                )
+                pull_surfaces(
+                    samples,
+                    receivers.fragments,
+                    receivers.faces,
+                    lit,
+                    reflected,
+                    silhouettes,
+                    edge_colors,
+                    clip_positions,
+                )
         with timed(plan.smoothing, [samples, clip_positions]):
-            smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, contrasts)
+            smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
         if not plan.averaging:
             return smoothed
         with timed(plan.averaging, [smoothed]):

@@ -53,7 +53,7 @@ _SNAP = 1.0 / 2048.0
 _UNKNOWN = -2
 
 # In place of an edge's vertices.
-_NOTHING = -1
+NOTHING = -1
 _INTERSECTION = -2
 
 
@@ -64,9 +64,11 @@ class Silhouettes:
     Args:
         pixels: Index of the pixel in the flat images [batch, height, width], −1 in an entry that is not used, int32 of
             shape [entry].
-        edges: Vertices of the edge between it and its neighbor to the right, left, below and above; (−1, −1) where
-            there is none, (−2, −2) where their faces intersect; vec2i of shape [entry, 4].
+        edges: Vertices a, b of the edge between it and its neighbor to the right, left, below and above, in the order
+            in which the line a × b is positive on its surface; (−1, −1) where there is none, (−2, −2) where their
+            faces intersect; vec2i of shape [entry, 4].
         shares: The area e of the pixel that lies beyond each, and how much it counts, ω; vec2 of shape [entry, 4].
+        entries: Entry of each pixel of the flat images, −1 for none, int32 of shape [pixel].
         fragments: What each pixel sees.
         faces: The rasterized faces, vec3i of shape [face].
     """
@@ -74,6 +76,7 @@ class Silhouettes:
     pixels: wp.array
     edges: wp.array
     shares: wp.array
+    entries: wp.array
     fragments: Fragments
     faces: wp.array
 
@@ -82,7 +85,7 @@ class Silhouettes:
 
 
 @wp.func
-def _center(pixel: int, width: int, height: int):
+def pixel_center(pixel: int, width: int, height: int):
     """Center of a pixel of the flat images, in normalized device coordinates."""
     row = pixel / width
     x = float(2 * (pixel - row * width) + 1 - width) / float(width)
@@ -91,14 +94,29 @@ def _center(pixel: int, width: int, height: int):
 
 
 @wp.func
-def _neighbor(pixel: int, side: int, width: int):
+def neighbor(pixel: int, side: int, width: int):
     """Pixel to the right (side 0), left, below or above."""
     step = wp.where(side < 2, 1, width)
     return pixel + wp.where(side % 2 == 0, step, -step)
 
 
 @wp.func
-def _relative(p: wp.vec4, center: wp.vec2):
+def _opposite(side: int):
+    """The side opposite to a side."""
+    return wp.where(side % 2 == 0, side + 1, side - 1)
+
+
+@wp.func
+def _has_neighbor(pixel: int, side: int, width: int, height: int):
+    """Whether the image goes on to a side of a pixel."""
+    row = pixel / width
+    place = wp.where(side < 2, pixel - row * width, row % height)
+    last = wp.where(side < 2, width, height) - 1
+    return wp.where(side % 2 == 0, place < last, place > 0)
+
+
+@wp.func
+def relative(p: wp.vec4, center: wp.vec2):
     """The x, y and w of a vertex relative to the ray through a point of the screen, so that nothing cancels there."""
     return wp.vec3(p[0] - center[0] * p[3], p[1] - center[1] * p[3], p[3])
 
@@ -106,9 +124,9 @@ def _relative(p: wp.vec4, center: wp.vec2):
 @wp.func
 def _plane(face: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
     """Plane n·(x, y, w) = 1 of a face relative to the ray through a point of the screen; n_w is 1/w there."""
-    a = _relative(clip_positions[face[0]], center)
-    b = _relative(clip_positions[face[1]], center)
-    c = _relative(clip_positions[face[2]], center)
+    a = relative(clip_positions[face[0]], center)
+    b = relative(clip_positions[face[1]], center)
+    c = relative(clip_positions[face[2]], center)
     normal = wp.cross(b - a, c - a)
     return normal / wp.dot(normal, a)
 
@@ -125,16 +143,16 @@ def _line(
     clip_positions: wp.array(dtype=wp.vec4),
 ):
     """The line ℓ between a pixel and its neighbor to a side, relative to the pixel's center."""
-    center = _center(pixel, width, height)
+    center = pixel_center(pixel, width, height)
     if edge[0] >= 0:
-        return wp.cross(_relative(clip_positions[edge[0]], center), _relative(clip_positions[edge[1]], center))
+        return wp.cross(relative(clip_positions[edge[0]], center), relative(clip_positions[edge[1]], center))
     here = faces[face_ids[pixel]]
-    there = faces[face_ids[_neighbor(pixel, side, width)]]
+    there = faces[face_ids[neighbor(pixel, side, width)]]
     return _plane(here, center, clip_positions) - _plane(there, center, clip_positions)
 
 
 @wp.func
-def _distance(line: wp.vec3, side: int, half_size: wp.vec2):
+def distance(line: wp.vec3, side: int, half_size: wp.vec2):
     """Where a line crosses the way from a pixel's center to its neighbor's, t [pixels]."""
     axis = side / 2
     return float(2 * (side % 2) - 1) * half_size[axis] * line[2] / line[axis]
@@ -145,6 +163,12 @@ def _lean(line: wp.vec3, side: int, half_size: wp.vec2):
     """How far along that way a line moves from one row (or column) of pixels to the next, m [pixels]."""
     axis = side / 2
     return wp.abs(line[1 - axis] / line[axis]) * half_size[axis] / half_size[1 - axis]
+
+
+@wp.func
+def ends_before(line: wp.vec3, side: int):
+    """Whether the surface that an edge's line bounds is on a pixel's own side of it, not the neighbor's to a side."""
+    return float(2 * (side % 2) - 1) * line[side / 2] > 0.0
 
 
 # ---------------------------------------------------------------------------------------------------- where they are
@@ -215,8 +239,8 @@ def _end_of_surface(
         for k in range(3):
             p = clip_positions[corners[(k + 1) % 3]]
             q = clip_positions[corners[(k + 2) % 3]]
-            a = _relative(p, end)
-            b = _relative(q, end)
+            a = relative(p, end)
+            b = relative(q, end)
             across_a = a[1 - axis]
             across_b = b[1 - axis]
             if wp.min(across_a, across_b) <= 0.0 and wp.max(across_a, across_b) > 0.0:
@@ -248,14 +272,14 @@ def _silhouette_between(
 
     It is where the nearer one's surface ends; only if that goes on, below the other's, is it where the other's ends.
     """
-    other = _neighbor(pixel, side, width)
+    other = neighbor(pixel, side, width)
     here = face_ids[pixel]
     there = face_ids[other]
     depth_here = _depth(here, barycentrics[pixel], faces, clip_positions)
     depth_there = _depth(there, barycentrics[other], faces, clip_positions)
     axis = side / 2
-    first = _center(pixel, width, height)
-    last = _center(other, width, height)
+    first = pixel_center(pixel, width, height)
+    last = pixel_center(other, width, height)
     margin = _SNAP * (last - first)
     found = int(-1)
     for attempt in range(2):
@@ -282,7 +306,7 @@ def _add_crossing(
     crossing = wp.atomic_add(crossing_count, 0, 1)
     crossings[crossing] = wp.vec4i(pixel, side, edge[0], edge[1])
     claims[pixel] = 2 * crossing
-    claims[_neighbor(pixel, side, width)] = 2 * crossing + 1
+    claims[neighbor(pixel, side, width)] = 2 * crossing + 1
 
 
 @wp.func
@@ -307,7 +331,7 @@ def _add_edge_if_seen(
 
     Several edges do, from both of their faces, so what is between them is kept.
     """
-    if face_ids[pixel] != face_ids[_neighbor(pixel, side, width)]:
+    if face_ids[pixel] != face_ids[neighbor(pixel, side, width)]:
         found = between[side / 2, pixel]
         if found == _UNKNOWN:
             found = _silhouette_between(
@@ -367,6 +391,8 @@ def _find_edges(
         b = clip[edge[1]]
         is_before_near_plane = a[3] > a[2] or b[3] > b[2]
         if is_before_near_plane and _is_silhouette(face, around[k], a, b, volume, faces, neighbors, clip):
+            if volume < 0.0:
+                edge = wp.vec2i(edge[1], edge[0])
             p = _end_on_screen(a, b, half_size)
             q = _end_on_screen(b, a, half_size)
             for axis in range(2):
@@ -418,7 +444,7 @@ def _approach(
     """Whether the face of a pixel's neighbor gets clearly nearer than the pixel's from one to the other."""
     axis = side / 2
     line = _line(pixel, side, wp.vec2i(_INTERSECTION, _INTERSECTION), width, height, face_ids, faces, clip_positions)
-    inverse_depth = _plane(faces[face_ids[pixel]], _center(pixel, width, height), clip_positions)[2]
+    inverse_depth = _plane(faces[face_ids[pixel]], pixel_center(pixel, width, height), clip_positions)[2]
     half_size = wp.where(axis == 0, 0.5 * float(width), 0.5 * float(height))
     opening = float(2 * (side % 2) - 1) * line[axis] / half_size
     return opening > LEAST_OPENING * inverse_depth
@@ -457,7 +483,7 @@ def _find_intersections(
                 clip = clip_positions[batch]
                 for axis in range(2):
                     side = 2 * axis
-                    other = _neighbor(pixel, side, width)
+                    other = neighbor(pixel, side, width)
                     is_last = wp.where(axis == 0, other == (row + 1) * width, other >= (batch + 1) * height * width)
                     differs = not is_last and wp.where(axis == 0, right, below) != surface and face_ids[other] >= 0
                     if differs and _approach(pixel, side, width, height, face_ids, faces, clip):
@@ -480,8 +506,9 @@ def _gather(
     # out
     pixels: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
+    entries: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a crossing: it goes to the entries of its two pixels; pixels and edges are −1 before.
+    """A thread owns a crossing: it goes to the entries of its two pixels; all outputs are −1 before.
 
     If there is an entry for all pixels, it is the pixel's own.
     """
@@ -491,11 +518,13 @@ def _gather(
         side = crossing[1]
         edge = wp.vec2i(crossing[2], crossing[3])
         pixel = crossing[0]
-        other = _neighbor(pixel, side, width)
+        other = neighbor(pixel, side, width)
         entry = wp.where(has_all, pixel, claims[pixel])
         other_entry = wp.where(has_all, other, claims[other])
         pixels[entry] = pixel
         pixels[other_entry] = other
+        entries[pixel] = entry
+        entries[other] = other_entry
         edges[entry, side] = edge
         edges[other_entry, side + 1] = edge
 
@@ -517,12 +546,12 @@ def _measure(
     entry, side = wp.tid()
     edge = edges[entry, side]
     share = wp.vec2()
-    if edge[0] != _NOTHING:
+    if edge[0] != NOTHING:
         pixel = pixels[entry]
         half_size = 0.5 * wp.vec2(float(width), float(height))
         clip = clip_positions[pixel / (width * height)]
         line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
-        t = wp.clamp(_distance(line, side, half_size), 0.0, 1.0)
+        t = wp.clamp(distance(line, side, half_size), 0.0, 1.0)
         lean = _lean(line, side, half_size)
         m = wp.min(lean, 1.0)
         area = float(0.0)
@@ -595,12 +624,13 @@ def find_silhouettes(
     most = crossings.size if has_all else int(crossing_count.numpy()[0])
     entry_count = face_ids.size if has_all else 2 * most
     pixels = wp.full(entry_count, -1, dtype=wp.int32, device=device)
-    edges = wp.full((entry_count, 4), wp.vec2i(_NOTHING, _NOTHING), dtype=wp.vec2i, device=device)
+    edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
+    entries = wp.full(face_ids.size, -1, dtype=wp.int32, device=device)
     wp.launch(
         _gather,
         dim=most,
         inputs=[crossing_count, crossings, claims, width, has_all],
-        outputs=[pixels, edges],
+        outputs=[pixels, edges, entries],
         device=device,
         record_tape=False,
     )
@@ -613,7 +643,7 @@ def find_silhouettes(
         device=device,
         record_tape=False,
     )
-    return Silhouettes(pixels, edges, shares, fragments, faces)
+    return Silhouettes(pixels, edges, shares, entries, fragments, faces)
 
 
 def _strip_count(device: wp.Device) -> int:
@@ -649,15 +679,15 @@ def _measure_adjoint(
     entry, side = wp.tid()
     edge = edges[entry, side]
     seed = adj_areas[entry, side]
-    if edge[0] != _NOTHING and seed != 0.0:
+    if edge[0] != NOTHING and seed != 0.0:
         axis = side / 2
         pixel = pixels[entry]
         batch = pixel / (width * height)
         clip = clip_positions[batch]
         half_size = 0.5 * wp.vec2(float(width), float(height))
-        center = _center(pixel, width, height)
+        center = pixel_center(pixel, width, height)
         line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
-        t = wp.clamp(_distance(line, side, half_size), 0.0, 1.0)
+        t = wp.clamp(distance(line, side, half_size), 0.0, 1.0)
         m = wp.min(_lean(line, side, half_size), 1.0)
         decline = float(0.0)  # of e with t
         if t <= 0.5 * (1.0 - m):
@@ -666,8 +696,8 @@ def _measure_adjoint(
             decline = (0.5 * (1.0 + m) - t) / m
         onward = seed * decline * half_size[axis] * float(2 * (side % 2) - 1)  # gradient by the line's place
         if edge[0] >= 0:
-            across_a = _relative(clip[edge[0]], center)[1 - axis]
-            across_b = _relative(clip[edge[1]], center)[1 - axis]
+            across_a = relative(clip[edge[0]], center)[1 - axis]
+            across_b = relative(clip[edge[1]], center)[1 - axis]
             spread = wp.where(axis == 0, -line[0], line[1])
             pull = onward * _pull(line / line[axis], center)
             wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * pull)
@@ -677,10 +707,10 @@ def _measure_adjoint(
                 at = pixel
                 sign = float(1.0)
                 if end == 1:
-                    at = _neighbor(pixel, side, width)
+                    at = neighbor(pixel, side, width)
                     sign = -1.0
                 corners = faces[face_ids[at]]
-                ray = _center(at, width, height)
+                ray = pixel_center(at, width, height)
                 plane = _plane(corners, ray, clip)
                 pull = sign * onward * (plane[2] / line[axis]) * _pull(plane, ray)
                 for k in range(3):
@@ -717,7 +747,7 @@ def _blend_kernel(dtype: type) -> wp.Kernel:
                     across = wp.where(side < 2, 2, 0)
                     counts = share[1] - _in_common(share, shares[entry, across])
                     counts -= _in_common(share, shares[entry, across + 1])
-                    total += share[0] * counts * (image[instance, _neighbor(pixel, side, width)] - here)
+                    total += share[0] * counts * (image[instance, neighbor(pixel, side, width)] - here)
             smoothed[instance, pixel] = total
 
     return blend
@@ -734,7 +764,8 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
         pixels: wp.array(dtype=wp.int32),
         shares: wp.array2d(dtype=wp.vec2),
         width: int,
-        contrasts: wp.array3d(dtype=dtype),
+        entries: wp.array(dtype=wp.int32),
+        edge_colors: wp.array3d(dtype=dtype),
         adj_smoothed: wp.array2d(dtype=dtype),
         # out
         adj_image: wp.array2d(dtype=dtype),
@@ -748,7 +779,7 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
             for side in range(4):
                 share = shares[entry, side]
                 if share[0] > 0.0:
-                    other = _neighbor(pixel, side, width)
+                    other = neighbor(pixel, side, width)
                     across = wp.where(side < 2, 2, 0)
                     counts = share[1] - _in_common(share, shares[entry, across])
                     counts -= _in_common(share, shares[entry, across + 1])
@@ -757,8 +788,9 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
                         wp.atomic_sub(adj_image, instance, pixel, share[0] * counts * seed)
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, pixel]
-                        if contrasts:
-                            contrast = contrasts[instance, entry, side]
+                        if edge_colors:
+                            beyond = edge_colors[instance, entries[other], _opposite(side)]
+                            contrast = beyond - edge_colors[instance, entry, side]
                         change = inner(seed, contrast)
                         wp.atomic_add(adj_areas, entry, side, counts * change)
                         for k in range(2):
@@ -769,14 +801,13 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def _find_contrasts(
+def _find_edge_colors(
     # in
     image: wp.array2d(dtype=wp.vec4),
     pixels: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     face_ids: wp.array(dtype=wp.int32),
     sides: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array2d(dtype=wp.vec4),
     shading: wp.array2d(dtype=wp.vec3),
@@ -785,7 +816,7 @@ def _find_contrasts(
     width: int,
     height: int,
     # out
-    contrasts: wp.array3d(dtype=wp.vec4),
+    edge_colors: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns an entry's pixel of an image."""
     instance, entry = wp.tid()
@@ -794,38 +825,37 @@ def _find_contrasts(
         batch = pixel / (width * height)
         lit = wp.min(instance + batch, shading.shape[0] - 1)
         reflected = wp.min(instance + batch, albedo.shape[0] - 1)
-        center = _center(pixel, width, height)
+        center = pixel_center(pixel, width, height)
+        half_size = 0.5 * wp.vec2(float(width), float(height))
         clip = clip_positions[batch]
+        here = image[instance, pixel]
         for side in range(4):
             edge = edges[entry, side]
-            if edge[0] != _NOTHING:
-                other = _neighbor(pixel, side, width)
-                here = image[instance, pixel]
-                there = image[instance, other]
-                if edge[0] >= 0:
-                    is_near = _depth(face_ids[pixel], barycentrics[pixel], faces, clip) <= _depth(
-                        face_ids[other], barycentrics[other], faces, clip
-                    )
-                    near = wp.where(is_near, pixel, other)
+            if edge[0] != NOTHING:
+                line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
+                color = here
+                opposite = _opposite(side)
+                if edges[entry, opposite][0] == NOTHING and _has_neighbor(pixel, opposite, width, height):
+                    rise = here - image[instance, neighbor(pixel, opposite, width)]
+                    if rise[3] == 0.0:
+                        color += wp.clamp(distance(line, side, half_size), 0.0, 1.0) * rise
+                if edge[0] >= 0 and ends_before(line, side):
                     back = int(0)
                     if sides:
-                        back = wp.where(sides[near] < faces.shape[0], 0, clip.shape[0])
+                        back = wp.where(sides[pixel] < faces.shape[0], 0, clip.shape[0])
                     first = receivers[back + edge[0]]
                     second = receivers[back + edge[1]]
                     if wp.min(first, second) >= 0:
-                        across_a = _relative(clip[edge[0]], center)[1 - side / 2]
-                        across_b = _relative(clip[edge[1]], center)[1 - side / 2]
+                        across_a = relative(clip[edge[0]], center)[1 - side / 2]
+                        across_b = relative(clip[edge[1]], center)[1 - side / 2]
                         place = wp.clamp(across_a / (across_a - across_b), 0.0, 1.0)
-                        color = wp.lerp(shading[lit, first], shading[lit, second], place)
-                        color = wp.cw_mul(color, albedo[reflected, near % (width * height)])
-                        if wp.isfinite(color):
-                            at_edge = wp.vec4(color[0], color[1], color[2], 1.0)
-                            here = wp.where(is_near, at_edge, here)
-                            there = wp.where(is_near, there, at_edge)
-                contrasts[instance, entry, side] = there - here
+                        received = wp.lerp(shading[lit, first], shading[lit, second], place)
+                        received = wp.cw_mul(received, albedo[reflected, pixel % (width * height)])
+                        color = wp.vec4(received[0], received[1], received[2], 1.0)
+                edge_colors[instance, entry, side] = wp.where(wp.isfinite(color), color, here)
 
 
-def find_contrasts(
+def find_edge_colors(
     image: wp.array,
     silhouettes: Silhouettes,
     clip_positions: wp.array,
@@ -833,9 +863,11 @@ def find_contrasts(
     receivers: wp.array,
     albedo: wp.array,
 ) -> wp.array:
-    """Find how colors differ across silhouettes, the nearer surface's taken at the edge itself.
+    """Find the colors that surfaces have at the edges themselves.
 
-    Shading changes fastest where a surface turns away from the eye: over the last half pixel of a ball, by a tenth.
+    Shading changes fastest where a surface turns away from the eye: over the last half pixel of a ball, by a tenth. So
+    the surface that ends at an edge has the color there that is found between the edge's vertices. What is seen beyond
+    has no vertices there: its color goes on from the pixel beside the edge as it does to that one from the next.
 
     Args:
         image: Color and coverage before smoothing, vec4 of shape [batch, height, width].
@@ -847,25 +879,24 @@ def find_contrasts(
         albedo: Of the samples, vec3 of shape [batch, height, width].
 
     Returns:
-        For each side of each entry the color beyond less that before, vec4 of shape [instance, entry, 4], for
-        :func:`smooth_silhouettes`.
+        For each side of each entry the color at the edge of what the entry's pixel sees, vec4 of shape
+        [instance, entry, 4], for :func:`smooth_silhouettes`.
 
     Not differentiable.
     """
     fragments = silhouettes.fragments
     batch_count, height, width = fragments.face_ids.shape
     instances = (image.shape[0] // batch_count, batch_count * height * width)
-    contrasts = wp.zeros((instances[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
+    edge_colors = wp.zeros((instances[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
     wp.launch(
-        _find_contrasts,
-        dim=contrasts.shape[:2],
+        _find_edge_colors,
+        dim=edge_colors.shape[:2],
         inputs=[
             image.reshape(instances),
             silhouettes.pixels,
             silhouettes.edges,
             fragments.face_ids.flatten(),
             None if fragments.sides is None else fragments.sides.flatten(),
-            fragments.barycentrics.flatten(),
             silhouettes.faces,
             clip_positions,
             shading,
@@ -874,15 +905,15 @@ def find_contrasts(
             width,
             height,
         ],
-        outputs=[contrasts],
+        outputs=[edge_colors],
         device=image.device,
         record_tape=False,
     )
-    return contrasts
+    return edge_colors
 
 
 def smooth_silhouettes(
-    image: wp.array, silhouettes: Silhouettes, clip_positions: wp.array, contrasts: wp.array | None = None
+    image: wp.array, silhouettes: Silhouettes, clip_positions: wp.array, edge_colors: wp.array | None = None
 ) -> wp.array:
     """Smooth an image along silhouettes, by how much of a pixel lies beyond them.
 
@@ -893,7 +924,7 @@ def smooth_silhouettes(
             elsewhere it becomes the coverage.
         silhouettes: Of :func:`find_silhouettes`; if their batch is 1 they serve every image.
         clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
-        contrasts: Of :func:`find_contrasts`, by which edges pull at vertices; by default what pixels differ by.
+        edge_colors: Of :func:`find_edge_colors`, by whose contrast edges pull at vertices; by default what pixels differ by.
 
     Returns:
         Smoothed image, like ``image``; a pixel lies within the range of itself and its four neighbors.
@@ -934,7 +965,7 @@ def smooth_silhouettes(
         wp.launch(
             _blend_adjoint_kernel(image.dtype),
             dim=(instances[0], pixels.size),
-            inputs=[flat, pixels, shares, width, contrasts, flat_smoothed.grad],
+            inputs=[flat, pixels, shares, width, silhouettes.entries, edge_colors, flat_smoothed.grad],
             outputs=[flat.grad, adj_areas],
             device=device,
         )
