@@ -13,7 +13,7 @@ _SAMPLE_COST = 5.0
 
 
 @wp.func
-def received(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
+def light_at(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
     """Shading at a point of a face."""
     result = weights[0] * shading[instance, corners[0]]
     result += weights[1] * shading[instance, corners[1]]
@@ -43,7 +43,7 @@ def _expose(
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         if face >= 0:
-            received = received(faces[face], barycentrics[view, sample], lit, shading)
+            received = light_at(faces[face], barycentrics[view, sample], lit, shading)
             color = wp.cw_mul(received, albedo[reflected, sample])
             samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
 
@@ -87,7 +87,7 @@ def _expose_adjoint(
                     wp.atomic_add(adj_shading, lit, corners[1], weights[1] * adj_received)
                     wp.atomic_add(adj_shading, lit, corners[2], weights[2] * adj_received)
                 if adj_albedo:
-                    received = received(corners, weights, lit, shading)
+                    received = light_at(corners, weights, lit, shading)
                     adj_albedo[reflected, sample] = adj_albedo[reflected, sample] + wp.cw_mul(adj_color, received)
                 if adj_barycentrics:
                     adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + wp.vec3(

@@ -924,7 +924,7 @@ def smooth_silhouettes(
             elsewhere it becomes the coverage.
         silhouettes: Of :func:`find_silhouettes`; if their batch is 1 they serve every image.
         clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
-        edge_colors: Of :func:`find_edge_colors`, by whose contrast edges pull at vertices; by default what pixels differ by.
+        edge_colors: Of :func:`find_edge_colors`, by which edges pull at vertices; by default those of pixels.
 
     Returns:
         Smoothed image, like ``image``; a pixel lies within the range of itself and its four neighbors.
@@ -932,8 +932,8 @@ def smooth_silhouettes(
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
 
-    Differentiable: image, clip_positions. An edge has the color of the pixels beside it, so where shading changes by δ
-    over a pixel there, its gradient is δ/2 off. Without gradient are intersections within one surface, cuts by the near
+    Differentiable: image, clip_positions. Without edge colors an edge has those of the pixels beside it: where shading
+    changes by δ over a pixel there, its gradient is δ/2 off. Without gradient are intersections within one surface, cuts by the near
     plane, and what leaves the image: there is no neighbor to take from.
     """
     fragments = silhouettes.fragments

@@ -15,7 +15,7 @@ the face's own.
 import warp as wp
 
 from warpshadow.batch import rows
-from warpshadow.film import received
+from warpshadow.film import light_at
 from warpshadow.parallel import launch_slices, split_row
 from warpshadow.raster import Fragments, run_length
 from warpshadow.silhouette import (
@@ -57,7 +57,7 @@ def _receive(
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         if face >= 0:
-            light[batch, sample] = received(faces[face], barycentrics[view, sample], lit, shading)
+            light[batch, sample] = light_at(faces[face], barycentrics[view, sample], lit, shading)
 
 
 @wp.func
@@ -217,7 +217,7 @@ def pull_surfaces(
     face_ids = rows(fragments.face_ids)
 
     def adjoint() -> None:
-        light = wp.zeros(rows(samples).shape, dtype=wp.vec3, device=device)
+        light = wp.zeros((samples.shape[0], height * width), dtype=wp.vec3, device=device)
         launch_slices(
             _receive,
             dim=[light.shape[0] * run_count],
