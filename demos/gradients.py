@@ -1,11 +1,13 @@
-"""Compare gradients of the bunny scene's image with central differences of it.
+"""Compare gradients of the bunny scene's image with central differences of it, for images of several sizes.
 
-    python demos/gradients.py
+    python demos/gradients.py [--sizes 32 64 128 256] [--methods directional log-sh none] [--losses 5]
 
 The losses are sums of the image weighted with a few random waves; the parameters the pose of the bunny (turn, shift)
 and that of the camera. The error is the relative L2 of the gradient over all losses and parameters, against differences
-of the same image, and of one with 5 × 5 samples a pixel, which is nearer to the image that there would be without
-pixels. "shadow alone" sees the ground with the bunny out of view.
+of the same image ("own"), and for the pose of one with up to 16 × 16 samples a pixel ("fine"), which is nearer to the
+image that there would be without pixels. Differences reach over half a sample, since over less an image jumps where
+samples flip; in a small image so far that shadows bend on the way, and "fine" is the one to trust. "shadow alone" sees
+the ground with the bunny out of view.
 """
 
 import argparse
@@ -19,17 +21,18 @@ from scenes import bunny_scene
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
-STEPS = {1: 7e-3, 2: 4e-3, 5: 4e-3}
-"""Differences reach over half a sample or so: over less, an image jumps where its samples flip."""
+FINE = 1280
+"""Samples across an image that differences are compared with, as far as 16 in a pixel make as many."""
 
 
-def main(methods: list[str], loss_count: int) -> None:
+def main(methods: list[str], sizes: list[int], loss_count: int) -> None:
     ws.quiet()
     torch.set_num_threads(1)
-    print(f"{'':46}{'own image':>12}{'5 × 5 samples':>16}")
+    print(f"{'':40}" + "".join(f"{f'{size} × {size}':>16}" for size in sizes))
+    print(f"{'':40}" + f"{'own':>9}{'fine':>7}" * len(sizes))
     for method in methods:
         scene = dataclasses.replace(bunny_scene(), visibility=ws.Visibility(method))
-        below = ws.Camera.look_at((1.6, 1.1, -1.2), (1.5, 0, -1.2), up=(0, 0, -1), fov_y=60, size=(96, 96))
+        below = ws.Camera.look_at((1.6, 1.1, -1.2), (1.5, 0, -1.2), up=(0, 0, -1), fov_y=60, size=(256, 256))
         cases: dict[str, tuple[ws.Scene, Callable, list[int]]] = {
             "shadow alone, pose": (dataclasses.replace(scene, camera=below), pose_image, [1]),
             "pose": (scene, pose_image, [1, 2]),
@@ -38,17 +41,31 @@ def main(methods: list[str], loss_count: int) -> None:
         for name, (seen, image_of, sample_counts) in cases.items():
             if method == "none" and "shadow" in name:
                 continue
-            truth = differences(renderer_of(seen, 5), image_of, STEPS[5], loss_count) if name == "pose" else None
+            fine = {
+                size: differences(renderer_of(seen, size, min(16, FINE // size)), image_of, loss_count)
+                for size in sizes
+                if name == "pose"
+            }
             for across in sample_counts:
-                renderer = renderer_of(seen, across)
-                gradient = gradients(renderer, image_of, loss_count)
-                own = relative_error(gradient, differences(renderer, image_of, STEPS[across], loss_count))
-                fine = "" if truth is None else f"{relative_error(gradient, truth):16.1%}"
-                print(f"{f'{method}, {name}, {across} × {across} samples':46}{own:12.1%}{fine}")
+                print(f"{f'{method}, {name}, {across} × {across} samples':40}", end="")
+                for size in sizes:
+                    renderer = renderer_of(seen, size, across)
+                    gradient = gradients(renderer, image_of, loss_count)
+                    own = relative_error(gradient, differences(renderer, image_of, loss_count))
+                    rest = f"{relative_error(gradient, fine[size]):7.1%}" if size in fine else " " * 7
+                    print(f"{own:9.1%}{rest}", end="", flush=True)
+                print()
 
 
-def renderer_of(scene: ws.Scene, across: int) -> TorchRenderer:
-    return TorchRenderer(dataclasses.replace(scene, supersampling=across))
+def renderer_of(scene: ws.Scene, size: int, across: int) -> TorchRenderer:
+    camera = scene.camera.resized(size / scene.camera.width)
+    return TorchRenderer(dataclasses.replace(scene, camera=camera, supersampling=across))
+
+
+def step_of(renderer: TorchRenderer) -> float:
+    """How far a difference reaches to each side [scene units, radians]: half a sample or so."""
+    scene = renderer.renderer.scene
+    return 1.8 / (scene.camera.width * scene.supersampling)
 
 
 def pose_image(renderer: TorchRenderer, values: torch.Tensor) -> torch.Tensor:
@@ -92,8 +109,9 @@ def gradients(renderer: TorchRenderer, image_of: Callable, count: int) -> np.nda
     return np.stack([torch.autograd.grad(value, start, retain_graph=True)[0].numpy() for value in values])
 
 
-def differences(renderer: TorchRenderer, image_of: Callable, step: float, count: int) -> np.ndarray:
+def differences(renderer: TorchRenderer, image_of: Callable, count: int) -> np.ndarray:
     """Central differences of the losses, shape [loss, parameter]."""
+    step = step_of(renderer)
     with torch.no_grad():
         ends = [[losses(image_of(renderer, sign * step * axis), count) for sign in (1, -1)] for axis in torch.eye(6)]
     return np.stack([((right - left) / (2 * step)).numpy() for right, left in ends], axis=-1)
@@ -106,6 +124,7 @@ def relative_error(got: np.ndarray, expected: np.ndarray) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--methods", nargs="+", default=["directional", "log-sh", "none"], help="of visibility")
+    parser.add_argument("--sizes", nargs="+", type=int, default=[32, 64, 128, 256], help="of the images [pixels]")
     parser.add_argument("--losses", type=int, default=5, help="random losses")
     arguments = parser.parse_args()
-    main(arguments.methods, arguments.losses)
+    main(arguments.methods, arguments.sizes, arguments.losses)
