@@ -492,10 +492,12 @@ def _barycentrics_adjoint(
     row = thread * run / width
     for pixel in range(thread * run, (thread + 1) * run):
         face = face_ids[instance, pixel]
-        if face >= 0:
+        adj_weights = adj_barycentrics[instance, pixel]
+        # What is the same at all corners does not depend on the weights, whose sum is 1.
+        if face >= 0 and (adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]):
             i = faces[face]
             ray = _ray(pixel - row * width, row, width, height)
-            pulls = _weights_adjoint(clip[i[0]], clip[i[1]], clip[i[2]], ray, adj_barycentrics[instance, pixel])
+            pulls = _weights_adjoint(clip[i[0]], clip[i[1]], clip[i[2]], ray, adj_weights)
             wp.atomic_add(adj_clip, i[0], wp.vec4(pulls.a[0], pulls.a[1], 0.0, pulls.a[2]))
             wp.atomic_add(adj_clip, i[1], wp.vec4(pulls.b[0], pulls.b[1], 0.0, pulls.b[2]))
             wp.atomic_add(adj_clip, i[2], wp.vec4(pulls.c[0], pulls.c[1], 0.0, pulls.c[2]))

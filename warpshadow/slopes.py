@@ -33,7 +33,7 @@ LEAST_DISTANCE = 0.02
 """Distance of an edge [pixels] below which rounding outweighs how color changes on the way to it."""
 
 _RECEIVE_COST = 5.0
-_SAMPLE_COST = 40.0
+_SAMPLE_COST = 20.0
 """Nanoseconds that a sample takes: what it receives, and how it pulls."""
 
 
@@ -217,7 +217,7 @@ def pull_surfaces(
     face_ids = rows(fragments.face_ids)
 
     def adjoint() -> None:
-        light = wp.zeros((samples.shape[0], height * width), dtype=wp.vec3, device=device)
+        light = wp.empty((samples.shape[0], height * width), dtype=wp.vec3, device=device)
         launch_slices(
             _receive,
             dim=[light.shape[0] * run_count],
