@@ -933,7 +933,7 @@ def smooth_silhouettes(
         ValueError: naming the argument, what it got and what it accepts.
 
     Differentiable: image, clip_positions. Without edge colors an edge has those of the pixels beside it: where shading
-    changes by δ over a pixel there, its gradient is δ/2 off. Without gradient are intersections within one surface, cuts
+    changes by δ over a pixel there, its gradient is δ/2 off. None have intersections within one surface, cuts
     by the near plane, and what leaves the image: there is no neighbor to take from.
     """
     fragments = silhouettes.fragments
