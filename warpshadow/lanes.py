@@ -12,6 +12,7 @@ are, so the width is among the flags. ``python demos/benchmark.py --lanes`` time
 import contextlib
 import functools
 import os
+import sys
 import warnings
 from typing import Any, NamedTuple
 
@@ -147,6 +148,15 @@ def module_options(lanes: int) -> dict[str, Any]:
     Unrolled by Warp, such loops take ten times as long to compile.
     """
     return {"max_unroll": 1} | ({"cpu_compiler_flags": compiler_flags(lanes)} if lanes > 1 else {})
+
+
+@functools.cache
+def use_vector_registers(file: str) -> None:
+    """Give the kernels on chunks of a Python module the flags that follow the CPU, before the first is built.
+
+    Importing the module does not ask for the CPU: that starts Warp.
+    """
+    wp.set_module_options(module_options(CHUNK), sys.modules[file])
 
 
 def group_count(vertex_count: int, lanes: int) -> int:

@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.batch import common_batch
 from warpshadow.directions import CHUNK
-from warpshadow.lanes import Chunk, as_chunks
+from warpshadow.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.parallel import launch_slices, split_row
 from warpshadow.tape import record_adjoint
 
@@ -188,6 +188,8 @@ def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -
         device=device,
         requires_grad=transfer.requires_grad or light.requires_grad,
     )
+    if device.is_cpu:
+        use_vector_registers(__name__)
     channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
     wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
     factors = [transfer, as_chunks(transfer), channels, as_chunks(channels)]

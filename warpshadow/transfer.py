@@ -14,7 +14,16 @@ import warp as wp
 from warpshadow import check, sh
 from warpshadow.constants import constant
 from warpshadow.directions import CHUNK, check_count
-from warpshadow.lanes import Chunk, as_chunks, group_count, lane_count, lane_functions, lane_type, module_options
+from warpshadow.lanes import (
+    Chunk,
+    as_chunks,
+    group_count,
+    lane_count,
+    lane_functions,
+    lane_type,
+    module_options,
+    use_vector_registers,
+)
 from warpshadow.parallel import Scratch, launch_slices, scratch_place, split_row
 from warpshadow.sh_kernels import (
     PRODUCT_COST,
@@ -294,6 +303,8 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         device=device,
         requires_grad=any(variable.requires_grad for variable in variables),
     )
+    if device.is_cpu:
+        use_vector_registers(__name__)
     cost = _CELL_COST * count
     launch_slices(
         _transfer_directions,
