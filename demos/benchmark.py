@@ -43,9 +43,8 @@ from warpshadow.visibility import directional, log_sh
 from warpshadow.visibility.exponential import exponentiate
 
 
-def main(device: str, runs: int) -> None:
-    ws.quiet()
-    torch.set_num_threads(1)  # what torch does here is little, and threads of two libraries wait for each other
+def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
+    """The size of the scene in words, and functions that run its stages once, by what they do."""
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
     positions, centers, radii = renderer.geometry
@@ -142,11 +141,29 @@ def main(device: str, runs: int) -> None:
         "iteration of a pose fit in torch": fit_pose,
         "iteration of 8 pose fits in a batch": fit_poses,
     }
-    vertex_count, sphere_count = points.shape[1], radii.shape[1]
-    if renderer.device.is_cpu:
+    size = f"{points.shape[1]} vertices, {faces.shape[0]} faces, {radii.shape[1]} spheres"
+    return size, rows
+
+
+def measure(device: str, seconds: float) -> dict[str, float]:
+    """Median milliseconds of each stage on a device, on all threads, of as many runs as there is time for, 3 to 15."""
+    _, rows = stages(device)
+    start = time.perf_counter()
+    median_times(list(rows.values()), 1)  # compiles, too
+    median_times(list(rows.values()), 1)
+    runs = int(min(15, max(3, seconds / (time.perf_counter() - start))))
+    return dict(zip(rows, median_times(list(rows.values()), runs), strict=True))
+
+
+def main(device: str, runs: int) -> None:
+    ws.quiet()
+    torch.set_num_threads(1)  # what torch does here is little, and threads of two libraries wait for each other
+    size, rows = stages(device)
+    is_cpu = wp.get_device(device).is_cpu
+    if is_cpu:
         print(cpu_text())
-    print(f"{vertex_count} vertices, {faces.shape[0]} faces, {sphere_count} spheres, {device}, medians of {runs} [ms]")
-    counts = sorted({1, ws.thread_count()}) if renderer.device.is_cpu else [1]
+    print(f"{size}, {device}, medians of {runs} [ms]")
+    counts = sorted({1, ws.thread_count()}) if is_cpu else [1]
     functions = [on_threads(count, function) for function in rows.values() for count in counts]
     flat = median_times(functions, runs)
     ws.set_thread_count(None)

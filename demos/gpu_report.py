@@ -29,6 +29,8 @@ import kernel_floor
 import numpy as np
 import torch
 import warp as wp
+from lane_choice import cpu_text
+from scenes import bunny_scene
 
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices
@@ -164,7 +166,7 @@ def sanitize(device: str, seconds: float) -> str:
 
 def stages(device: str, runs: int = 10) -> list[dict[str, float | str]]:
     """Stages of a pose iteration on the bunny scene: milliseconds, each waited for, and the floors of an H200."""
-    scene = benchmark.bunny_scene()
+    scene = bunny_scene()
     size, rising, reached = kernel_floor.measure(scene)
     floors = {stage.name: stage for stage in kernel_floor.stages(size, rising, reached)}
     items = kernel_floor.counts(size)
@@ -239,9 +241,7 @@ def report(device: str, folder: Path, seconds: float) -> dict:
     part("agreement", lambda: list(agreement(device)))
     part("sanitizer", lambda: sanitize(device, left("sanitizer")))
     part("stages", lambda: stages(device))
-    part(
-        "benchmark", lambda: {name: benchmark.measure(name, seconds=left("benchmark") / 2) for name in ("cpu", device)}
-    )
+    part("benchmark", lambda: {name: benchmark.measure(name, left("benchmark") / 4) for name in ("cpu", device)})
     part("tests", lambda: run_tests(device, left() - 20, folder))
     return result
 
@@ -263,7 +263,7 @@ def faults(result: dict) -> list[str]:
 
 def table(result: dict) -> str:
     """A device's report in Markdown."""
-    lines = [f"### {result['device']} ({result['alias']}) beside {benchmark.cpu_name()}", ""]
+    lines = [f"### {result['device']} ({result['alias']}) beside {cpu_text().splitlines()[0]}", ""]
     for name, part in result.items():
         if isinstance(part, dict) and "error" in part:
             lines += [f"{name}: {part['error']}", ""]

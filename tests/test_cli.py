@@ -260,6 +260,7 @@ def test_tune_chooses_by_time_as_well(scene, quick_tuning):
     assert float(chosen) == min(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("option", "value", "parts"),
     [
@@ -360,6 +361,7 @@ def assert_same(got, expected):
         np.testing.assert_array_equal(values, expected[name])
 
 
+@pytest.mark.slow
 def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_file, tmp_path):
     folder = tmp_path / "out"
     result = run("fit", fit_file, "-o", folder)
@@ -373,6 +375,7 @@ def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_fil
     np.testing.assert_allclose(found(folder).bodies[0].albedo, COLOR, atol=RECOVERED)
 
 
+@pytest.mark.slow
 def test_what_a_fit_writes_can_be_rendered(fit_file, tmp_path):
     run("fit", fit_file, "-o", tmp_path / "out")
     result = run("render", tmp_path / "out" / "scene.toml", "-o", tmp_path / "again.exr")
@@ -381,6 +384,7 @@ def test_what_a_fit_writes_can_be_rendered(fit_file, tmp_path):
     assert np.abs(again - target).max() < 2 * RECOVERED * target.max()
 
 
+@pytest.mark.slow
 def test_fit_recovers_a_color_and_the_exposure_from_a_picture_of_8_bits_under_a_mask(fit_file, tmp_path):
     """Only what stands still in known light has a known color: the ground is known."""
     lines = 'image = "photo.png"\nmask = "mask.png"'
@@ -391,6 +395,7 @@ def test_fit_recovers_a_color_and_the_exposure_from_a_picture_of_8_bits_under_a_
     np.testing.assert_allclose(found(tmp_path / "out").bodies[0].albedo, COLOR, atol=RECOVERED_FROM_8_BITS)
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_done_is_not_done_again(fit_file, tmp_path):
     first = run("fit", fit_file, "-o", tmp_path / "out")
     values = parameters(tmp_path / "out")
@@ -401,6 +406,7 @@ def test_a_fit_that_is_done_is_not_done_again(fit_file, tmp_path):
     assert_same(parameters(tmp_path / "out"), values)
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_says_how_to_go_on_and_ends_where_it_would_have(fit_file, tmp_path, monkeypatch):
     from warpshadow.inverse import checkpoint
 
@@ -436,6 +442,7 @@ def test_a_fit_that_is_interrupted_as_it_writes_its_results_writes_them_the_next
     np.testing.assert_allclose(found(tmp_path / "out").bodies[0].albedo, COLOR, atol=RECOVERED)
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_path, monkeypatch):
     def interrupt(*args, **options):
         raise KeyboardInterrupt
@@ -447,6 +454,7 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
     assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
 
 
+@pytest.mark.slow
 def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_path):
     fit_file.write_text(FIT.replace("iterations = 60", "iterations = 400"))
     folder = tmp_path / "out"
@@ -535,6 +543,7 @@ def test_envmap_refuses_or_repairs_bad_pixels(tmp_path):
     fails("envmap", tmp_path / "square.exr", parts=("square.exr", "twice as wide as high"))
 
 
+@pytest.mark.slow
 def test_spheres_reports_writes_and_draws_the_fit(tmp_path, monkeypatch):
     """Of few steps: how good a fit is, test_spheres.py asks."""
     monkeypatch.setattr("warpshadow.spheres.fit_spheres", functools.partial(ws.fit_spheres, steps=100))
@@ -560,6 +569,7 @@ def test_spheres_refuses_what_it_cannot_read_or_write(tmp_path):
     fails("spheres", mesh, "--error", -1, parts=("error",))
 
 
+@pytest.mark.slow
 def test_warmup_says_when_a_device_is_ready():
     result = run("warmup")
     assert result.exit_code == 0, result.output
@@ -606,6 +616,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_behind(scene, tmp_path, full
     assert {path.name for path in tmp_path.iterdir()} - files_before == {"out.exr"} - {name}
 
 
+@pytest.mark.slow
 def test_spheres_on_a_full_disk_leave_no_file(tmp_path, monkeypatch):
     """Neither the fit that is asked for nor the one that is to be kept: of that, there is a warning."""
     monkeypatch.setattr("warpshadow.spheres.fit_spheres", functools.partial(ws.fit_spheres, steps=100))
@@ -651,6 +662,7 @@ def test_help_lists_every_option(command):
             assert option.upper() in result.stdout.upper()
 
 
+@pytest.mark.slow
 def test_the_module_runs_as_a_program(tmp_path):
     """A process of its own: help and a mistake, without a traceback and without Warp's messages."""
     program = [sys.executable, "-m", "warpshadow"]

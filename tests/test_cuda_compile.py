@@ -29,12 +29,14 @@ def check_ptx(files, kernel_names):
             assert any(".entry" in line and name in line for line in text.splitlines()), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FACTORIES)
 def test_kernels_made_by_factories_compile_for_cuda(name, tmp_path):
     kernel = FACTORIES[name]()
     check_ptx(compile_ptx(kernel.module, ARCHITECTURES, tmp_path), [kernel.func.__name__])
 
 
+@pytest.mark.slow
 def test_kernels_of_files_compile_for_cuda(tmp_path):
     modules = file_modules()
     assert {"warpshadow.shading", "warpshadow.raster", "warpshadow.mesh", "warpshadow.camera"} <= set(modules)

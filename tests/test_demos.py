@@ -41,6 +41,7 @@ def test_the_pure_warp_loop_finds_the_way_to_a_pose():
     assert closer_distance < 0.7 * distance
 
 
+@pytest.mark.slow
 def test_a_shadow_seen_alone_has_the_derivatives_of_central_differences():
     shadow = shadow_gradient.Shadow(SPHERES, 12)
     assert set(np.unique(shadow.renderer.renderer.body_ids())) == {1}

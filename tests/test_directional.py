@@ -81,6 +81,7 @@ def test_transmittance_is_within_0_and_1(seed, sphere_count, scale):
         assert got.min() >= 0 and got.max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [64, 256])
 @pytest.mark.parametrize("distance", [1.0, 1.003, 1.009, 1.02])
 def test_a_lone_sphere_at_its_surface_is_not_culled_where_its_cone_is_wider_than_the_sphere(count, distance, device):

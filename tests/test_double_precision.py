@@ -57,6 +57,7 @@ VERTICES = 1.2 * np.array([[1, 0, -0.6], [-1, 0.1, -0.7], [0.1, -0.2, 1.1], [0.2
 FACES = np.int32([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 
 
+@pytest.mark.slow
 def test_the_build_has_the_digits_of_float64(double, device):
     points, _, centers, radii = (values.astype(np.float64) for values in twins.random_scene(0))
     directions = double("directions").fibonacci(32)
@@ -66,6 +67,7 @@ def test_the_build_has_the_digits_of_float64(double, device):
     np.testing.assert_allclose(got, twins.transmittance(points, centers, radii, directions), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_build_rasterizes_what_the_package_rasterizes(double, device):
     """Depths are sorted by the bits of float32, and so they are here."""
     clip_positions = random(0, 1, 60, 4).astype(np.float32) + np.float32([0, 0, 1, 2])
@@ -157,6 +159,7 @@ def test_transmittance(count, softness, double, device, check, spheres):
     check(lambda p, c, r: transmittance(p, up, c, r, directions, softness=softness), points, *rest)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", ["cap", "eigen"])
 def test_log_visibility(log, double, device, check, spheres):
     accumulate = double("visibility.log_sh").accumulate
@@ -286,6 +289,7 @@ def test_interpolation(double, device, check, clip):
     check(draw, clip, (wp.vec2d, random(0, 1, 4, 2)))
 
 
+@pytest.mark.slow
 def test_textures(double, device, check, clip):
     """Two faces have a texture that repeats and is finer than the picture; two have colors at their vertices."""
     raster, texture = double("raster"), double("texture")
@@ -302,6 +306,7 @@ def test_textures(double, device, check, clip):
     check(reflect, clip, (wp.vec2d, uvs), (wp.vec3d, vertex_albedo), (wp.vec3d, image))
 
 
+@pytest.mark.slow
 def test_upright_silhouettes(double, device, check):
     """Of edges that lean, how the lean changes is left out of the gradient."""
     mesh, raster, silhouette = double("mesh"), double("raster"), double("silhouette")
@@ -368,6 +373,7 @@ def variables(renderer, *arguments):
     return [torch.tensor(values, **options) for values in arguments]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, monkeypatch):

@@ -166,6 +166,7 @@ def test_a_shadow_alone_moves_the_nodes_of_a_deforming_body(method):
 # ---------------------------------------------------------------------------------------------- with silhouettes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("parameters", [Poses, Cameras])
 def test_what_moves_the_image_has_the_gradient_of_the_image(method, parameters):
@@ -222,6 +223,7 @@ def image_of_batch(renderer: TorchRenderer, values: dict[str, torch.Tensor]) -> 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_batch_is_its_instances_one_by_one(method, receivers):
@@ -333,6 +335,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
         assert torch.equal(first, second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, monkeypatch):

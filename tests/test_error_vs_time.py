@@ -91,6 +91,7 @@ def test_the_time_at_an_error_is_read_off_between_what_was_measured_and_continue
         assert time_at_error(times, errors, error) == pytest.approx(2 * (0.4 / error) ** 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_path_tracer_is_compared_at_the_error_of_the_default(ball, monkeypatch):
     """With one that takes 2 ms a sample, and whose noise is known."""
     truth = ws.render(error_vs_time.with_visibility(ball, method="ray-traced", samples=256))
@@ -132,6 +133,7 @@ def test_what_seems_better_than_the_default_is_timed_again_until_none_is_left_in
     assert error_vs_time.better_than(figures[0], figures) == [figures[1]]
 
 
+@pytest.mark.slow
 def test_the_demo_writes_its_figures_and_draws_them(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(error_vs_time.importlib.util, "find_spec", lambda name: None)
     error_vs_time.main(None, tmp_path, runs=1, quick=True)
@@ -153,6 +155,7 @@ def test_the_demo_writes_its_figures_and_draws_them(tmp_path, monkeypatch, capsy
 # ---------------------------------------------------------------------------------------------- parts of the error
 
 
+@pytest.mark.slow
 def test_the_parts_of_the_error_explain_the_whole(parts):
     for of_method in parts.values():
         *others, whole = of_method.values()
@@ -166,6 +169,7 @@ def test_a_ball_is_its_own_sphere_and_a_coarse_ground_interpolates(parts):
     assert directional["vertices"] > 2 * directional["spheres"]
 
 
+@pytest.mark.slow
 def test_worse_spheres_and_fewer_vertices_show_in_their_own_parts(ball, parts):
     small = dataclasses.replace(ball.bodies[0], blockers=ws.Spheres([(0, 0, 0)], [0.7]))
     worse = error_vs_time.error_parts(
@@ -186,6 +190,7 @@ def test_the_exponential_of_log_sh_is_a_small_part_and_its_bands_a_large_one(par
     assert harmonic["exponential"] < 0.01 < harmonic["bands"]
 
 
+@pytest.mark.slow
 def test_rays_that_all_receivers_share_agree_with_the_reference(ball):
     from warpshadow.point_sample import PointSample
 

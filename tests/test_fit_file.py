@@ -119,6 +119,7 @@ def test_stages_that_work_can_be_named(load, name):
     assert fit.stages == make(fit.problem)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lines", "kind", "options"),
     [
@@ -270,6 +271,7 @@ NOT_WHOLE = ('"1"', "true", "[1]", "2.0")
 NOT_TRUE_OR_FALSE = ("1", '"yes"', "[true]")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "key", "values"),
     [

@@ -66,6 +66,7 @@ def test_log_visibility_is_the_golden_one(log, name, golden, device):
     assert (np.linalg.norm(rows - golden[name], axis=1) < LOG_SH_ROW * norms).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log, name", [("cap", "log_sh_cap_eps3"), ("eigen", "log_sh_eigen_delta005")])
 def test_the_float64_twin_is_the_golden_one_to_twelve_digits(log, name, golden):
     values = (golden[key] for key in ("sphere_centers", "sphere_radii"))

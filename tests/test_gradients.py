@@ -87,6 +87,7 @@ def test_the_adjoint_of_transmittance_is_that_of_its_twin(softness, scene, devic
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order, log", [(2, "cap"), (5, "cap"), (8, "cap"), (3, "eigen"), (8, "eigen")])
 def test_the_adjoint_of_accumulation_is_that_of_its_twin(order, log, scene, device):
     check(

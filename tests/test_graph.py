@@ -142,6 +142,7 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, sc
     assert np.abs(expected[2]).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("captures")
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, scene, monkeypatch):

@@ -16,12 +16,14 @@ def modules_after(statement):
     return set(json.loads(output.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_nothing_heavy():
     names = modules_after("import warpshadow")
     assert "warp" in names
     assert not names.intersection(HEAVY)
 
 
+@pytest.mark.slow
 def test_importing_the_package_does_not_start_warp():
     """Which looks for devices and loads its compiler: half a second that a first kernel pays for."""
     script = "import warp, warpshadow; print(warp._src.context.runtime is None)"
@@ -29,6 +31,7 @@ def test_importing_the_package_does_not_start_warp():
     assert run.stdout.splitlines()[-1] == "True"
 
 
+@pytest.mark.slow
 def test_no_stage_imports_anything_heavy():
     stages = ["basis", "blockers", "camera", "directions", "image", "light", "mesh", "raster", "reference", "renderer"]
     stages += ["scene", "sh", "shading", "spheres", "visibility.directional", "visibility.log_sh"]
@@ -36,6 +39,7 @@ def test_no_stage_imports_anything_heavy():
     assert not names.intersection(HEAVY)
 
 
+@pytest.mark.slow
 def test_every_public_name_can_be_imported():
     names = modules_after("from warpshadow import *")
     assert "warpshadow.renderer" in names

@@ -222,6 +222,7 @@ def test_candidates_go_on_from_the_best_of_the_stage_before():
     assert first[0] == fit(problem, [Stage(1)]).losses[0][0]  # the scene's own pose takes part
 
 
+@pytest.mark.slow
 def test_candidates_beyond_the_fourteen_turns_are_drawn_by_the_seed_alone():
     problem = small_problem(Pose(0))
     stages = [Stage(1, candidates=16)]
@@ -322,6 +323,7 @@ def test_a_fit_does_not_depend_on_exposure():
 # ---------------------------------------------------------------------------------------------- stops
 
 
+@pytest.mark.slow
 def test_a_fit_at_its_goal_has_converged_as_soon_as_that_can_be_said():
     scene = small_scene()
     result = fit(Problem(scene, Target(ws.render(scene)), Pose(0), still=None), [Stage(500)], tolerance=1e-3)
@@ -336,6 +338,7 @@ def test_a_loss_of_zero_has_converged():
     assert result.losses[0] == [0.0] * 2 * WINDOW and result.reason == "converged"
 
 
+@pytest.mark.slow
 def test_a_stage_that_has_converged_makes_way_for_the_next():
     scene = small_scene()
     problem = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
@@ -372,6 +375,7 @@ UNBOUNDED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", UNBOUNDED)
 def test_what_becomes_infinite_ends_the_fit_with_the_values_before(case):
     free, optimizer, rate, what = UNBOUNDED[case]
@@ -437,6 +441,7 @@ def dies_after_each_save(monkeypatch):
 ROUNDS = (Stage(3, 0.02, scale=0.5, candidates=3), Stage(2, 0.01, candidates=2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "stages"), [*((name, STAGES) for name in OPTIMIZERS), ("Adam", ROUNDS)], ids=[*OPTIMIZERS, "candidates"]
 )
@@ -469,6 +474,7 @@ def test_a_fit_that_has_ended_is_not_computed_again(tmp_path):
     assert np.array_equal(first.images(), second.images())
 
 
+@pytest.mark.slow
 def test_a_converged_and_a_diverged_fit_stay_so(tmp_path):
     scene = small_scene()
     goal = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
@@ -534,6 +540,7 @@ def long_fit(path: Path | None) -> Result:
     return fit(small_problem(), LONG, optimizer=optimizer, tolerance=0.0, checkpoint=path, checkpoint_seconds=0.0)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_goes_on_in_another_with_the_result_that_it_would_have_had(tmp_path):
     path = tmp_path / "fit.checkpoint"
     command = f"import pathlib, test_inverse_descent as t; t.long_fit(pathlib.Path({str(path)!r}))"

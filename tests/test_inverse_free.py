@@ -173,6 +173,7 @@ def test_what_is_free_says_which_bodies_move(scene, free, expected, monkeypatch)
     assert [geometry and geometry.moving for geometry in given] == [expected]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FREE)
 def test_each_starts_where_the_scene_has_it(scene, dim_scene, case):
     in_cells = case == "light in cells"
@@ -187,6 +188,7 @@ def test_each_starts_where_the_scene_has_it(scene, dim_scene, case):
     assert np.abs(images_of(problem, setting, values)[0] - reference).max() < POSED * reference.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in FREE if case not in ("exposure", "light in cells")])
 def test_the_scene_that_is_found_has_the_images_of_the_fit(scene, case):
     """With values away from the start, seen from two sides."""
@@ -309,6 +311,7 @@ MESHES_MOVE = {"pose", "pose by quaternion", "pose by columns", "deformation", "
 MESHES_MOVE |= {"pose, deformation and radii"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", GRADIENTS)
 def test_the_gradient_of_the_loss_is_its_central_difference(soft_scene, dim_scene, case):
     """Of each number where there are few, and in random directions; where meshes move, of the ground in view.
@@ -384,6 +387,7 @@ RECOVERY = {
 ITERATIONS = 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", RECOVERY)
 def test_each_recovers_the_truth(scene, dim_scene, case):
     free, distance, rate, remains = RECOVERY[case]

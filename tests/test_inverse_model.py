@@ -38,6 +38,7 @@ def lit_problem(light: Light, *, views: int = 1, channels: int = 3, **options) -
     return Problem(scene_of(), targets, light, **{"still": None} | options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("still", [None, ws.Visibility("ray-traced", samples=32)], ids=["spheres", "rays"])
 @pytest.mark.parametrize("reduction", ["mean", "sum"])
 @pytest.mark.parametrize("views", [1, 2])

@@ -412,6 +412,7 @@ def test_fingerprints_do_not_change_with_being_asked_or_made_again_or_with_what_
     assert first.fingerprint() == second.fingerprint()
 
 
+@pytest.mark.slow
 def test_fingerprints_are_those_of_another_process():
     command = "import test_inverse_problem as t; print({n: p.fingerprint() for n, p in t.variations().items()})"
     environment = os.environ | {"PYTHONHASHSEED": "7", "PYTHONPATH": str(Path(__file__).parent)}

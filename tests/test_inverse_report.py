@@ -64,6 +64,7 @@ def rendered_again(folder, result):
     return np.stack(images)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free", "tolerance"),
     [

@@ -78,6 +78,7 @@ def test_an_assembler_that_fails_is_quoted(tmp_path, monkeypatch):
         kernel_report.main(90, 256)
 
 
+@pytest.mark.slow
 def test_the_resources_of_a_module_are_found_by_the_assembler():
     ptxas = kernel_report.find_ptxas()
     if ptxas is None:

@@ -267,6 +267,7 @@ def test_a_constant_map_projects_to_band_zero_and_a_linear_one_to_band_one():
     np.testing.assert_allclose(tilted[1:], expected, atol=PIXELATION)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [1, 2, 3, 4, 16])
 def test_a_constant_map_of_any_height_lights_white_to_its_radiance(height):
     """In whatever light is expressed, for the method in question: "log-sh" and "none", "directional", rays."""

@@ -137,6 +137,7 @@ def test_tiny_caps_keep_their_relative_accuracy(log, order, device):
 # ------------------------------------------------------------------------------------------ sums
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_horizon", [False, True])
 @pytest.mark.parametrize("log", LOGS)
 @pytest.mark.parametrize("order", [2, 4, 8])
@@ -284,6 +285,7 @@ def test_visibility_stays_bounded_however_spheres_overlap(centers, log, device):
 # ------------------------------------------------------------------------------------------ exponentials
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 8])
 @pytest.mark.parametrize("base", BASES)
 def test_exponentials_are_those_of_the_float64_twin(base, order, device):
@@ -297,6 +299,7 @@ def test_exponentials_are_those_of_the_float64_twin(base, order, device):
     assert row_errors(got, expected).max() < EXPONENTIATE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base, error", [("quadratic", 5e-3), ("linear", 5e-3), ("optimal_linear", 5e-2)])
 def test_the_default_threshold_is_near_convergence(base, error, device):
     """Converged: quadratic with a threshold of 1/1000. The errors are the base approximation's, not roundings."""
@@ -344,6 +347,7 @@ def test_a_threshold_beyond_stability_is_refused(base):
             exponentiate(rows, base=base, threshold=threshold)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 def test_the_largest_threshold_allowed_does_not_explode(base, device):
     rows = accumulate(*twins.random_scene(15, sphere_count=100), device).astype(float)

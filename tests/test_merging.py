@@ -40,6 +40,7 @@ def test_quads_are_those_of_the_float64_twin(scale, device):
     np.testing.assert_allclose(nodes.extents.numpy()[0], expected[2], rtol=EXACT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spread", "measured"), [(0.7, 0.92), (1.2, 1.06), (2.5, 1.08)])
 def test_a_quads_sphere_covers_what_its_spheres_do_on_average(spread, measured, device):
     """Discs of random directions, counted at points: of spheres that overlap much, little, and hardly."""
@@ -106,6 +107,7 @@ def put(points, centers, radii, device, **options):
     return [*arrays, wp.array(radii[None], dtype=wp.float32, device=device, **options)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", [0.3, 0.75, 1.0])
 def test_spheres_that_merge_block_what_the_float64_twin_says(tau, device):
     points, centers, radii = many_spheres(4)
@@ -155,6 +157,7 @@ def test_nothing_jumps_while_spheres_merge(device):
     assert np.ptp(seen, axis=0).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["points", "centers", "radii"])
 def test_gradients_of_transmittance_are_those_of_the_float64_twin_while_spheres_merge(name, verified_tape, device):
     points, centers, radii = many_spheres(8, count=512)

@@ -77,6 +77,7 @@ def test_bending_moves_the_top_far_and_the_foot_little(demos):
         assert np.array_equal(bent.faces, mesh.faces)
 
 
+@pytest.mark.slow
 def test_a_fit_is_measured_and_one_that_fails_is_listed(demos, ball_case):
     problems, tables = demos
     figures = tables.solve(ball_case, "directional", None)

@@ -238,6 +238,7 @@ def test_the_environment_says_how_many_threads_run(monkeypatch):
     assert parallel.thread_count() == len(os.sched_getaffinity(0))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_process_has_threads_of_its_own():
     program = """

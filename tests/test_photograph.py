@@ -141,6 +141,7 @@ def truth():
     return ws.Scene((ball, ws.Body(ws.plane(5.0, 20), (0.5, 0.5, 0.5))), sky, camera)
 
 
+@pytest.mark.slow
 def test_exposure_and_place_are_found_in_a_photograph(truth, tmp_path, rng):
     visibility = ws.Visibility(method="ray-traced", samples=256)
     traced = ws.render(dataclasses.replace(truth, visibility=visibility))

@@ -89,6 +89,7 @@ def assert_near(got: np.ndarray, expected: np.ndarray, tolerance: float = FLOAT3
 # ---------------------------------------------------------------------------------------------- views that stand
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", (*METHODS, "ray-traced"))
 def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
     renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
@@ -239,6 +240,7 @@ def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.nda
     return [shading, truth]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_free", [False, True])
 def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
     """Under the sun, too: it is much smaller than a cell."""
@@ -358,6 +360,7 @@ def test_light_of_few_bands_gives_the_image_that_it_gives_with_all_of_them(metho
 # ---------------------------------------------------------------------------------------------- what no longer stands
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_other_bodies_that_move_are_noticed(method):
     renderer = Renderer(scene_of(method))
@@ -562,6 +565,7 @@ def camera_fit(renderer):
 FITS = [texture_fit, light_fit, still_image, pose_fit, one_of_three, light_over_one_of_three, radii_fit, camera_fit]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [True, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fit", FITS)

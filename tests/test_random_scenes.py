@@ -39,6 +39,7 @@ def test_a_scene_is_the_same_in_any_order_and_whatever_the_count():
         assert_same(one, other)
 
 
+@pytest.mark.slow
 def test_a_scene_is_the_same_in_another_process():
     program = (
         "import hashlib; from warpshadow.random_scenes import RandomScenes; scene = RandomScenes(3)[7];"
@@ -146,6 +147,7 @@ def test_arguments_out_of_range_are_named(arguments, message):
         RandomScenes(**arguments)
 
 
+@pytest.mark.slow
 def test_importing_the_module_imports_nothing_heavy():
     program = "import sys, warpshadow.random_scenes; print(sorted({'torch', 'trimesh', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

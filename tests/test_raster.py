@@ -218,6 +218,7 @@ def test_far_strips_are_drawn_once_between_parallel_edges_without_a_vertex_near_
     assert (draw_each_alone(clip, 32, 32, device) == 1).all()
 
 
+@pytest.mark.slow
 def test_thousands_of_tiny_triangles_match_the_twin_and_leave_no_hole(device):
     rng = np.random.default_rng(8)
     corners = grid_patch(rng, 60, -0.5, 16.5, 0.24)  # 7200 faces on 16 x 16 pixels: most hold no center

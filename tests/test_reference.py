@@ -120,6 +120,7 @@ OBJECTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("segments", [1, 64])
 @pytest.mark.parametrize("name", OBJECTS)
 def test_shadows_of_what_touches_a_ground_of_any_size_are_its_own_whatever_its_size(name, segments, device):

@@ -91,6 +91,7 @@ def test_an_unoccluded_white_plane_shows_the_radiance_of_constant_light(device, 
     assert np.abs(image / [0.5, 1, 2, 1] - 1).max() < tolerance
 
 
+@pytest.mark.slow
 def test_the_ground_under_a_ball_gets_what_the_form_factor_leaves(device):
     """A ball of radius r at height h above a point, θ off its normal, blocks cos θ r²/h² of a constant dome."""
     grazing = ws.Camera.look_at((3.5, 0.4, 0), (0, 0, 0), fov_y=10, size=(32, 32))
@@ -107,6 +108,7 @@ def test_the_ground_under_a_ball_gets_what_the_form_factor_leaves(device):
     assert np.abs(shown[:, 0] - expected).max() < facets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", [dome, sunny])
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_images_of_an_exact_sphere_are_near_those_by_rays(device, method, light):
@@ -126,6 +128,7 @@ def test_without_blockers_log_sh_is_no_visibility_at_all(device):
 # ---------------------------------------------------------------------------------------------- bodies without blockers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blockers", [0, ws.Spheres(np.empty((0, 3)), [])], ids=["0", "no spheres"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, blockers):
@@ -406,6 +409,7 @@ def test_two_bodies_are_the_same_as_one_mesh_of_both(device):
 # ---------------------------------------------------------------------------------------------- free light
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("basis", [HarmonicBasis(3), CellBasis(fibonacci(64))], ids=["harmonics", "cells"])
 def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, method, basis):
@@ -421,6 +425,7 @@ def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, metho
     assert error < (0.02 if method == "ray-traced" else 0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [32, 128, 256, 512])
 def test_no_light_is_lost_between_cells_of_different_size(device, count):
     """One cell of light after the other gives all that the method's own 128 cells give."""

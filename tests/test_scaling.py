@@ -23,6 +23,7 @@ def test_exponents_are_those_of_a_power_law_and_the_last_one_of_the_last_two_poi
     assert np.isnan(scaling.exponents(points[:1])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the peak of a call")
 def test_memory_is_what_a_call_takes_at_most_though_it_gives_it_back():
     held = np.ones(2**22)  # 32 MiB that are no part of the call
@@ -47,6 +48,7 @@ def test_a_crowd_stands_on_the_ground_without_touching():
         assert (np.delete(gaps, one) > 0).all()
 
 
+@pytest.mark.slow
 def test_curves_are_measured_printed_and_drawn(tmp_path, monkeypatch, capsys):
     prepared = []
 

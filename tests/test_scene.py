@@ -204,6 +204,7 @@ NOT_WHOLE = ('"1"', "true", "[1]", "2.0", "nan")
 NOT_POSITIVE = ("0", "-1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "key", "values"),
     [

@@ -119,6 +119,7 @@ def test_a_constant_map_of_any_height_projects_to_the_constant_function(height):
     assert np.abs(coefficients[1:]).max() < EXACT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [1, 2, 3, 5])
 @pytest.mark.parametrize("order", [1, 2, 8, 12])
 def test_a_map_projects_to_the_integral_over_what_its_pixels_cover(height, order):

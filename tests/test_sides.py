@@ -118,6 +118,7 @@ def test_a_sheet_under_half_a_sky_is_lit_above_and_dark_below_however_it_winds(m
             assert np.abs(image[..., 0] / albedo - expected).max() < HALF_LIGHT[method]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [ABOVE, BELOW, INSIDE])
 @pytest.mark.parametrize("receivers", RECEIVERS)
 @pytest.mark.parametrize("method", METHODS)
@@ -141,6 +142,7 @@ def test_free_light_falls_on_backs_as_known_light_does(method):
     assert_near(images[0], Renderer(bowl_scene(method)).draw(coefficients).numpy(), 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", RECEIVERS)
 @pytest.mark.parametrize("method", METHODS)
 def test_cameras_see_both_sides_of_a_surface_at_once(method, receivers):
@@ -170,6 +172,7 @@ def test_instances_see_both_sides_of_a_surface_at_once(method, receivers):
         assert_near(together[instance], draw(turns[instance : instance + 1]).reshape(together[0].shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_free", [False, True])
 @pytest.mark.parametrize("moving", [[0], [1]])
 @pytest.mark.parametrize("method", SMOOTH_METHODS)
@@ -283,6 +286,7 @@ class Motion:
         return (ends[0] - ends[1]) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [None, [0]])
 @pytest.mark.parametrize("receivers", RECEIVERS)
 @pytest.mark.parametrize("method", SMOOTH_METHODS)
@@ -296,6 +300,7 @@ def test_how_an_open_mesh_winds_does_not_matter_to_gradients(method, receivers, 
         assert gradient.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", RECEIVERS)
 @pytest.mark.parametrize("method", SMOOTH_METHODS)
 def test_gradients_of_backs_are_central_differences_of_the_image(method, receivers):

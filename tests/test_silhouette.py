@@ -185,6 +185,7 @@ def test_a_smoothed_image_is_that_of_the_twin(dtype, channels, small, device, po
     np.testing.assert_allclose(smoothed, twin(image, small, at_rest, at_rest), atol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_gradients_are_central_differences_of_the_twin(small, device, verified_tape, poisoned_outputs):
     rng = np.random.default_rng(1)
     image, weights, other_image = rng.normal(size=(3, 22, 26, 3))
@@ -588,6 +589,7 @@ def motion(request, device):
     return SimpleNamespace(smoothed=smoothed, averaged=averaged, differences=differences)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("image", ["smoothed", "averaged"])
 def test_gradients_of_motion_are_differences_of_the_image(image, motion):
     """Of the smoothed image itself, and of one with 64 samples a pixel, on average over directions."""

@@ -154,6 +154,7 @@ def test_the_energy_of_a_cover_and_its_gradient_agree_with_float64(device):
     np.testing.assert_allclose(gradient, expected, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_descent_covers_more_of_the_surface_and_leaves_the_mesh_less(device):
     mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
     start, _ = stage_1.greedy_cover(mesh, 12, rng)
@@ -163,6 +164,7 @@ def test_descent_covers_more_of_the_surface_and_leaves_the_mesh_less(device):
     assert after < 0.6 * before
 
 
+@pytest.mark.slow
 def test_without_refinement_a_fit_covers_a_mesh_and_stays_in_it():
     """On the box, that a few large and many small spheres fill."""
     report = fit_spheres(box(), 64, refine=False, cache=False, progress=False).report
@@ -173,6 +175,7 @@ def test_without_refinement_a_fit_covers_a_mesh_and_stays_in_it():
 # ------------------------------------------------------------------------------ stage 2
 
 
+@pytest.mark.slow
 def test_soft_transmittance_and_loss_agree_with_float64(refinement):
     fit, spheres = refinement
     chosen = np.arange(0, fit.RECEIVERS, 97)
@@ -183,6 +186,7 @@ def test_soft_transmittance_and_loss_agree_with_float64(refinement):
     np.testing.assert_allclose(got, twin_transmittance(points, directions, spheres, width), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
     fit, spheres = refinement
     chosen = np.arange(0, fit.RECEIVERS, 61)
@@ -275,6 +279,7 @@ def test_spheres_that_are_none_are_refused(make, message):
 # ------------------------------------------------------------------------------ fits
 
 
+@pytest.mark.slow
 def test_a_ball_is_one_sphere():
     fit = fit_spheres(icosphere(2.0, 3), 1, **{**QUICK, "steps": 300})
     assert fit.spheres.radii[0] == pytest.approx(2.0, rel=0.03)
@@ -283,6 +288,7 @@ def test_a_ball_is_one_sphere():
     assert fit.report.visibility_error < 0.03
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, short_cover):
     options = {**QUICK, "steps": 120, "device": device}  # enough for spheres to be relocated
     first, second = (fit_spheres(bumpy(), 10, **options).spheres for _ in range(2))
@@ -292,6 +298,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, shor
     assert not np.array_equal(first.centers, other.centers)
 
 
+@pytest.mark.slow
 def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
     mesh = bumpy()
     moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
@@ -303,6 +310,7 @@ def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
     np.testing.assert_array_equal(4 * here.centers, fit_spheres(power, 10, **options).spheres.centers)
 
 
+@pytest.mark.slow
 def test_refinement_and_more_spheres_lower_the_error(short_cover):
     cover = fit_spheres(bumpy(), 16, **{**QUICK, "refine": False}).report
     few, some, many = (fit_spheres(bumpy(), count, **{**QUICK, "steps": 200}).report for count in (4, 16, 40))
@@ -310,12 +318,14 @@ def test_refinement_and_more_spheres_lower_the_error(short_cover):
     assert few.visibility_error > some.visibility_error > many.visibility_error
 
 
+@pytest.mark.slow
 def test_a_requested_error_is_met_with_as_few_spheres_as_needed(short_cover):
     fit = fit_spheres(bumpy(), error=0.06, **{**QUICK, "steps": 150})
     assert fit.report.visibility_error <= 0.06
     assert fit.report.sphere_count == len(fit.spheres) <= 64
 
 
+@pytest.mark.slow
 def test_open_and_multi_part_meshes_are_fitted(short_cover):
     ball = icosphere(1.0, 3)
     bowl = Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0])
@@ -368,6 +378,7 @@ def test_a_mesh_without_surface_is_refused():
 # ------------------------------------------------------------------------------ cache and picture
 
 
+@pytest.mark.slow
 def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch, short_cover):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     options = {**QUICK, "cache": True, "steps": 5}
@@ -387,6 +398,7 @@ def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tm
     assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
 def test_fits_in_a_folder_that_is_shared_can_be_read_by_others(tmp_path, monkeypatch, short_cover):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
@@ -415,6 +427,7 @@ def test_the_picture_of_a_fit_is_written(tmp_path):
 # ------------------------------------------------------------------------------ accuracy and portability
 
 
+@pytest.mark.slow
 def test_64_spheres_on_the_bunny_meet_the_targets():
     pytest.importorskip("pxr", reason="reading bunny.usd takes usd-core")
     import warp.examples

@@ -81,6 +81,7 @@ def assert_finite(values, gradients):
 SCENES = twins.hard_scenes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [16, 64, 256])
 @pytest.mark.parametrize("case", SCENES)
 def test_transmittance_and_its_gradient_are_the_twins_in_hard_scenes(case, count, device):
@@ -91,6 +92,7 @@ def test_transmittance_and_its_gradient_are_the_twins_in_hard_scenes(case, count
     assert errors.gradient < (OFFSET_GRADIENT if "offset" in case else GRADIENT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", LOGS)
 @pytest.mark.parametrize("case", SCENES)
 def test_log_sh_visibility_and_its_gradient_are_the_twins_in_hard_scenes_at_every_order(case, log, device):
@@ -104,6 +106,7 @@ def test_log_sh_visibility_and_its_gradient_are_the_twins_in_hard_scenes_at_ever
         assert errors.gradient < (OFFSET_GRADIENT if "offset" in case else corner)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("order", ORDERS)
 def test_every_base_gives_the_twins_visibility_in_hard_scenes(order, base, device):
@@ -148,6 +151,7 @@ def test_far_from_the_origin_the_error_is_that_of_rounding_positions_alone(label
 # ------------------------------------------------------------------------------------------ overlap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 10, 100, 1000, 10000])
 def test_any_number_of_spheres_in_one_direction_is_bounded_with_finite_gradients(depth, device):
     points, normals, centers, radii = twins.stacked_spheres(depth)
@@ -197,6 +201,7 @@ def test_held_squarings_draw_a_warning_and_plain_ones_none(device, recwarn):
         exponential.exponentiate(put(300 * one, wp.float32, device))
 
 
+@pytest.mark.slow
 def test_plain_squaring_would_have_overflowed_where_held_squaring_is_good():
     """What the README says of overlap."""
     errors = stability.overlap_errors()
@@ -228,6 +233,7 @@ def vectors(count, numbers=NUMBERS):
     return arrays(np.float32, (count, 3), elements=numbers)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     points=vectors(4),

@@ -550,6 +550,7 @@ def test_uvs_of_no_place_are_refused(device):
 # ---------------------------------------------------------------------------------------------------- gradients
 
 
+@pytest.mark.slow
 def test_gradients_of_reflectance_are_central_differences_of_the_twin(device, verified_tape):
     """By what reflects, and by where on its texture and how wide a sample is: through the choice of levels, too."""
     bodies = Bodies(device)
@@ -573,6 +574,7 @@ def test_gradients_of_reflectance_are_central_differences_of_the_twin(device, ve
         assert relative(np.array(got), np.array(expected)) < GRADIENT, number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lights", [1, 2])
 def test_samples_exposed_at_once_are_albedo_times_what_they_receive_both_ways(device, poisoned_outputs, lights):
     """Against the twin in float64, in which they are linear in what reflects, and so exact differences."""
@@ -726,6 +728,7 @@ def test_a_texture_fit_leaves_no_holes(device):
     assert (weights[0][in_view] == 0).mean() > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("texels_a_sample", [1.0, 1.4, 2.0, 2.7, 4.0, 5.7])
 @pytest.mark.parametrize("tilt", [0.0, 0.8, 1.3])
 def test_no_texel_between_samples_is_missed(device, texels_a_sample, tilt):

@@ -190,6 +190,7 @@ def test_a_tape_of_warp_around_a_tensor_function_goes_on_after_it():
     assert t.grad == 10 and x.grad.numpy() == 6
 
 
+@pytest.mark.slow
 def test_fits_of_spheres_are_beside_the_tape():
     """A pose that requires a gradient is often what asks for the spheres first."""
     with wp.Tape() as recording:
@@ -201,6 +202,7 @@ def test_fits_of_spheres_are_beside_the_tape():
 # ---------------------------------------------------------------------------------------------- images
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_threads_that_share_a_renderer_each_see_what_they_ask_for(method, restless):
     """One body moves, so the renderer keeps what stands still, for the last camera."""

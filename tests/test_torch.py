@@ -159,6 +159,7 @@ def test_a_plain_tuple_is_a_geometry(renderer):
 # ---------------------------------------------------------------------------------------------- gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["light", "color", "vertices", "texture"])
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients_are_central_differences(method, name):
@@ -201,6 +202,7 @@ def test_forward_and_backward_are_adjoint(device, name):
     assert abs(left.item() - right.item()) < DIFFERENCE * abs(left.item())
 
 
+@pytest.mark.slow
 def test_all_inputs_can_be_free_at_once(renderer):
     values = inputs_of(renderer)
     image_of(renderer, "vertices", values).square().sum().backward()
@@ -465,6 +467,7 @@ def test_placed_refuses_what_is_no_rotation_and_takes_what_a_step_leaves_of_one(
     renderer.placed(stepped, translations, scales)
 
 
+@pytest.mark.slow
 def test_nine_free_numbers_descend_to_a_rotation(renderer):
     """The nearest rotation is taken of them, which need not be one; they are found by their gradient."""
     wanted = rotation_matrices(torch.tensor([[0.3, -0.5, 0.2], [0.0, 0.1, 0.0]]))
@@ -483,6 +486,7 @@ def test_nine_free_numbers_descend_to_a_rotation(renderer):
 # ---------------------------------------------------------------------------------------------- over time
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from Linux's /proc")
 def test_memory_does_not_grow_over_iterations(renderer):
     values = inputs_of(renderer)
@@ -500,6 +504,7 @@ def test_memory_does_not_grow_over_iterations(renderer):
     assert grown < 20e6, f"{grown / 1e6:.0f} MB more after 1000 iterations of 0.6 MB"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from Linux's /proc")
 def test_memory_does_not_grow_while_bodies_move(renderer):
     rotations, translations, scales = renderer.scene_poses()
@@ -516,6 +521,7 @@ def test_memory_does_not_grow_while_bodies_move(renderer):
     assert grown < 20e6, f"{grown / 1e6:.0f} MB more after 1000 iterations"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_light_is_recovered_from_an_image(method):
     """Adam explains the image; a second-order method on this least-squares problem finds the light itself."""
@@ -591,6 +597,7 @@ def parallel_step(rank: int, world_size: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch has no torch.distributed")
 def test_two_processes_train_as_one(tmp_path):
     """DistributedDataParallel averages gradients that went through the renderer."""

@@ -82,6 +82,7 @@ def test_a_mirrored_image_is_that_of_mirrored_light():
     assert np.abs(image - other).max() > 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("through", ["directional", "none"])
 def test_training_lessens_the_difference_of_the_images(lessons, through, tmp_path):
     def loss_after(epochs):
@@ -175,6 +176,7 @@ demo.part(team)
 """
 
 
+@pytest.mark.slow
 def test_two_processes_learn_the_same_as_one_and_resume_together(lessons, tmp_path):
     """A batch of all scenes has the same gradient wherever its halves are computed, up to rounding."""
     program = tmp_path / "program.py"
@@ -199,6 +201,7 @@ def test_errors_of_light_are_those_of_the_sky_alone():
     np.testing.assert_allclose(demo.light_errors(lights, truths), [0, 0.5, 2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_whole_demo_judges_and_draws(tmp_path, capsys):
     pytest.importorskip("pxr", reason="the bunny is a USD file")
     demo.main(tmp_path, scenes=2, epochs=1, held_out=1, size=16, bodies=[SPHERE], picture_size=48)

@@ -30,6 +30,7 @@ def clamped_cosines(order, normals):
     return twins.turned(np.pi * (weight * z) @ twins.zonal_values(order, z) / np.pi, normals.astype(float))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [16, 1])
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_sh_transfer_is_the_product_of_visibility_and_cosine(order, lanes, monkeypatch, device):
@@ -53,6 +54,7 @@ def test_unblocked_sh_transfer_is_the_cosine_and_that_of_full_visibility(order, 
     assert np.abs(sh_transfer(full, on_device, order=order).numpy() - free).max() < FLOAT32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_shadowed", [True, False])
 @pytest.mark.parametrize("lanes", [16, 1])
 @pytest.mark.parametrize(("order", "bands"), [(2, 1), (5, 2), (8, 1), (8, 3), (8, 7)])

@@ -112,6 +112,7 @@ def test_where_nothing_is_accurate_enough_a_hair_of_accuracy_is_not_worth_the_ti
     assert tuning._nearest(trials).error == expected
 
 
+@pytest.mark.slow
 def test_numbers_of_spheres_that_were_not_tried_are_told(instant, fitted, monkeypatch):
     monkeypatch.setattr(tuning, "is_fitted", lambda mesh, count, **_: count in (16, 64))
     assert ws.tune(asking(24), error=1e-9).untried_counts == (32, 128, 256, 512)
@@ -179,6 +180,7 @@ def test_only_spheres_that_were_fitted_before_are_tried_unless_fits_are_wanted(i
     assert counts == {24, *tuning.SPHERE_COUNTS}
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_kept_is_known_to_be(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     mesh = ws.icosphere(1.0, 1)
