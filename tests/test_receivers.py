@@ -76,7 +76,7 @@ def test_vertices_of_seen_faces_and_of_edges_at_silhouettes_have_a_part_in_the_i
     face_ids = wp.array([[[-1, 1, 1]], [[-1, -1, -1]]], dtype=wp.int32, device=device)
     edges = wp.array([[(-1, -1), (-2, -2), (7, 0), (-1, -1)]], dtype=wp.vec2i, device=device)
     fragments = Fragments(face_ids, None)
-    seen = seen_vertices(fragments, Silhouettes(None, edges, None, fragments, faces), 9)
+    seen = seen_vertices(fragments, Silhouettes(None, edges, None, None, fragments, faces), 9)
     np.testing.assert_array_equal(np.argwhere(seen), [[0, vertex] for vertex in (0, 2, 3, 4, 7)])
 
 
