@@ -55,12 +55,14 @@ FLOORS = {
     "clip positions": ["project"],
     "rasterization": ["rasterize", "visible faces, barycentrics"],
     "silhouettes": ["silhouettes found", "silhouettes listed"],
+    "sides": ["sides"],
     "normals": ["normals"],
     "visibility": ["visibility, directional"],
     "transfer": ["transfer, directional"],
     "shading": ["shading, directional"],
     "reflectance": ["albedo"],
     "exposure": ["exposed"],
+    "contrasts": ["slopes"],
     "smoothing": ["contrasts and smoothing"],
 }
 """Stages as a renderer explains them, and as ``kernel_floor.py`` counts them."""

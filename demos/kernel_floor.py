@@ -63,6 +63,7 @@ class Size(NamedTuple):
     spheres: int
     directions: int
     samples: int
+    open_faces: int = 0  # of bodies that are not closed
 
 
 def stages(size: Size, rising: float, reached: float) -> list[Stage]:
@@ -91,6 +92,7 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
             Work(0, 0, 0),
         ),
         Stage("visible faces, barycentrics", "sample", Work(45 + SPECIAL, 40, 4), Work(80 + SPECIAL, 28, 1)),
+        Stage("sides", "open face", Work(40, 12 + 36 + 4, 1), Work(0, 0, 0)),
         Stage("normals", "vertex", Work(20 * faces_per_vertex + 30, 48 + 12 * faces_per_vertex, 3), Work(100, 84, 2)),
         Stage("silhouettes found", "vertex", Work(120 * faces_per_vertex, 24 * faces_per_vertex, 2), Work(0, 0, 0)),
         Stage("silhouettes listed", "sample", Work(20, 4 + 2 * 32 + 2 * 4 + 3 * 32, 6), Work(0, 0, 0)),
@@ -100,6 +102,7 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
         Stage("albedo", "sample", Work(15, 40, 2), Work(15, 40, 1)),
         Stage("exposed", "sample", Work(20, 60, 3), Work(45, 92, 1)),
         Stage("contrasts and smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 5), Work(60, 64 + 2 * 16 + 64, 5)),
+        Stage("slopes", "sample", Work(0, 0, 0), Work(160 + 6 * SPECIAL, 28 + 84, 2)),
         Stage("loss", "sample", Work(8, 32, 2), Work(8, 48, 4)),
         Stage("visibility, log-SH sum", "pair", Work(harmonic_pair, 0, 1), Work(2.5 * harmonic_pair, 0, 1)),
         Stage(
@@ -122,6 +125,7 @@ def counts(size: Size) -> dict[str, int]:
         "receiver": size.vertices,
         "pair": size.vertices * size.spheres,
         "sample": size.samples,
+        "open face": size.open_faces,
         "texel": 256 * 256,
     }
 
@@ -188,7 +192,10 @@ def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)
     vertex_count, sphere_count = arrays[0].shape[1], arrays[3].shape[1]
     face_count, sample_count = renderer.assembly.faces.shape[0], scene.camera.width * scene.camera.height
-    return Size(vertex_count, face_count, sphere_count, len(directions), sample_count), *shares
+    size = Size(
+        vertex_count, face_count, sphere_count, len(directions), sample_count, renderer.assembly.two_sided_faces.size
+    )
+    return size, *shares
 
 
 def main(batches: list[int]) -> None:

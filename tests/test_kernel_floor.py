@@ -70,7 +70,7 @@ def test_the_scene_is_measured():
     camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(8, 6))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 4), blockers=0)), ws.synthetic_sky(height=16), camera)
     size, rising, reached = kernel_floor.measure(scene)
-    assert size == Size(42 + 25, 80 + 32, 1, 128, 48)
+    assert size == Size(42 + 25, 80 + 32, 1, 128, 48, open_faces=32)
     assert 0 < reached < rising <= 1
 
 

@@ -1,6 +1,6 @@
 """Motion: rigid poses of bodies and embedded deformation, of vertices and spheres together.
 
-Arrays at rest have no batch dimension; what moves has one: an instance for every pose.
+Vertices and nodes of a graph at rest have no batch dimension; what moves has one: an instance for every pose.
 """
 
 import itertools
@@ -418,6 +418,7 @@ class DeformationGraph:
             wp.array(weights.astype(np.float32), device=device),
         )
 
+    @one_at_a_time
     def points(self, matrices: wp.array, translations: wp.array) -> wp.array:
         """Deform the bound points.
 
@@ -434,12 +435,14 @@ class DeformationGraph:
         inputs = [self.rest, self.nodes, self.weights, self.node_positions, matrices, translations]
         return _launch(_deform_points, (matrices.shape[0], self.rest.shape[0]), wp.vec3, inputs)
 
+    @one_at_a_time
     def centers(self, translations: wp.array) -> wp.array:
         """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
         check.finite_arrays({"translations": translations})
         return _launch(_move_nodes, translations.shape, wp.vec3, [self.node_positions, translations])
 
+    @one_at_a_time
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
         """As-rigid-as-possible energy Σ |M_j (g_k − g_j) + g_j + t_j − (g_k + t_k)|² over neighbors (E_reg of Sumner).
 
@@ -452,6 +455,7 @@ class DeformationGraph:
         inputs = [self.node_positions, self.neighbors, matrices, translations]
         return _energy("matrices, translations", _sum_rigidity, (len(matrices), len(self.neighbors)), inputs)
 
+    @one_at_a_time
     def shear(self, matrices: wp.array) -> wp.array:
         """How far the matrices are from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
 

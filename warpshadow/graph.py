@@ -25,6 +25,7 @@ import warp as wp
 
 from warpshadow.constants import collected
 from warpshadow.tape import recorded
+from warpshadow.threads import one_at_a_time
 
 Result = TypeVar("Result")
 
@@ -62,6 +63,7 @@ class Captured(Generic[Result]):
         self._has_run = False
         self._captured: tuple[wp.Graph, Result, list[wp.array]] | None = None
 
+    @one_at_a_time
     def __call__(self) -> Result:
         """Call or replay it; the captured call's result is written anew by each replay."""
         if not is_captured(self._device) or not self._has_run:

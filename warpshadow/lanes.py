@@ -39,9 +39,9 @@ _HOST_FLAG = "-march=native"
 _WHOLE_LOOPS = ("-fno-unroll-loops", "-fno-slp-vectorize")
 """Flags that leave loops alone, so that one over lanes becomes a vector instruction.
 
-Unrolled by the compiler, loops are put together again as far as it finds what belongs together: on a Zen 4, 16 lanes
-take 1.2 to 1.7 times as long then. But a loop of more than a register stays in memory unless it is unrolled, and takes
-four to eight times as long.
+A loop that the compiler unrolls is vectorized again only in part: on a Zen 4, 16 lanes take 1.2 to 1.7 times as long.
+But a loop wider than a register has to be unrolled: otherwise its values stay in memory, and it takes four to eight
+times as long.
 """
 
 
@@ -151,12 +151,12 @@ def module_options(lanes: int) -> dict[str, Any]:
 
 
 @functools.cache
-def use_vector_registers(file: str) -> None:
+def use_vector_registers(module_name: str) -> None:
     """Give the kernels on chunks of a Python module the flags that follow the CPU, before the first is built.
 
     Importing the module does not ask for the CPU: that starts Warp.
     """
-    wp.set_module_options(module_options(CHUNK), sys.modules[file])
+    wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
 
 
 def group_count(vertex_count: int, lanes: int) -> int:

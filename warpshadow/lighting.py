@@ -296,7 +296,7 @@ class Lighting:
     def _transfers(
         self, plan: LightingPlan, groups: list[_Group], terms: _Terms, *, continues: bool = False
     ) -> list[wp.array]:
-        """Transfer vectors of groups in some terms; where kept cells have the light in them, what moves lets pass."""
+        """Transfer vectors of groups in some terms; where kept cells hold the light, transmittance of moving bodies."""
         groups = [_in_step(group) for group in groups]
         seen = []
         for group in groups:

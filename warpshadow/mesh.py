@@ -572,7 +572,8 @@ def _volume(positions: np.ndarray, faces: np.ndarray) -> float:
 def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     """Faces to turn over, as few as can be, so that neighbors wind alike, bool of shape [face].
 
-    Each face is there twice, as it is and turned over, and joined to what winds alike: a piece of the mesh becomes two.
+    A graph has two nodes a face, "as it is" and "turned over". Nodes of neighbors that wind alike are joined, so each
+    piece of the mesh is there in both windings; the one that turns fewer faces over is taken.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -286,7 +286,7 @@ class ReflectancePlan(Plan):
 
 
 def exposes_albedo(varying: Collection[str]) -> bool:
-    """Whether textures vary, and nothing else does but albedo: samples are exposed as it is found what they reflect."""
+    """Whether only textures, and maybe albedo, need gradients: one kernel then samples textures and exposes."""
     return TEXTURES in varying and not set(varying) - {ALBEDO, TEXTURES}
 
 

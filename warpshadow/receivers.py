@@ -23,7 +23,7 @@ class Receivers(NamedTuple):
     normals: wp.array  # [batch, receiver − still] vec3
     faces: wp.array  # [face or side + own] vec3i, indices of receivers
     of_vertices: wp.array  # [vertex, and their backs if any is seen] int32, -1 for none
-    fragments: Fragments  # a sample with a receiver of its own sees one of the added faces, whose corners are all it
+    fragments: Fragments  # pixel receivers add a degenerate face (r, r, r) each, which its sample sees
     still: np.ndarray = np.empty(0, int)  # [still], vertices that are the first receivers; points are of those after
 
 

@@ -167,7 +167,7 @@ def _lean(line: wp.vec3, side: int, half_size: wp.vec2):
 
 @wp.func
 def ends_before(line: wp.vec3, side: int):
-    """Whether the surface that an edge's line bounds is on a pixel's own side of it, not the neighbor's to a side."""
+    """Whether an edge bounds the surface of the pixel itself, not that of its neighbor to a side."""
     return float(2 * (side % 2) - 1) * line[side / 2] > 0.0
 
 
@@ -719,7 +719,7 @@ def _measure_adjoint(
 
 @wp.func
 def _in_common(share: wp.vec2, across: wp.vec2):
-    """Half of what an area has in common with one across it, a part of the former."""
+    """Half of the overlap of two areas beyond neighboring edges, as a fraction of the first."""
     return 0.5 * wp.max(share[1] + across[1] - 1.0, 0.0) * across[0]
 
 
@@ -771,7 +771,7 @@ def _blend_adjoint_kernel(dtype: type) -> wp.Kernel:
         adj_image: wp.array2d(dtype=dtype),
         adj_areas: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns an entry's pixel of an image; what it kept of its own color is in the gradient before."""
+        """A thread owns an entry's pixel of an image; ``adj_image`` already holds the part by the pixel's own color."""
         instance, entry = wp.tid()
         pixel = pixels[entry]
         if pixel >= 0:
@@ -866,8 +866,8 @@ def find_edge_colors(
     """Find the colors that surfaces have at the edges themselves.
 
     Shading changes fastest where a surface turns away from the eye: over the last half pixel of a ball, by a tenth. So
-    the surface that ends at an edge has the color there that is found between the edge's vertices. What is seen beyond
-    has no vertices there: its color goes on from the pixel beside the edge as it does to that one from the next.
+    the color of the near surface, which ends at the edge, is interpolated between the edge's vertices. The far surface
+    has no vertices there: its color is extrapolated linearly from the two nearest pixels that see it.
 
     Args:
         image: Color and coverage before smoothing, vec4 of shape [batch, height, width].

@@ -1,4 +1,4 @@
-"""Slopes: how color changes over a sample, by which surfaces that move pull at their vertices.
+"""Slopes: the mean gradient of color over a sample on screen, by which surfaces that move pull at their vertices.
 
 A surface of color c that moves over the screen by v changes a sample by −∇c · v. Were faces large, ∇c could be that of
 the face at the sample's point. But where they are as small as samples, it is one of many; and towards a limb, where
@@ -140,7 +140,7 @@ def _pull_surfaces(
                     if goes_on[side] != 0:
                         is_flat = is_flat and face_ids[view, neighbor(sample, side, width)] == face
                 rises = wp.vec2()
-                spans = wp.vec2()  # over which what the loss sees of the color rises so [pixels]
+                spans = wp.vec2()  # lengths over which those were measured [pixels]
                 if not is_flat:
                     for side in range(4):
                         onward = 1.0 - 2.0 * float(side % 2)
@@ -151,6 +151,7 @@ def _pull_surfaces(
                             line = wp.cross(relative(clip[edge[0]], center), relative(clip[edge[1]], center))
                             t = distance(line, side, half_size)
                             if ends_before(line, side) and t > LEAST_DISTANCE and t <= 1.0:
+                                # entries are of all views; where one view serves all images, each has its own colors
                                 rise = edge_colors[batch - view, entry, side] - color
                                 span = wp.min(t, 0.5)
                                 total = wp.dot(adj_color, wp.vec3(rise[0], rise[1], rise[2]))
@@ -196,7 +197,8 @@ def pull_surfaces(
 ) -> None:
     """Let surfaces that move change samples by the mean slope of the light that they receive.
 
-    It is an adjoint alone, in place of the one that barycentrics have from :func:`warpshadow.film.expose`.
+    It records an adjoint alone, from samples to clip positions. It replaces the gradient to barycentrics that
+    :func:`warpshadow.film.expose` has at points.
 
     Args:
         samples: Color and coverage of the samples, vec4 of shape [batch, height, width].

@@ -20,7 +20,7 @@ from warpshadow.assembly import Assembly, Geometry
 from warpshadow.batch import concatenate
 from warpshadow.camera import to_clip
 from warpshadow.graph import is_readable
-from warpshadow.lanes import Chunk, as_chunks
+from warpshadow.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.light import EnvironmentMap
 from warpshadow.mesh import vertex_normals
 from warpshadow.reference import CellSamples, LightSamples, cell_samples, even_samples, sample_map, trace_cells
@@ -320,6 +320,8 @@ def light_cells(transmittance: wp.array, kept: KeptRows) -> wp.array:
     Differentiable: transmittance.
     """
     device, requires_grad = transmittance.device, transmittance.requires_grad
+    if device.is_cpu:
+        use_vector_registers(__name__)
     shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device, requires_grad=requires_grad)
     factors = [kept.index, as_chunks(kept.rows)]
     wp.launch(
@@ -376,6 +378,8 @@ def cell_transfer(transmittance: wp.array, kept: KeptRows) -> wp.array:
     Differentiable: transmittance.
     """
     device, requires_grad = transmittance.device, transmittance.requires_grad
+    if device.is_cpu:
+        use_vector_registers(__name__)
     transfer = wp.zeros(transmittance.shape, dtype=wp.float32, device=device, requires_grad=requires_grad)
     factors = [kept.index, as_chunks(kept.rows)]
 

@@ -1,9 +1,9 @@
 """Threads: any number of them may call the library, which does the work of one call after another.
 
-Warp loads modules and makes kernels on the thread that first needs them, and neither bears company (1.19: two threads
-that load at once lose kernels). So whatever is called from outside and launches kernels holds one lock, which also
-guards what renderers keep between calls. Nothing is lost by it: a call runs on all cores (:mod:`warpshadow.parallel`),
-and what lies between launches is Python, which runs one thread at a time.
+Loading modules and making kernels is not thread-safe in Warp (1.19: two threads that load at once lose kernels). One
+lock guards both, and what renderers keep between calls. These hold it: renderers, fits of spheres, `tune`, deformation
+graphs, captured graphs, and everything in torch. The functions of single stages do not. Little is lost by it: a call
+runs on all cores (:mod:`warpshadow.parallel`), and between launches there is Python, which runs one thread at a time.
 """
 
 import functools

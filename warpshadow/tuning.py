@@ -20,6 +20,7 @@ from warpshadow.blockers import fitted_counts
 from warpshadow.point_sample import PointSample
 from warpshadow.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres, is_fitted
+from warpshadow.threads import one_at_a_time
 from warpshadow.timing import image_times
 from warpshadow.visibility.zonal_logs import LOGS
 
@@ -147,6 +148,7 @@ def _listed(words: Sequence[str]) -> str:
     return words[0] if len(set(words)) == 1 else ", ".join(words)
 
 
+@one_at_a_time
 def tune(
     scene: Scene,
     *,
@@ -236,6 +238,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 _resolved: weakref.WeakKeyDictionary[Scene, Scene] = weakref.WeakKeyDictionary()
 
 
+@one_at_a_time
 def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Scene:
     """Put settings in place of "auto": the first that reach the error of the scene's :class:`Visibility`.
 

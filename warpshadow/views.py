@@ -78,10 +78,7 @@ class View(_ViewFields):
 
     @property
     def keeps(self) -> bool:
-        """Whether what is computed from it may be kept.
-
-        So it may unless something varies, or a CUDA graph is being captured, in whose memory nothing outlasts it.
-        """
+        """Whether what is computed from it may be kept: no input needs a gradient, and no CUDA graph is captured."""
         return not (self.varying or self.clip_positions.device.is_capturing)
 
     @property
