@@ -98,3 +98,17 @@ def test_a_file_that_is_write_protected_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: os.stat(path).st_mode & 0o222 != 0)  # root may do anything
     with pytest.raises(PermissionError, match=r"a\.txt: got a file that is write-protected"):
         files.check_file(tmp_path / "a.txt")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has other permissions and links")
+def test_a_link_stays_and_what_it_names_is_written_with_its_permissions(tmp_path):
+    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
+    target.write_text("before")
+    target.chmod(0o640)
+    link.symlink_to(target)
+    with files.whole(link) as unfinished:
+        unfinished.write_text("after")
+    assert link.is_symlink()
+    assert target.read_text() == "after"
+    assert target.stat().st_mode & 0o777 == 0o640
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.txt", "target.txt"]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warpshadow as ws
 from warpshadow import reference, sh
 from warpshadow.basis import CellBasis, HarmonicBasis
 from warpshadow.directions import fibonacci
@@ -408,3 +409,21 @@ def test_past_no_mesh_nothing_is_traced(device):
     assert np.abs(transfer @ [np.sqrt(4 * np.pi), 0, 0, 0] - 1).max() < 5e-3
     everything = trace(None, np.zeros((1, 1, 3)), np.array([[[0.0, 1, 0]]]), fibonacci(64), device)[0, 0]
     np.testing.assert_array_equal(everything, fibonacci(64)[:, 1] > 0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 10.0, 37.0])
+def test_nothing_leaks_past_a_wall_at_whose_foot_a_receiver_lies(angle, device):
+    """The wall's plane holds the receiver, whose normal says nothing of the side: rounding must not decide."""
+    turn = ws.Body(ws.plane(), rotation=(0, angle, 0)).rotation_matrix()
+    wall = np.array([(-1, 0, 0), (1, 0, 0), (1, 2, 0), (-1, 2, 0)]) @ turn.T  # looks to +z
+    mesh = wp.Mesh(
+        wp.array(wall.astype(np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.array([0, 1, 2, 0, 2, 3], np.int32), device=device),
+    )
+    feet = np.stack([np.linspace(-0.9, 0.9, 31), np.zeros(31), np.zeros(31)], axis=-1) @ turn.T
+    up = np.tile([0.0, 1.0, 0.0], (31, 1))
+    towards = np.array([(0, 0.3, -1), (0.2, 0.3, -1), (0, 0.3, 1), (-0.2, 0.3, 1)]) @ turn.T
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (feet[None], up[None], towards)]
+    seen = trace_visibility(mesh, *arrays).numpy()[0]
+    np.testing.assert_array_equal(seen, np.tile([0, 0, 1, 1], (31, 1)))

@@ -680,3 +680,22 @@ def test_openmp_has_more_threads_than_cores_so_that_those_that_wait_sleep(policy
         assert more >= 2 * len(os.sched_getaffinity(0))  # each begins a team of two and stays
     else:
         assert more < 2
+
+
+def test_the_rotations_that_a_caller_gets_may_be_changed_before_the_gradient_is_asked_for():
+    numbers = torch.randn(4, 9, generator=torch.Generator().manual_seed(0))
+    gradients = []
+    for copies in (False, True):
+        free = numbers.clone().requires_grad_()
+        rotations = rotation_matrices(free)
+        rotations = rotations.clone() if copies else rotations
+        rotations.mul_(torch.arange(9.0).reshape(3, 3))
+        rotations.square().sum().backward()
+        gradients.append(free.grad)
+    torch.testing.assert_close(*gradients)
+
+
+def test_light_that_is_no_tensor_is_refused(renderer):
+    light = np.ones((renderer.renderer.basis.size, 3), np.float32)
+    with pytest.raises(ValueError, match="light: got ndarray, expected a tensor of torch.float32"):
+        renderer(light)

@@ -132,7 +132,9 @@ def render(
 def tune(
     scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
     error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
-    ms: Annotated[Optional[float], typer.Option(help="In place of --error: longest time of an image [ms].")] = None,
+    ms: Annotated[
+        Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
+    ] = None,
     fit: Annotated[
         bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s each; they are kept for later.")
     ] = False,
@@ -299,6 +301,11 @@ def spheres(
             fit.spheres.write(output)
         if picture is not None:
             plot_spheres(loaded, fit.spheres, picture)
+        if error is not None and report.visibility_error > error:
+            raise ValueError(
+                f"--error: no fit reaches {error:g}; {report.sphere_count} spheres, the most that are tried, have "
+                f'{report.visibility_error:.3g}; bodies that do not move can be exact: method = "ray-traced"'
+            )
 
 
 @app.command()

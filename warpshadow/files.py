@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator
@@ -13,17 +14,19 @@ def whole(path: str | Path) -> Iterator[Path]:
     """Give a new empty file beside ``path`` to write to, which takes its place if the block ends without an error.
 
     Otherwise it is removed, and what was at ``path`` stays. It has the suffix of ``path``, by which libraries tell
-    formats, and the permissions that the user's umask gives any new file.
+    formats, and the permissions of what it replaces, or those that the user's umask gives any new file.
 
     Raises:
         OSError: where it cannot be written, such as on a full disk; of ``path``, whatever the file beside it is called.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # a link stays, and what it names is written
     unfinished = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
     try:
         unfinished.touch(exist_ok=False)
         try:
             yield unfinished
+            if path.exists():
+                shutil.copymode(path, unfinished)
             os.replace(unfinished, path)
         finally:
             unfinished.unlink(missing_ok=True)

@@ -532,7 +532,8 @@ class Surface(NamedTuple):
 
     Faces joined along an edge wind alike: where some wind against most of their piece, they are turned over. So normals
     of neighbors add up, and one side of a piece is its front, all over. On a one-sided piece (a Möbius strip) they
-    cannot, and stay as they are.
+    cannot, and stay as they are. Of faces listed twice, as in "double-sided" exports, the copies wind as the first, or
+    their normals would cancel.
     """
 
     faces: np.ndarray
@@ -542,12 +543,44 @@ class Surface(NamedTuple):
     neighbors: np.ndarray
     """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
     is_closed: bool
-    """Whether no face shows its back to those outside: two share each edge, wind alike, and look outward."""
+    """Whether no face shows its back to those outside: two share each edge and wind alike, and pieces look outward.
+
+    A shell that is hollow inside does not count as closed: it costs a launch more, and gets the same image.
+    """
 
 
 def _surface(mesh: Mesh) -> Surface:
-    faces, uv_faces, neighbors = mesh.faces, mesh.uv_faces, edge_neighbors(mesh.faces, mesh.positions)
-    places = _places(mesh.positions)[faces]
+    """Join the faces; those that are listed again, with either winding, become as the first of them."""
+    places = _places(mesh.positions)[mesh.faces]
+    first = _first_of_equal(places)
+    own = np.unique(first)
+    if len(own) == len(first):
+        return _joined(mesh.positions, mesh.faces, mesh.uv_faces)
+    joined = _joined(mesh.positions, mesh.faces[own], None if mesh.uv_faces is None else mesh.uv_faces[own])
+    row = np.searchsorted(own, first)
+    wanted = _places(mesh.positions)[joined.faces][row]
+    is_turned = ~np.any([(np.roll(wanted, k, axis=1) == places).all(axis=1) for k in range(3)], axis=0)
+    corner = (_with_turned(places, is_turned)[:, :, None] == wanted[:, None, :]).argmax(axis=2)
+    across = np.take_along_axis(joined.neighbors[row], corner, axis=1)
+    return Surface(
+        _with_turned(mesh.faces, is_turned),
+        None if mesh.uv_faces is None else _with_turned(mesh.uv_faces, is_turned),
+        np.where(across < 0, across, own[across]).astype(np.int32),
+        joined.is_closed,
+    )
+
+
+def _first_of_equal(places: np.ndarray) -> np.ndarray:
+    """The first face with the same three corners as each, in any order; a face without area is its own."""
+    corners = np.sort(places, axis=1)
+    _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    has_area = (np.diff(corners, axis=1) != 0).all(axis=1)
+    return np.where(has_area, first[group.ravel()], np.arange(len(places)))
+
+
+def _joined(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
+    """Join faces of which none is listed twice."""
+    neighbors, places = edge_neighbors(faces, positions), _places(positions)[faces]
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
     across = np.maximum(neighbors, 0)
     runs_back = (first[across] == last[:, :, None]) & (last[across] == first[:, :, None])
@@ -559,14 +592,32 @@ def _surface(mesh: Mesh) -> Surface:
         faces, neighbors = (_with_turned(values, is_turned) for values in (faces, neighbors))
         uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
     is_proper = (places != first).all(axis=1)
-    is_closed = winds_alike.all() and (neighbors[is_proper] >= 0).all() and _volume(mesh.positions, faces) > 0
+    has_no_border = winds_alike.all() and (neighbors[is_proper] >= 0).all()
+    is_closed = has_no_border and (_volumes(positions, faces[is_proper], neighbors, is_proper) > 0).all()
     return Surface(faces, uv_faces, neighbors, bool(is_closed))
 
 
-def _volume(positions: np.ndarray, faces: np.ndarray) -> float:
-    """What faces enclose, negative where they look inward."""
+def _volumes(positions: np.ndarray, faces: np.ndarray, neighbors: np.ndarray, is_proper: np.ndarray) -> np.ndarray:
+    """What each piece of a mesh without borders encloses, negative where its faces look inward."""
     a, b, c = np.moveaxis((positions - positions[0].astype(np.float64))[faces], 1, 0)
-    return np.sum(a * np.cross(b, c)) / 6
+    parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    _, piece = np.unique(_pieces_of(neighbors)[is_proper], return_inverse=True)
+    return np.bincount(piece, weights=parts)
+
+
+def _pieces_of(neighbors: np.ndarray) -> np.ndarray:
+    """Number of the piece that each face belongs to; those joined across an edge belong together."""
+    face, edge = np.nonzero(neighbors >= 0)
+    return _connected(face, neighbors[face, edge], len(neighbors))
+
+
+def _connected(ends: np.ndarray, other_ends: np.ndarray, count: int) -> np.ndarray:
+    """Number of the part of a graph that each of its nodes is in."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(ends)), (ends, other_ends)), shape=(count, count))
+    return connected_components(links, directed=False)[1]
 
 
 def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
@@ -575,17 +626,13 @@ def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     A graph has two nodes a face, "as it is" and "turned over". Nodes of neighbors that wind alike are joined, so each
     piece of the mesh is there in both windings; the one that turns fewer faces over is taken.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     count = len(neighbors)
     face, edge = np.nonzero(neighbors >= 0)
     other = neighbors[face, edge] + np.where(winds_alike[face, edge], 0, count)
     ends = np.concatenate([face, face + count]), np.concatenate([other, (other + count) % (2 * count)])
-    links = coo_array((np.ones(len(ends[0])), ends), shape=(2 * count, 2 * count))
-    part_count, part = connected_components(links, directed=False)
+    part = _connected(*ends, 2 * count)
     as_it_is, over = part[:count], part[count:]
-    kept = np.bincount(as_it_is, minlength=part_count)
+    kept = np.bincount(as_it_is, minlength=len(part))
     return (kept[as_it_is] < kept[over]) | ((kept[as_it_is] == kept[over]) & (as_it_is > over))
 
 

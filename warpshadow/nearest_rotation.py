@@ -59,11 +59,13 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
     Differentiable: matrices.
     """
     rotations = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device, requires_grad=matrices.requires_grad)
+    kept = wp.empty_like(rotations, requires_grad=False)  # the caller may change those that it gets
     options = {"dim": matrices.shape, "device": matrices.device, "record_tape": False}
     wp.launch(_nearest_rotations, inputs=[matrices], outputs=[rotations], **options)
+    wp.copy(kept, rotations)
 
     def adjoint() -> None:
-        inputs = [matrices, rotations, rotations.grad]
+        inputs = [matrices, kept, rotations.grad]
         wp.launch(_nearest_rotations_adjoint, inputs=inputs, outputs=[matrices.grad], **options)
 
     record_adjoint(adjoint, [matrices, rotations])

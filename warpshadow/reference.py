@@ -19,6 +19,10 @@ _RAY_COST = 200.0
 _ROUNDING = 2.0**-21
 """How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
 
+_UPRIGHT = 1.0e-3
+"""Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
+in front of it then, whatever rounding says."""
+
 _RAISE = 1.0e-4
 """Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
 
@@ -27,7 +31,7 @@ _RAISE = 1.0e-4
 def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
     """Whether a ray from a receiver meets a face, in float64, where coordinates and their differences are exact.
 
-    A receiver on a face, to float32's rounding, is put slightly above it, on the side of its normal. It so gets no
+    A receiver on a face, to float32's rounding, is put slightly above it, on the side of its own normal. It so gets no
     shadow from the face and its neighbors in the plane, but does where light comes from behind them. For all other
     faces rays start at the receiver itself, so that nothing is too thin or too near to cast a shadow.
     """
@@ -39,7 +43,8 @@ def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3,
     largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
     if wp.abs(drop) <= wp.float64(_ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
         length = wp.length(across)
-        height = wp.where(wp.dot(across, wp.vec3d(normal)) < wp.float64(0.0), -_RAISE, _RAISE)
+        is_behind = wp.dot(across, wp.vec3d(normal)) < wp.float64(-_UPRIGHT) * length
+        height = wp.where(is_behind, -_RAISE, _RAISE)
         move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
         a -= move
         b -= move

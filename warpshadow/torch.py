@@ -104,6 +104,8 @@ class TorchRenderer(torch.nn.Module):
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(renderer.basis, light.shape[-2] if light.ndim > 1 else 0)
             arguments.add("light", light, wp.vec3, (renderer.basis.size,), what)
+        elif isinstance(light, np.ndarray):  # which a renderer takes for known light
+            raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         for name, tensor, dtype in zip(Geometry._fields, geometry or (), _GEOMETRY_DTYPES, strict=False):
             arguments.add(f"geometry.{name}", tensor, dtype, getattr(renderer.assembly.rest, name).shape[1:])
         if clip_matrices is not None:
