@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 import warp as wp
@@ -49,14 +50,14 @@ def is_integer(value: object) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def is_path(value: object) -> bool:
+def is_path(value: object) -> TypeGuard[str | os.PathLike[str]]:
     """Whether a value may name a file."""
     return isinstance(value, (str, os.PathLike))
 
 
 def path(name: str, value: object) -> Path:
     """A path; ValueError for what names no file."""
-    if not isinstance(value, (str, os.PathLike)):
+    if not is_path(value):
         raise ValueError(f"{name}: got {described(value)}, expected the path of a file")
     return Path(value)
 

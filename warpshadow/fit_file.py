@@ -244,9 +244,9 @@ def _typed(key: str, value: Any, hint: Any) -> Any:
 
 def _is(value: Any, hint: Any) -> bool:
     if hint is float:
-        return tables.is_number(value)
+        return check.is_number(value)
     if hint is int:
-        return tables.is_integer(value)
+        return check.is_integer(value)
     parts = typing.get_args(hint)
     if not parts:
         return isinstance(value, hint)

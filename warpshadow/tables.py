@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warpshadow import files
+from warpshadow import check, files
 
 Table = dict[str, Any]
 
@@ -76,16 +76,6 @@ def check_table(value: object) -> None:
         raise ValueError(f"got {value!r}, expected a table of keys")
 
 
-def is_number(value: object) -> bool:
-    """Whether a value is a finite number."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def is_integer(value: object) -> bool:
-    """Whether a value is a whole number, written as one."""
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, Any]]:
     """Tables of a list, each with what messages call it."""
     if not isinstance(table[key], list):
@@ -97,7 +87,7 @@ def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, An
 def number(table: Table, key: str, default: float) -> float:
     """A finite number."""
     value = table.get(key, default)
-    if not is_number(value):
+    if not check.is_number(value):
         raise ValueError(f"{key}: got {value!r}, expected a finite number")
     return value
 
@@ -106,7 +96,7 @@ def check_integer(table: Table, key: str, *, pair: bool = False) -> None:
     """Raise ValueError unless a key is missing or a whole number, or maybe a pair of them."""
     value = table.get(key, 1)
     values = value if pair and isinstance(value, list) and len(value) == 2 else [value]
-    if not all(map(is_integer, values)):
+    if not all(map(check.is_integer, values)):
         raise ValueError(f"{key}: got {value!r}, expected a whole number{' or two' if pair else ''}")
 
 
@@ -146,7 +136,7 @@ def _is_tables(value: object) -> bool:
 
 
 def _is_vector(value: object, count: int) -> bool:
-    return isinstance(value, list) and len(value) == count and all(map(is_number, value))
+    return isinstance(value, list) and len(value) == count and all(map(check.is_number, value))
 
 
 def _lines(table: Mapping[str, Any]) -> str:
