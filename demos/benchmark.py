@@ -28,19 +28,20 @@ from scenes import bunny_scene
 
 import warpshadow as ws
 from warpshadow import inverse
-from warpshadow.basis import CellBasis, HarmonicBasis
-from warpshadow.camera import to_clip
-from warpshadow.directions import fibonacci
-from warpshadow.mesh import vertex_normals
-from warpshadow.raster import interpolate, rasterize
-from warpshadow.renderer import Renderer
-from warpshadow.shading import shade
-from warpshadow.silhouette import find_silhouettes, smooth_silhouettes
-from warpshadow.timing import median_times, whole_image
+from warpshadow.assets.basis import CellBasis, HarmonicBasis
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.project import to_clip
+from warpshadow.stages.rasterize import interpolate, rasterize
+from warpshadow.stages.shading import shade
+from warpshadow.stages.silhouettes.find import find_silhouettes
+from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
+from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.visibility import directional, log_sh
+from warpshadow.stages.visibility.exponential import exponentiate
 from warpshadow.torch import TorchRenderer
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, log_sh
-from warpshadow.visibility.exponential import exponentiate
+from warpshadow.tuning.timing import median_times, whole_image
 
 
 def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:

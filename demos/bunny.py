@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scenes import image_error, on_ground, shipped_mesh
 
 import warpshadow as ws
-from warpshadow.image import linear_to_srgb
+from warpshadow.assets.image import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 METHODS = {

@@ -10,8 +10,10 @@ import warp as wp
 from warp._src.context import user_modules  # Warp has no public way to list them
 
 import warpshadow
-from warpshadow import batch, lanes, raster, silhouette, transfer
-from warpshadow.visibility import directional, exponential, log_sh
+from warpshadow.device import batch, lanes
+from warpshadow.stages import rasterize, transfer
+from warpshadow.stages.silhouettes import smooth
+from warpshadow.stages.visibility import directional, exponential, log_sh
 
 LANES = 1
 """Receivers of a thread on a GPU, lanes.lane_count."""
@@ -50,11 +52,11 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (
-            raster._interpolation,
-            raster._interpolation_adjoint,
+            rasterize._interpolation,
+            rasterize._interpolation_adjoint,
             batch._add_kernel,
-            silhouette._blend_kernel,
-            silhouette._blend_adjoint_kernel,
+            smooth._blend_kernel,
+            smooth._blend_adjoint_kernel,
         )
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },

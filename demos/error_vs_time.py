@@ -32,16 +32,17 @@ import warp as wp
 from scenes import image_error, on_ground, shipped_mesh
 
 import warpshadow as ws
-from warpshadow.point_sample import PointReceivers, PointSample
-from warpshadow.reference import sample_map, trace_visibility
-from warpshadow.shading import shade
 from warpshadow.spheres import exact_occlusion
-from warpshadow.timing import median_times, whole_image
-from warpshadow.transfer import sh_transfer
-from warpshadow.tuning import pareto_front
-from warpshadow.visibility import log_sh
-from warpshadow.visibility.exponential import exponentiate
-from warpshadow.visibility.merging import MERGED_FROM
+from warpshadow.stages.light_samples import sample_map
+from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.shading import shade
+from warpshadow.stages.transfer import sh_transfer
+from warpshadow.stages.visibility import log_sh
+from warpshadow.stages.visibility.exponential import exponentiate
+from warpshadow.stages.visibility.merging import MERGED_FROM
+from warpshadow.tuning.point_sample import PointReceivers, PointSample
+from warpshadow.tuning.timing import median_times, whole_image
+from warpshadow.tuning.tune import pareto_front
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)

@@ -23,8 +23,8 @@ import numpy as np
 from scenes import bunny_scene
 
 import warpshadow as ws
-from warpshadow.directions import edge_width, fibonacci
-from warpshadow.mesh import vertex_normals
+from warpshadow.maths.directions import edge_width, fibonacci
+from warpshadow.stages.normals import vertex_normals
 
 OPERATIONS_PER_SECOND = 67e12
 BYTES_PER_SECOND = 4.8e12

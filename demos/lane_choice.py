@@ -21,12 +21,12 @@ import warp as wp
 from scenes import bunny_scene
 
 import warpshadow as ws
-from warpshadow import lanes
-from warpshadow.directions import fibonacci
-from warpshadow.mesh import vertex_normals
-from warpshadow.renderer import Renderer
-from warpshadow.visibility import directional, log_sh
-from warpshadow.visibility.exponential import exponentiate
+from warpshadow.device import lanes
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.visibility import directional, log_sh
+from warpshadow.stages.visibility.exponential import exponentiate
 
 SLACK = 1.15
 """Times the best choice's time that the chosen one may take."""

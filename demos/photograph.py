@@ -31,11 +31,11 @@ from scipy import ndimage
 
 import warpshadow as ws
 from warpshadow import inverse
-from warpshadow.fit_file import load_fit
-from warpshadow.image import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.image import linear_to_srgb, srgb_to_linear
+from warpshadow.inverse.fit_file import load_fit
 from warpshadow.inverse.world import Found
-from warpshadow.scene_file import write_scene
-from warpshadow.sh import equirectangular_directions
+from warpshadow.maths.sh import equirectangular_directions
+from warpshadow.scene.files import write_scene
 
 FOCAL_LENGTH, SENSOR_HEIGHT = 24.0, 15.6  # mm: as EXIF and the camera's data sheet have them
 SIZE = 256  # pixels across and down

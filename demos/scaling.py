@@ -36,13 +36,13 @@ import warp as wp
 from scenes import bunny_scene, on_ground, shipped_mesh
 
 import warpshadow as ws
-from warpshadow.assembly import Geometry
-from warpshadow.directions import fibonacci
-from warpshadow.mesh import vertex_normals
-from warpshadow.point_sample import at_receivers
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.assembly import Geometry
 from warpshadow.spheres import fit_spheres
-from warpshadow.timing import median_times
+from warpshadow.stages.normals import vertex_normals
 from warpshadow.torch import TorchRenderer
+from warpshadow.tuning.point_sample import at_receivers
+from warpshadow.tuning.timing import median_times
 
 Timed = dict[str, Callable[[], object]]
 

@@ -18,7 +18,7 @@ import torch
 from scenes import shipped_mesh
 
 import warpshadow as ws
-from warpshadow.image import linear_to_srgb
+from warpshadow.assets.image import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 PARAMETERS = ("x", "z", "scale")

@@ -21,13 +21,14 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 import twins
 
 import warpshadow as ws
-from warpshadow.deform import Poses, rotation_matrices
-from warpshadow.directions import fibonacci
-from warpshadow.mesh import vertex_normals
-from warpshadow.raster import interpolate, rasterize
-from warpshadow.shading import shade
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, exponential, log_sh
+from warpshadow.maths.directions import fibonacci
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.poses import Poses
+from warpshadow.stages.rasterize import interpolate, rasterize
+from warpshadow.stages.rotations import rotation_matrices
+from warpshadow.stages.shading import shade
+from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.visibility import directional, exponential, log_sh
 
 STEP = 1e-7
 """Of central differences, in sizes of the case: small, since curvature jumps where a receiver meets a sphere."""

@@ -32,9 +32,9 @@ from torch.utils.data.distributed import DistributedSampler
 from tqdm import tqdm
 
 import warpshadow as ws
-from warpshadow import sh
 from warpshadow.inverse import checkpoint
-from warpshadow.random_scenes import RandomScenes, primitives
+from warpshadow.maths import sh
+from warpshadow.scene.random_scenes import RandomScenes, primitives
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import TorchRenderer
 

@@ -21,9 +21,10 @@ import warp.optim
 from scenes import on_ground, shipped_mesh
 
 import warpshadow as ws
-from warpshadow.batch import concatenate
-from warpshadow.deform import Poses, rotation_matrices
-from warpshadow.image import linear_to_srgb
+from warpshadow.assets.image import linear_to_srgb
+from warpshadow.device.batch import concatenate
+from warpshadow.stages.poses import Poses
+from warpshadow.stages.rotations import rotation_matrices
 
 TURN = np.radians([0.0, 15.0, 0.0])
 SHIFT = np.array([0.16, 0.0, 0.12])

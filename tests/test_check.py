@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from warpshadow import check
-from warpshadow.mesh import MeshError
+from warpshadow.assets.mesh import MeshError
 
 
 def test_a_known_choice_passes():

@@ -16,9 +16,9 @@ import warp as wp
 from typer.testing import CliRunner
 
 import warpshadow as ws
-from warpshadow import sh
+from warpshadow.assets.image import auto_exposure
 from warpshadow.cli import app
-from warpshadow.image import auto_exposure
+from warpshadow.maths import sh
 
 # Half a step of 8-bit sRGB where it is steepest.
 EIGHT_BITS = 0.006
@@ -166,7 +166,7 @@ def test_a_missing_scene_is_one_line_and_status_1(tmp_path):
 
 
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warpshadow.scene_file.load_scene", lambda path: pytest.fail("the scene was read"))
+    monkeypatch.setattr("warpshadow.scene.files.load_scene", lambda path: pytest.fail("the scene was read"))
     missing = tmp_path / "nowhere" / "out.exr"
     picture = ("out.png", "got extension '.png'", "expected .exr; pictures are written by --png ")
     fails("render", scene, "-o", tmp_path / "out.png", parts=picture)
@@ -225,12 +225,12 @@ def test_a_wrong_option_is_status_2_with_its_name(arguments, part):
 @pytest.fixture
 def quick_tuning(monkeypatch):
     """Few settings, points and rays, so that a test takes no time."""
-    from warpshadow import tuning
-    from warpshadow.point_sample import PointSample
+    from warpshadow.tuning import tune
+    from warpshadow.tuning.point_sample import PointSample
 
-    monkeypatch.setattr(tuning, "PointSample", functools.partial(PointSample, count=60, direction_count=64))
+    monkeypatch.setattr(tune, "PointSample", functools.partial(PointSample, count=60, direction_count=64))
     for name, values in (("DIRECTION_COUNTS", (16, 32)), ("ORDERS", (4,)), ("LOGS", ("eigen",))):
-        monkeypatch.setattr(tuning, name, values)
+        monkeypatch.setattr(tune, name, values)
 
 
 def lines_to_put_in(text):
@@ -302,9 +302,9 @@ def test_render_makes_the_choice_that_a_scene_leaves_to_it(scene, tmp_path, quic
 
 
 def test_a_method_that_is_given_takes_the_place_of_auto_before_anything_is_tried(scene, tmp_path, monkeypatch):
-    from warpshadow import tuning
+    from warpshadow.tuning import tune
 
-    monkeypatch.setattr(tuning, "PointSample", None)
+    monkeypatch.setattr(tune, "PointSample", None)
     scene.write_text(SCENE.replace("[visibility]", '[visibility]\nmethod = "auto"'))
     result = run("render", scene, "-o", tmp_path / "out.exr", "--method", "directional")
     assert result.exit_code == 0, result.output
@@ -448,7 +448,7 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("warpshadow.fit_file.fit", interrupt)
+        patched.setattr("warpshadow.inverse.fit_file.fit", interrupt)
         result = run("fit", fit_file, "-o", tmp_path / "out")
     assert result.exit_code == 130 and "interrupted before a checkpoint" in result.stderr
     assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
@@ -608,7 +608,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_behind(scene, tmp_path, full
             full_disk()
         write(path, pixels)
 
-    monkeypatch.setattr("warpshadow.image.write_image", write_with_the_disk_full)
+    monkeypatch.setattr("warpshadow.assets.image.write_image", write_with_the_disk_full)
     result = run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / "out.png")
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
     assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1

@@ -1,15 +1,12 @@
 """Every kernel of the package compiles for CUDA, without a GPU: Warp's NVRTC makes PTX of each module."""
 
 import ast
-import sys
 from pathlib import Path
 
 import pytest
+from cuda_kernels import FACTORIES, compile_ptx, file_modules, import_package
 
 import warpshadow
-
-sys.path.append(str(Path(__file__).parents[1] / "demos"))
-from cuda_kernels import FACTORIES, compile_ptx, file_modules, import_package
 
 ARCHITECTURES = [75, 90]
 
@@ -39,7 +36,12 @@ def test_kernels_made_by_factories_compile_for_cuda(name, tmp_path):
 @pytest.mark.slow
 def test_kernels_of_files_compile_for_cuda(tmp_path):
     modules = file_modules()
-    assert {"warpshadow.shading", "warpshadow.raster", "warpshadow.mesh", "warpshadow.camera"} <= set(modules)
+    assert {
+        "warpshadow.stages.shading",
+        "warpshadow.stages.rasterize",
+        "warpshadow.assets.mesh",
+        "warpshadow.assets.camera",
+    } <= set(modules)
     for name, module in modules.items():
         folder = tmp_path / name
         folder.mkdir()

@@ -8,8 +8,10 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow import film, texture, views
-from warpshadow import renderer as renderer_module
+from warpshadow.pipeline import renderer as renderer_module
+from warpshadow.pipeline import views
+from warpshadow.stages import film
+from warpshadow.stages.textures import pyramid, sample
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
 
 # Where no silhouette moves the loss is smooth, and what is left is float32 rounding over the step.
@@ -295,7 +297,7 @@ def test_colors_in_a_batch_make_a_batch_of_images_without_any_texture():
 def test_it_does_not_matter_whether_a_thread_owns_a_row_of_samples_or_one(monkeypatch):
     """Rows are for CPUs; GPUs start a thread for every sample."""
     results = []
-    for modules in ((), (film, texture)):
+    for modules in ((), (film, pyramid, sample)):
         for module in modules:
             monkeypatch.setattr(module, "run_length", lambda device, width: 1)
         renderer = TorchRenderer(scene_of("none", ON_BOTH))

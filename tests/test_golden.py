@@ -5,10 +5,10 @@ import pytest
 import twins
 import warp as wp
 
-from warpshadow import directions as cells
-from warpshadow import sh
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, exponential, log_sh
+from warpshadow.maths import directions as cells
+from warpshadow.maths import sh
+from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # The golden log-SH has no corners rounded off (see test_log_sh.py: up to 0.6% of one cap near cos θ = 0.916), so
 # single rows may be off by 1.2e-4 (eigen; cap: 4e-7), all of them together by 3e-5.

@@ -5,10 +5,10 @@ import pytest
 import twins
 import warp as wp
 
-from warpshadow import directions as cells
-from warpshadow import sh
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, exponential, log_sh
+from warpshadow.maths import directions as cells
+from warpshadow.maths import sh
+from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # Relative L2 of a whole gradient: float32 kernels against float64 differences. Measured 3e-6 to 2e-4.
 ADJOINT = 1e-3

@@ -4,12 +4,11 @@ The cases and their measurement are those of demos/stability.py, which prints th
 """
 
 import dataclasses
-import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
+import stability
 import twins
 import warp as wp
 from hypothesis import given, settings
@@ -17,15 +16,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import warpshadow as ws
-from warpshadow.deform import Poses
-from warpshadow.directions import fibonacci
-from warpshadow.mesh import vertex_normals
-from warpshadow.shading import shade
-from warpshadow.transfer import directional_transfer, sh_transfer
-from warpshadow.visibility import directional, exponential, log_sh
-
-sys.path.append(str(Path(__file__).parents[1] / "demos"))
-import stability
+from warpshadow.maths.directions import fibonacci
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.poses import Poses
+from warpshadow.stages.shading import shade
+from warpshadow.stages.transfer import directional_transfer, sh_transfer
+from warpshadow.stages.visibility import directional, exponential, log_sh
 
 # Visibility: float32 against float64, relative to an unblocked receiver's. Measured 3e-5, where θ is nearly 90° and the
 # cone's blend magnifies rounding a hundredfold, and at the rounded corners of the eigen log.

@@ -2,17 +2,20 @@
 
 import warp as _wp
 
-from warpshadow.basis import CellBasis, HarmonicBasis
-from warpshadow.camera import Camera
-from warpshadow.image import ImageError, read_image, write_image
-from warpshadow.light import EnvironmentMap, synthetic_sky
-from warpshadow.mesh import Mesh, MeshError, icosphere, load_mesh, plane
-from warpshadow.parallel import set_thread_count, thread_count
-from warpshadow.renderer import Renderer, render
-from warpshadow.scene import Body, Scene, Visibility
-from warpshadow.scene_file import SceneError, load_scene, write_scene
+from warpshadow.assets.basis import CellBasis, HarmonicBasis
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.image import ImageError, read_image, write_image
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.mesh import Mesh, MeshError
+from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.assets.sky import synthetic_sky
+from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.pipeline.renderer import Renderer, render
+from warpshadow.scene.files import SceneError, load_scene, write_scene
+from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
-from warpshadow.tuning import Tuning, tune
+from warpshadow.tuning.tune import Tuning, tune
 
 __version__ = "0.1.0"
 

@@ -144,6 +144,27 @@ def numbers(
         return np.array(found, dtype, order="C")
 
 
+def positive(name: str, value: float) -> float:
+    """Return a positive number as a float, or raise ValueError."""
+    if not (is_number(value) and 0.0 < value <= LARGEST):
+        raise ValueError(f"{name}: got {described(value)}, expected a positive number up to {LARGEST:g}")
+    return float(value)
+
+
+def pixel_count(name: str, value: int) -> int:
+    """Return a positive number of pixels, or raise ValueError."""
+    if not is_integer(value) or value < 1:
+        raise ValueError(f"{name}: got {value!r}, expected a positive whole number of pixels")
+    return int(value)
+
+
+def image_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height [pixels], or raise ValueError."""
+    if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
+        raise ValueError(f"size: got {described(size)}, expected width and height [pixels], such as (640, 480)")
+    return pixel_count("size (width)", size[0]), pixel_count("size (height)", size[1])
+
+
 def pixels(name: str, values: object, *, expected: str, error: type[ValueError] = ValueError) -> np.ndarray:
     """Copy linear values of pixels as :func:`numbers` does; codes of a picture, which are integers, are refused."""
     copied = numbers(name, values, expected=expected, error=error)
@@ -151,7 +172,7 @@ def pixels(name: str, values: object, *, expected: str, error: type[ValueError] 
     if dtype.kind != "f":
         raise error(
             f"{name}: got values of {dtype}, expected linear ones as floats: those of an 8-bit picture are "
-            "warpshadow.image.srgb_to_linear(values / 255), and read_image(path) reads one"
+            "warpshadow.assets.image.srgb_to_linear(values / 255), and read_image(path) reads one"
         )
     return copied
 

@@ -13,7 +13,8 @@ import numpy as np
 import typer
 import warp as wp
 
-from warpshadow import Tuning, __version__, files, quiet
+from warpshadow import Tuning, __version__, quiet
+from warpshadow.assets import files
 
 app = typer.Typer(
     add_completion=False,
@@ -94,11 +95,11 @@ def render(
     device: Device = "cpu",
 ) -> None:
     """Render a scene file to an image with soft shadows."""
-    from warpshadow.image import auto_exposure, exposed, write_image
-    from warpshadow.renderer import Renderer
-    from warpshadow.scene import AUTO
-    from warpshadow.scene_file import parse_scene
-    from warpshadow.tuning import describe, resolved
+    from warpshadow.assets.image import auto_exposure, exposed, write_image
+    from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.scene.files import parse_scene
+    from warpshadow.scene.scene import AUTO
+    from warpshadow.tuning.tune import describe, resolved
 
     with _clear_errors():
         is_picture = output.suffix.lower() in _PICTURES
@@ -144,10 +145,10 @@ def tune(
 
     Exit status 1: none reaches it; the one that comes nearest is named, and what to try next.
     """
-    from warpshadow.scene_file import parse_scene
-    from warpshadow.timing import TIMED_RECEIVERS
-    from warpshadow.tuning import describe
-    from warpshadow.tuning import tune as tune_scene
+    from warpshadow.scene.files import parse_scene
+    from warpshadow.tuning.timing import TIMED_RECEIVERS
+    from warpshadow.tuning.tune import describe
+    from warpshadow.tuning.tune import tune as tune_scene
 
     with _clear_errors():
         if (error is None) == (ms is None):
@@ -203,7 +204,7 @@ def fit(
     The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
     became NaN or Inf, and the folder has the best values before that.
     """
-    from warpshadow.fit_file import load_fit
+    from warpshadow.inverse.fit_file import load_fit
     from warpshadow.inverse.report import Report
 
     with _clear_errors(), _resumable(output):
@@ -275,7 +276,7 @@ def spheres(
     device: Device = "cpu",
 ) -> None:
     """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
-    from warpshadow.mesh import load_mesh
+    from warpshadow.assets.mesh_files import load_mesh
     from warpshadow.spheres import check_matplotlib, fit_spheres, plot_spheres
 
     with _clear_errors():
@@ -321,9 +322,9 @@ def envmap(
     ] = None,
 ) -> None:
     """Print an environment map's statistics and write its spherical-harmonic reconstruction beside it."""
-    from warpshadow import sh
-    from warpshadow.image import write_image
-    from warpshadow.light import EnvironmentMap
+    from warpshadow.assets.image import write_image
+    from warpshadow.assets.light import EnvironmentMap
+    from warpshadow.maths import sh
 
     with _clear_errors():
         beside = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
@@ -341,11 +342,11 @@ def warmup(device: Device = "cpu") -> None:
     """Compile every kernel that rendering needs, so that the first render need not."""
     from tqdm import tqdm
 
-    from warpshadow.camera import Camera
-    from warpshadow.light import EnvironmentMap
-    from warpshadow.mesh import icosphere
-    from warpshadow.renderer import Renderer
-    from warpshadow.scene import METHODS, Body, Scene, Visibility
+    from warpshadow.assets.camera import Camera
+    from warpshadow.assets.light import EnvironmentMap
+    from warpshadow.assets.primitives import icosphere
+    from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.scene.scene import METHODS, Body, Scene, Visibility
     from warpshadow.spheres import fit_spheres
 
     with _clear_errors():

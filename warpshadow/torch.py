@@ -15,17 +15,20 @@ import numpy as np
 import torch
 import warp as wp
 
-from warpshadow import check, deform
-from warpshadow.assembly import Geometry, as_geometry
-from warpshadow.basis import Basis, describe_coefficients
-from warpshadow.batch import common_batch
-from warpshadow.camera import Camera, compose_clip_matrices
-from warpshadow.deform import Poses, Vec6
-from warpshadow.light import EnvironmentMap
-from warpshadow.renderer import Renderer
-from warpshadow.scene import Scene
-from warpshadow.tape import recorded, unrecorded
-from warpshadow.threads import one_at_a_time, one_call
+from warpshadow import check
+from warpshadow.assets.basis import Basis, describe_coefficients
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.batch import common_batch
+from warpshadow.device.tape import recorded, unrecorded
+from warpshadow.device.threads import one_at_a_time, one_call
+from warpshadow.pipeline.assembly import Geometry, as_geometry
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.scene.scene import Scene
+from warpshadow.stages import rotations
+from warpshadow.stages.poses import Poses
+from warpshadow.stages.project import compose_clip_matrices
+from warpshadow.stages.rotations import Vec6
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 _GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
@@ -46,9 +49,9 @@ class TorchRenderer(torch.nn.Module):
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        renderer: The :class:`warpshadow.renderer.Renderer` whose methods it calls.
+        renderer: The :class:`warpshadow.Renderer` whose methods it calls.
 
-    Threads may share it, and it can be copied, pickled and saved, as :class:`warpshadow.renderer.Renderer` can.
+    Threads may share it, and it can be copied, pickled and saved, as :class:`warpshadow.Renderer` can.
     """
 
     def __init__(
@@ -206,7 +209,7 @@ class TorchRenderer(torch.nn.Module):
         *,
         rest: Geometry | None = None,
     ) -> Geometry:
-        """Exchange the shape of one body at rest, as :meth:`warpshadow.assembly.Assembly.deformed` does.
+        """Exchange the shape of one body at rest, as :meth:`warpshadow.pipeline.assembly.Assembly.deformed` does.
 
         Args:
             number: The body, from 0.
@@ -272,7 +275,7 @@ class TorchRenderer(torch.nn.Module):
 
 
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
-    """Make rotation matrices of free parameters, as :func:`warpshadow.deform.rotation_matrices` does.
+    """Make rotation matrices of free parameters, as :func:`warpshadow.stages.rotations.rotation_matrices` does.
 
     Args:
         parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
@@ -283,7 +286,8 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
         Rotations, shape [..., 3, 3].
 
     Raises:
-        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.deform.rotation_matrices` says.
+        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.stages.rotations.rotation_matrices`
+            says.
 
     Differentiable: parameters.
     """
@@ -291,7 +295,7 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
     rows = parameters.reshape(1, -1, *dtype._shape_)
-    matrices = apply(deform.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
+    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
     return matrices.reshape(*parameters.shape[:-1], 3, 3)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from warpshadow import files
+from warpshadow.assets import files
 
 _MARK = b"warpshadow checkpoint 1\n"
 

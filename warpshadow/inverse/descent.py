@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from warpshadow import check
-from warpshadow.camera import Camera
+from warpshadow.assets.camera import Camera
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model, make_model
@@ -25,7 +25,7 @@ from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.stages import Stage, check_stages
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene import Scene
+from warpshadow.scene.scene import Scene
 
 WINDOW = 25
 """Iterations over which a loss must fall for its stage to go on."""

@@ -17,16 +17,16 @@ import torch
 import warp as wp
 
 from warpshadow import check
-from warpshadow.basis import Basis, CellBasis, HarmonicBasis
-from warpshadow.camera import Camera
-from warpshadow.directions import check_count, fibonacci
+from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.world import Found, Setting, World
-from warpshadow.light import EnvironmentMap
-from warpshadow.renderer import Renderer
-from warpshadow.scene import SPHERE_METHODS, Body, Scene, Visibility
-from warpshadow.sh import check_order, equirectangular_directions
+from warpshadow.maths.directions import check_count, fibonacci
+from warpshadow.maths.sh import check_order, equirectangular_directions
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene, Visibility
 from warpshadow.spheres import Spheres
-from warpshadow.texture import fill_unseen
+from warpshadow.stages.textures.sample import fill_unseen
 from warpshadow.torch import apply, rotation_matrices
 
 Values = dict[str, torch.Tensor]
@@ -319,7 +319,8 @@ class Texture(FreeOfBody):
         body = scene.bodies[self.body]
         if body.mesh.uvs is None:
             raise ValueError(
-                f"body: got {self.body}, whose mesh has no uvs; expected uvs, as warpshadow.mesh.unwrap makes them"
+                f"body: got {self.body}, whose mesh has no uvs; expected uvs, as "
+                "warpshadow.assets.unwrap.unwrap makes them"
             )
         if body.texture is None and np.ndim(body.albedo) > 1:
             raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected one color")

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 
 from warpshadow import check
-from warpshadow.basis import Basis
-from warpshadow.blockers import scene_blockers
-from warpshadow.camera import Camera
+from warpshadow.assets.basis import Basis
+from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free import Albedo, Free, Light, Texture, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene import AUTO, METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
-from warpshadow.tables import located
+from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.scene import AUTO, METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.toml_tables import located
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Problem:
         if self.still is not None:
             check.choice("still.method", self.still.method, METHODS)
         if self.scene.visibility.method == AUTO:
-            from warpshadow.tuning import resolved  # which renders to find out
+            from warpshadow.tuning.tune import resolved  # which renders to find out
 
             object.__setattr__(self, "scene", resolved(self.scene))
         if self.moves and self.scene.visibility.method == "ray-traced":

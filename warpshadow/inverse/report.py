@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpshadow import files, tables
-from warpshadow.image import write_image
+from warpshadow.assets import files
+from warpshadow.assets.image import write_image
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.preview import white_of
 from warpshadow.inverse.stages import Stage
-from warpshadow.light import EnvironmentMap
-from warpshadow.scene_file import camera_table, write_scene
-from warpshadow.sh import reconstruct_map
+from warpshadow.maths.sh import reconstruct_map
+from warpshadow.scene import toml_tables
+from warpshadow.scene.files import camera_table, write_scene
 
 _MAP_HEIGHT = 64  # of a map of spherical harmonics [pixels]
 
@@ -50,7 +51,7 @@ class Report:
         """Write it.
 
         Args:
-            folder: Made if it is not there. It gets the scene as :func:`warpshadow.scene_file.write_scene` writes it,
+            folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it,
                 to be rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended,
                 and of each view the camera and the exposure, which a scene does not have); parameters.npz (all values,
                 as the fit holds them); before.png and after.png beside target.png; and loss.png where matplotlib is
@@ -65,7 +66,7 @@ class Report:
         if not isinstance(scene.light, EnvironmentMap):
             write_image(folder / "light.exr", reconstruct_map(scene.light, _MAP_HEIGHT).astype(np.float32))
             written.append(folder / "light.exr")
-        tables.write(folder / "summary.toml", self._summary())
+        toml_tables.write(folder / "summary.toml", self._summary())
         values: dict[str, Any] = {
             f"{name}.{key}": each.cpu().numpy() for name, own in result.values.items() for key, each in own.items()
         }
@@ -74,7 +75,7 @@ class Report:
         written += [folder / "summary.toml", folder / "parameters.npz"]
         return [*written, *self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
 
-    def _summary(self) -> tables.Table:
+    def _summary(self) -> toml_tables.Table:
         found, seconds = self.result.found, self.result.seconds
         fit = {
             "reason": self.result.reason,

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from warpshadow import check
-from warpshadow.directions import check_count
 from warpshadow.inverse.problem import Problem
-from warpshadow.scene import Visibility, check_supersampling
+from warpshadow.maths.directions import check_count
+from warpshadow.scene.scene import Visibility, check_supersampling
 
 LAST_RATE = 0.1
 """Share of its learning rate that a stage ends with."""

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from warpshadow import check
-from warpshadow.camera import Camera
-from warpshadow.image import linear_to_srgb, read_image
-from warpshadow.tables import located
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.image import linear_to_srgb, read_image
+from warpshadow.scene.toml_tables import located
 
 _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 import warp as wp
 
-from warpshadow.assembly import Geometry
-from warpshadow.blockers import scene_blockers
-from warpshadow.camera import Camera
-from warpshadow.deform import DeformationGraph
-from warpshadow.scene import SPHERE_METHODS, Scene, Visibility
+from warpshadow.assets.camera import Camera
+from warpshadow.pipeline.assembly import Geometry
+from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.scene import SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
+from warpshadow.stages.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer
 
 

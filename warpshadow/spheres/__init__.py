@@ -8,7 +8,7 @@
     fit         the stages in order, the search for an error, the cache
 
 Stage 1 serves volume, stage 2 serves light: spheres leave the mesh where that helps the shadow. It sees the cones of
-warpshadow.visibility.cones with the soft edge of the directional method, so the rules that a renderer applies to
+warpshadow.stages.visibility.cones with the soft edge of the directional method, so the rules that a renderer applies to
 receivers on and inside spheres are part of what is fitted.
 """
 

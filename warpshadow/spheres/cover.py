@@ -13,8 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
-from warpshadow.directions import fibonacci
-from warpshadow.parallel import launch_slices
+from warpshadow.device.parallel import launch_slices
+from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
 

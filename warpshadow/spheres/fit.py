@@ -17,16 +17,17 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow import check, files
-from warpshadow.mesh import Mesh
-from warpshadow.order import compact_order
+from warpshadow import check
+from warpshadow.assets import files
+from warpshadow.assets.mesh import Mesh
+from warpshadow.device.tape import unrecorded
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
-from warpshadow.tape import unrecorded
-from warpshadow.threads import one_at_a_time
 
 ALGORITHM_VERSION = 3
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""

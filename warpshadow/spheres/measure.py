@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warpshadow.directions import fibonacci
-from warpshadow.reference import trace_visibility
+from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
+from warpshadow.stages.ray_tracing import trace_visibility
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warpshadow.mesh import vertex_normals
+from warpshadow.stages.normals import vertex_normals
 
 
 @wp.func

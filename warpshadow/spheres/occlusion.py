@@ -3,8 +3,8 @@
 import warp as wp
 
 from warpshadow import check
-from warpshadow.lanes import lane_type
-from warpshadow.visibility.cones import BLEND, cone_function
+from warpshadow.device.lanes import lane_type
+from warpshadow.stages.visibility.cones import BLEND, cone_function
 
 _cone = cone_function(1)
 _Lane = lane_type(1)
@@ -45,7 +45,7 @@ def _exact_occlusion(
 def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
     """Test which rays spheres block, without any smoothing: the reference of the approximations.
 
-    A receiver on or inside a sphere sees it as warpshadow.visibility.cones has it: as a hemisphere around the
+    A receiver on or inside a sphere sees it as warpshadow.stages.visibility.cones has it: as a hemisphere around the
     direction of its center, and not at all nearer than FADE/2 radii to the center.
 
     Args:

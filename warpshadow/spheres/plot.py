@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpshadow import files
-from warpshadow.mesh import Mesh
+from warpshadow.assets import files
+from warpshadow.assets.mesh import Mesh
 from warpshadow.spheres.sphere_set import Spheres
 
 

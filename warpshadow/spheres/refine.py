@@ -1,8 +1,8 @@
 """Stage 2: spheres that let through the light that the mesh lets through.
 
 Receivers on the mesh, on grounds below it and in a shell around it know from rays which directions they see. Adam moves
-and grows spheres until their transmittance, with the soft edge of warpshadow.visibility.directional, says the same
-after smoothing by lights of several sharpnesses; spheres that matter little are relocated on the way.
+and grows spheres until their transmittance, with the soft edge of warpshadow.stages.visibility.directional, says the
+same after smoothing by lights of several sharpnesses; spheres that matter little are relocated on the way.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.lanes import lane_type
-from warpshadow.parallel import launch_slices
+from warpshadow.device.lanes import lane_type
+from warpshadow.device.parallel import launch_slices
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.visibility.cones import cone_function
+from warpshadow.stages.visibility.cones import cone_function
 
 LANES = 16
 """Directions that a thread handles at once."""

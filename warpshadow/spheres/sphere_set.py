@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpshadow import check, files
+from warpshadow import check
+from warpshadow.assets import files
 
 
 @dataclass(frozen=True, eq=False)

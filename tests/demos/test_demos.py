@@ -1,0 +1,68 @@
+"""The demos that are short loops of their own, at a size at which they take no time."""
+
+import dataclasses
+
+import gradients
+import numpy as np
+import pytest
+import shadow_gradient
+import torch
+import warp as wp
+import warp_loop
+from benchmark import bunny_scene
+from scenes import on_ground
+
+import warpshadow as ws
+
+SPHERES = ws.Spheres([(0.2, 0, 0), (-0.2, 0.1, 0), (0, 0.2, 0.2)], [0.3, 0.25, 0.2])
+
+
+def test_the_pure_warp_loop_finds_the_way_to_a_pose():
+    mesh = ws.icosphere(1.0, 2)
+    mesh = ws.Mesh(mesh.positions * np.float32([1.0, 0.7, 0.5]), mesh.faces)
+    sky = ws.synthetic_sky((-0.75, 0.6, -0.1), sun_radius=5.0, height=32)
+    scene = on_ground(mesh, sky, blockers=SPHERES, ground=ws.Body(ws.plane(6.0, 16)))
+    scene = ws.Scene(scene.bodies, sky, scene.camera.resized(1 / 16), ws.Visibility(directions=32))
+    renderer = ws.Renderer(scene)
+    truth = warp_loop.FreePose(renderer, warp_loop.TURN, warp_loop.SHIFT)
+    pose = warp_loop.FreePose(renderer)
+    angle, distance = pose.errors(truth)
+    assert angle == pytest.approx(15, rel=1e-4)
+    assert distance == pytest.approx(0.2, rel=1e-4)
+    losses = list(warp_loop.recover(pose, wp.clone(truth.draw(), requires_grad=False), 12))
+    assert len(losses) == 12
+    assert losses[-1] < 0.3 * losses[0]
+    closer_angle, closer_distance = pose.errors(truth)
+    assert closer_angle < 0.7 * angle
+    assert closer_distance < 0.7 * distance
+
+
+@pytest.mark.slow
+def test_a_shadow_seen_alone_has_the_derivatives_of_central_differences():
+    shadow = shadow_gradient.Shadow(SPHERES, 12)
+    assert set(np.unique(shadow.renderer.renderer.body_ids())) == {1}
+    got, expected = shadow_gradient.by_adjoint(shadow), shadow_gradient.by_differences(shadow)
+    assert (torch.linalg.norm(expected, dim=(0, 1)) > 1).all()
+    assert (shadow_gradient.relative_errors(got, expected) < 1e-2).all()
+
+
+def test_a_shadow_seen_alone_tells_the_way_of_what_casts_it():
+    shadow = shadow_gradient.Shadow(SPHERES, 12)
+    assert (shadow_gradient.cosines(shadow, torch.arange(4) * torch.pi / 2) > 0.9).all()
+
+
+def test_a_small_image_has_the_gradient_of_its_differences():
+    """At a size at which fits begin faces are smaller than samples; by the slopes of single ones the error is 16%."""
+    scene = dataclasses.replace(bunny_scene(), visibility=ws.Visibility("none"))
+    renderer = gradients.renderer_of(scene, 64, 2)
+    got, expected = (of(renderer, gradients.pose_image, 5) for of in (gradients.gradients, gradients.differences))
+    assert gradients.relative_error(got, expected) < 0.08
+
+
+def test_the_pictures_of_the_demos_are_drawn(tmp_path):
+    image = wp.full((1, 4, 4), wp.vec4(0.2, 0.4, 0.6, 1.0), dtype=wp.vec4)
+    warp_loop.plot({"target": image, "start": image}, tmp_path / "loop.png")
+    derivatives = np.linspace(-1, 1, 16).reshape(4, 4)
+    shadow_gradient.plot(image.numpy()[0], derivatives, 0.9 * derivatives, tmp_path / "gradient.png")
+    for name in ("loop.png", "gradient.png"):
+        assert np.ptp(ws.read_image(tmp_path / name)[..., :3]) > 0.1

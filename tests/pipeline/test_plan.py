@@ -1,0 +1,660 @@
+"""Plans: what is left out changes nothing, what changes is noticed, and what is said to be left out is left out."""
+
+import dataclasses
+import functools
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.assets.basis import HarmonicBasis
+from warpshadow.device.batch import expand
+from warpshadow.pipeline import assembly, still
+from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.views import View
+from warpshadow.stages.light_samples import sample_map
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.poses import Poses
+from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
+from warpshadow.stages.visibility import directional
+from warpshadow.torch import TorchRenderer
+
+METHODS = ("directional", "log-sh", "none")
+# The same float32 numbers, summed in another order.
+FLOAT32 = 1e-5
+# Exponentials of sums of float32 logs: squarings amplify how they are rounded.
+EXPONENTIAL = 1e-3
+# What rays find differs from sphere to mesh, by receiver and from run to run of the directions: 1.3% at 1024 rays.
+RAY_NOISE = 0.02
+
+UNIT_SPHERE = ws.Spheres([[0, 0, 0]], [1.0])
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tensors this small gain nothing from threads, which wait for each other where cores are shared."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(count)
+
+
+def scene_of(method: str = "directional", *, still_blocks: bool = True, size: int = 24, **options) -> ws.Scene:
+    """Two balls over a textured ground."""
+    balls = [
+        ws.Body(ws.icosphere(1.0, 2), albedo=(0.7, 0.5, 0.3), blockers=spheres, translation=place, scale=0.5)
+        for spheres, place in ((UNIT_SPHERE, (-0.7, 0.8, 0.4)), (UNIT_SPHERE if still_blocks else 0, (0.6, 0.6, 0)))
+    ]
+    texture = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3))
+    ground = ws.Body(ws.plane(5.0, 16), texture=texture, blockers=0)
+    sky = ws.synthetic_sky((-0.6, 0.6, 0.3), height=32, sun_radius=8)
+    camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.5, 0), size=(size, size))
+    visibility = ws.Visibility(method, directions=32, order=4, samples=256)
+    return ws.Scene((*balls, ground), sky, camera, dataclasses.replace(visibility, **options))
+
+
+def poses_of(renderer: Renderer, shift=(0.0, 0.0, 0.0), requires_grad: bool = False) -> Poses:
+    """The scene's, the first body shifted."""
+    poses = renderer.assembly.poses
+    translations = poses.translations.numpy().copy()
+    translations[:, 0] += shift
+    moved = wp.array(translations, dtype=wp.vec3, device=renderer.device, requires_grad=requires_grad)
+    return Poses(poses.rotations, moved, poses.scales)
+
+
+def gradient_and_image(renderer: Renderer, moving, *, light=None, shift=(0.1, -0.1, 0.2)) -> tuple[np.ndarray, ...]:
+    """Of a weighted sum of the image to translations of all bodies, and the image."""
+    poses = poses_of(renderer, shift, requires_grad=True)
+    with wp.Tape() as tape:
+        image = renderer.draw(light, view=renderer.view(renderer.assembly.placed(poses, moving=moving)))
+    weights = np.random.default_rng(1).normal(size=(*image.shape, 4)).astype(np.float32)
+    tape.backward(grads={image: wp.array(weights, dtype=wp.vec4, device=renderer.device)})
+    return poses.translations.grad.numpy()[0], image.numpy()
+
+
+def free_light(renderer: Renderer, requires_grad: bool = False) -> wp.array:
+    values = np.random.default_rng(2).uniform(0.1, 1, (1, renderer.basis.size, 3))
+    return wp.array(values, dtype=wp.vec3, device=renderer.device, requires_grad=requires_grad)
+
+
+def assert_near(got: np.ndarray, expected: np.ndarray, tolerance: float = FLOAT32) -> None:
+    assert np.abs(got - expected).max() <= tolerance * np.abs(expected).max()
+
+
+# ---------------------------------------------------------------------------------------------- views that stand
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", (*METHODS, "ray-traced"))
+def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
+    renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
+    light = free_light(renderer)
+    for _ in range(2):
+        geometry = renderer.assembly.placed(poses_of(renderer, (0.2, 0.1, 0)))
+        view = renderer.view(geometry)
+        known, free = renderer.draw(view=view).numpy(), renderer.draw(light, view=view).numpy()
+    assert renderer.view(geometry) is view
+    view = fresh.view(geometry)
+    np.testing.assert_array_equal(known, fresh.draw(view=view).numpy())
+    np.testing.assert_array_equal(free, fresh.draw(light, view=view).numpy())
+    monkeypatch.setattr(wp, "launch", None)
+    assert renderer.shade(view=renderer.view(geometry)) is renderer.shade(view=renderer.view(geometry))
+
+
+@pytest.mark.parametrize("method", (*METHODS, "ray-traced"))
+def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch):
+    renderer = Renderer(scene_of(method))
+    coefficients = np.random.default_rng(6).uniform(0.1, 1, (9, 3)).astype(np.float32)
+    for light in (ws.synthetic_sky(height=32), coefficients):
+        first = renderer.shade(light)
+        scenes = renderer.shade()
+        np.testing.assert_array_equal(first.numpy(), Renderer(scene_of(method)).shade(light).numpy())
+        with monkeypatch.context() as patch:
+            patch.setattr(wp, "launch", None)
+            assert renderer.shade(light) is first and renderer.shade() is scenes
+    coefficients *= 2
+    assert_near(renderer.shade(coefficients).numpy(), 2 * first.numpy())
+
+
+@pytest.mark.parametrize("name", ["positions", "centers", "radii", "clip_matrices"])
+def test_what_is_mutated_in_place_is_seen_anew(name):
+    renderer = Renderer(scene_of())
+    geometry = renderer.assembly.placed(poses_of(renderer))
+    clip_matrices = wp.clone(renderer.clip_matrices)
+    before = renderer.view(geometry, clip_matrices)
+    first = renderer.draw(view=before).numpy().copy()
+    array = clip_matrices if name == "clip_matrices" else getattr(geometry, name)
+    array.assign(array.numpy() * np.float32(1.25) if name != "clip_matrices" else array.numpy() + np.eye(4) * 0.1)
+    after = renderer.view(geometry, clip_matrices)
+    image = renderer.draw(view=after).numpy()
+    assert after is not before and (image != first).any()
+    fresh = Renderer(scene_of())
+    np.testing.assert_array_equal(image, fresh.draw(view=fresh.view(geometry, clip_matrices)).numpy())
+
+
+def test_a_view_is_of_its_geometry_as_it_was():
+    """The arrays change before anything is computed from the view."""
+    renderer = Renderer(scene_of())
+    geometry = renderer.assembly.placed(poses_of(renderer, (0.1, 0, 0)))
+    expected = renderer.draw(view=renderer.view(geometry)).numpy().copy()
+    other = Renderer(scene_of())
+    view = other.view(geometry)
+    for array in geometry:
+        array.zero_()
+    np.testing.assert_array_equal(other.draw(view=view).numpy(), expected)
+
+
+def test_tensors_that_are_mutated_in_place_are_seen_anew():
+    renderer = TorchRenderer(scene_of())
+    rotations, translations, scales = renderer.scene_poses()
+    geometry = renderer.placed(rotations, translations, scales)
+    first = renderer(geometry=geometry)
+    assert torch.equal(renderer(geometry=geometry), first)
+    geometry.positions.mul_(1.1)
+    second = renderer(geometry=geometry)
+    assert not torch.equal(second, first)
+    assert torch.equal(second, TorchRenderer(scene_of())(geometry=geometry))
+
+
+def test_free_light_over_a_given_geometry_has_the_gradient_that_it_has_over_the_scenes():
+    renderer = TorchRenderer(scene_of())
+    light = torch.ones(renderer.renderer.basis.size, 3, requires_grad=True)
+    geometry = renderer.placed(*renderer.scene_poses())
+    gradients = []
+    for given in (None, geometry, geometry):
+        gradients.append(torch.autograd.grad(renderer(light, geometry=given).square().sum(), light)[0])
+    assert torch.equal(gradients[0], gradients[1]) and torch.equal(gradients[1], gradients[2])
+
+
+def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_beside_cameras():
+    """Alone, samples are exposed as it is found what they reflect, in light that is kept; lights take turns."""
+    renderer, random = TorchRenderer(scene_of()), np.random.default_rng(7)
+    texture, colors, weights = (
+        torch.tensor(random.uniform(size=shape), dtype=torch.float32) for shape in ((8, 8, 3), (162, 3), (24, 24, 4))
+    )
+    texture.requires_grad_(), colors.requires_grad_()
+    cameras = torch.tensor(renderer.renderer.clip_matrices.numpy()[0], requires_grad=True)
+    coefficients = torch.tensor(free_light(renderer.renderer).numpy()[0])
+    other = ws.synthetic_sky((0.4, 0.8, 0.1), height=32, sun_radius=8)
+    for light in (None, other, None, coefficients, 2 * coefficients, other):
+        results = []
+        for clip_matrices in (None, cameras):
+            given = {"albedo": [None, colors, None], "textures": [None, None, texture], "clip_matrices": clip_matrices}
+            image = renderer(light, **given)
+            gradients = torch.autograd.grad((image * weights).sum(), [texture, colors])
+            results.append([value.detach().numpy() for value in (image, *gradients)])
+        for alone, beside in zip(*results, strict=True):
+            assert_near(alone, beside, 10 * FLOAT32)
+
+
+# ---------------------------------------------------------------------------------------------- moving bodies
+
+
+@pytest.mark.parametrize("is_free", [False, True])
+@pytest.mark.parametrize("method", METHODS)
+def test_bodies_without_blockers_that_stand_still_change_nothing(method, is_free):
+    renderer = Renderer(scene_of(method, still_blocks=False))
+    light = free_light(renderer) if is_free else None
+    for _ in range(2):
+        gradient, image = gradient_and_image(renderer, [0], light=light)
+    expected_gradient, expected = gradient_and_image(renderer, None, light=light)
+    assert_near(image, expected)
+    assert_near(gradient[0], expected_gradient[0], 5 * FLOAT32)
+    assert not gradient[1:].any()
+
+
+@pytest.mark.parametrize("is_free", [False, True])
+def test_log_sums_of_spheres_that_stand_still_change_nothing(is_free):
+    renderer = Renderer(scene_of("log-sh"))
+    light = free_light(renderer) if is_free else None
+    for _ in range(2):
+        gradient, image = gradient_and_image(renderer, [0], light=light)
+    expected_gradient, expected = gradient_and_image(renderer, None, light=light)
+    assert_near(image, expected, EXPONENTIAL)
+    assert_near(gradient[0], expected_gradient[0], EXPONENTIAL)
+    assert not gradient[1:].any()
+
+
+def mesh_of(body: ws.Body) -> wp.Mesh:
+    mesh = body.world_mesh()
+    return wp.Mesh(wp.array(mesh.positions, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
+
+
+def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.ndarray]:
+    """Of the receivers on still bodies, where the moving one is too far away to matter: as rendered, and by rays."""
+    view = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
+    shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.still)]
+    vertices = renderer.assembly.scene_geometry.positions.numpy()[0]
+    normals = vertex_normals(renderer.assembly.scene_geometry.positions, renderer.assembly.faces).numpy()[0]
+    points, normals = (wp.array(values[view.receivers.still], dtype=wp.vec3) for values in (vertices, normals))
+    mesh = mesh_of(renderer.scene.bodies[1])
+    if light is None:
+        truth = trace_shading(mesh, points, normals, sample_map(renderer.scene.light.radiance, directions)).numpy()
+    else:
+        truth = trace_transfer(mesh, points, normals, renderer.basis, directions).numpy() @ light.numpy()[0]
+    return [shading, truth]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_free", [False, True])
+def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
+    """Under the sun, too: it is much smaller than a cell."""
+    renderer = Renderer(scene_of(samples=2048))
+    light = free_light(renderer) if is_free else None
+    shading, truth = shading_and_truth(renderer, light, 8192)
+    assert len(shading) > 200
+    assert np.linalg.norm(shading - truth) < RAY_NOISE * np.linalg.norm(truth)
+    view = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0))))  # any body may move
+    rows = view.receivers.of_vertices.numpy()[renderer.view(None).receivers.of_vertices.numpy() >= -1]
+    still = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.still
+    by_spheres = renderer.shade(light, view).numpy()[0, rows[still]]
+    assert np.linalg.norm(by_spheres - truth) > 3 * np.linalg.norm(shading - truth)
+
+
+@pytest.mark.parametrize("is_free", [False, True])
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differences(method, is_free):
+    """A weighted sum of the shading of receivers on still bodies, to the translation of the moving one."""
+    renderer = Renderer(scene_of(method, samples=64))
+    light = free_light(renderer) if is_free else None
+    weight_of_vertex = np.random.default_rng(3).uniform(0.5, 1, (len(renderer.assembly.body_of_vertex), 3))
+
+    def view_of(poses: Poses) -> View:
+        return renderer.view(renderer.assembly.placed(poses, moving=[0]))
+
+    def weights_of(view: View) -> np.ndarray:
+        weights = np.zeros((1, (view.receivers.of_vertices.numpy() >= 0).sum(), 3), np.float32)
+        vertices = view.receivers.still
+        weights[0, : len(vertices)] = weight_of_vertex[vertices] * np.isin(vertices, always_seen)[:, None]
+        return weights
+
+    def loss(shift: np.ndarray) -> float:
+        view = view_of(poses_of(renderer, shift))
+        return (renderer.shade(light, view).numpy().astype(float) * weights_of(view)).sum()
+
+    step = 4e-3  # at which float32 rounding and curvature are both below the tolerance
+    shifts = step * np.concatenate([np.eye(3), -np.eye(3)])
+    seen = [view_of(poses_of(renderer, shift)).receivers.still for shift in shifts]
+    always_seen = functools.reduce(np.intersect1d, seen)
+    differences = np.array([loss(shift) for shift in shifts])
+    poses = poses_of(renderer, requires_grad=True)
+    with wp.Tape() as tape:
+        view = view_of(poses)
+        shading = renderer.shade(light, view)
+    tape.backward(grads={shading: wp.array(weights_of(view), dtype=wp.vec3, device=renderer.device)})
+    assert_near(poses.translations.grad.numpy()[0, 0], (differences[:3] - differences[3:]) / (2 * step), 1e-2)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_instances_share_what_stands_still(method):
+    renderer = Renderer(scene_of(method))
+    poses = renderer.assembly.poses
+    shifts = np.zeros((3, 3, 3))
+    shifts[:, 0] = np.random.default_rng(4).normal(size=(3, 3)) * [0.2, 0.1, 0.2]
+    translations = poses.translations.numpy() + shifts
+
+    def image_and_gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        count = len(values)
+        rotations, scales = (expand(array, count) for array in (poses.rotations, poses.scales))
+        moved = wp.array(values, dtype=wp.vec3, device=renderer.device, requires_grad=True)
+        with wp.Tape() as tape:
+            geometry = renderer.assembly.placed(Poses(rotations, moved, scales), moving=[0])
+            image = renderer.draw(view=renderer.view(geometry))
+        tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0, 2.0, 3.0, 4.0), dtype=wp.vec4)})
+        return image.numpy().copy(), moved.grad.numpy()
+
+    images, gradients = image_and_gradient(translations)
+    for number in range(3):
+        image, gradient = image_and_gradient(translations[number : number + 1])
+        assert_near(images[number], image[0])
+        assert_near(gradients[number], gradient[0], 10 * FLOAT32)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_cameras_share_what_stands_still(method):
+    cameras = [ws.Camera.look_at(eye, (0, 0.5, 0), size=(24, 24)) for eye in ((0.5, 2.2, 4.6), (3, 1.5, -3))]
+    renderer = Renderer(scene_of(method, still_blocks=False), cameras=cameras)
+    gradient, image = gradient_and_image(renderer, [0])
+    expected_gradient, expected = gradient_and_image(renderer, None)
+    assert image.shape[0] == 2
+    assert_near(image, expected)
+    assert_near(gradient[0], expected_gradient[0], 5 * FLOAT32)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_samples_that_are_receivers_are_lit_by_everything_that_moves_or_not(method):
+    """Bodies that stand still and have no spheres: nothing may change."""
+    scene = scene_of(method, still_blocks=False)
+    ground = dataclasses.replace(scene.bodies[2], receivers="pixel")
+    renderer = Renderer(dataclasses.replace(scene, bodies=(*scene.bodies[:2], ground)))
+    gradient, image = gradient_and_image(renderer, [0])
+    expected_gradient, expected = gradient_and_image(renderer, None)
+    assert_near(image, expected)
+    assert_near(gradient[0], expected_gradient[0], 5 * FLOAT32)
+
+
+# ---------------------------------------------------------------------------------------------- few bands
+
+
+@pytest.mark.parametrize("method", ["log-sh", "none"])
+def test_light_of_few_bands_gives_the_image_that_it_gives_with_all_of_them(method):
+    """Free light in a basis of few bands over a pose with a gradient, and known light."""
+    few, all_ = (Renderer(scene_of(method), basis=HarmonicBasis(order)) for order in (2, 4))
+    values = np.random.default_rng(5).uniform(0.1, 1, (4, 3)).astype(np.float32)
+    padded = np.concatenate([values, np.zeros((12, 3), np.float32)])
+    light, same = (wp.array(each[None], dtype=wp.vec3) for each in (values, padded))
+    gradient, image = gradient_and_image(few, None, light=light)
+    expected_gradient, expected = gradient_and_image(all_, None, light=same)
+    assert_near(image, expected)
+    assert_near(gradient, expected_gradient, 5 * FLOAT32)
+    for got, whole in ((values, padded), (light, same)):
+        assert_near(few.draw(got).numpy(), all_.draw(whole).numpy())
+    assert few.transfer.shape[-1] == 4 and "4 coefficients" in str(few.explain(2 * values))
+
+
+# ---------------------------------------------------------------------------------------------- what no longer stands
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_other_bodies_that_move_are_noticed(method):
+    renderer = Renderer(scene_of(method))
+    for moving in ([0], [1], [0, 1], [2], [], [0]):
+        fresh = Renderer(scene_of(method))
+        image, expected = (
+            each.draw(view=each.view(each.assembly.placed(poses_of(each, (0.1, 0, 0)), moving=moving))).numpy()
+            for each in (renderer, fresh)
+        )
+        np.testing.assert_array_equal(image, expected)
+    assert_near(image, expected)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bodies_that_stand_elsewhere_are_noticed(method):
+    """A geometry that was not placed, in which what is said to stand still stands somewhere else."""
+    renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
+    image = renderer.draw(view=renderer.view(renderer.assembly.placed(moving=[0]))).numpy().copy()
+    poses = renderer.assembly.poses
+    shift = wp.array(poses.translations.numpy() + np.array([[[0, 0, 0], [0.3, 0.1, 0.2], [0, 0, 0]]]), dtype=wp.vec3)
+    elsewhere = Geometry(*renderer.assembly.placed(Poses(poses.rotations, shift, poses.scales)), moving=[0])
+    moved = renderer.draw(view=renderer.view(elsewhere)).numpy()
+    assert (moved != image).any()
+    np.testing.assert_array_equal(moved, fresh.draw(view=fresh.view(elsewhere)).numpy())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_another_camera_sees_what_stands_still_anew(method):
+    """It shows vertices that the first did not, and shows all of them elsewhere."""
+    renderer = Renderer(scene_of(method))
+    images = []
+    for camera in (renderer.scene.camera, ws.Camera.look_at((-3, 1.0, -3.6), (0.4, 0.3, 0), size=(24, 24))):
+        clip_matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44)
+        fresh = Renderer(scene_of(method))
+        image, expected = (
+            each.draw(
+                view=each.view(each.assembly.placed(poses_of(each, (0.1, 0, 0)), moving=[0]), clip_matrices)
+            ).numpy()
+            for each in (renderer, fresh)
+        )
+        assert_near(image, expected)
+        images.append(image)
+    assert (images[0] != images[1]).any()
+
+
+def test_instances_that_differ_in_what_stands_still_are_refused():
+    renderer = Renderer(scene_of("none"))
+    positions, centers, radii = renderer.geometry
+    two = wp.array(positions.numpy() * np.array([1, 1.1])[:, None, None], dtype=wp.vec3)
+    with pytest.raises(ValueError, match=r"geometry: got instances that differ in more than the bodies \(0,\)"):
+        renderer.view(Geometry(two, centers, radii, moving=[0]))
+
+
+def test_a_body_that_moves_is_one_of_the_scenes():
+    renderer = Renderer(scene_of("none"))
+    with pytest.raises(ValueError, match="moving: got 3, expected the number of a body, from 0 to 2"):
+        renderer.assembly.placed(moving=[3])
+
+
+def test_what_is_deformed_moves():
+    renderer = TorchRenderer(scene_of())
+    points = torch.tensor(renderer.renderer.scene.bodies[1].mesh.positions)[None] * 1.1
+    rest = renderer.deformed(1, points)
+    assert rest.moving == (1,)
+    poses = renderer.scene_poses()
+    assert renderer.placed(*poses, rest=rest, moving=[0]).moving == (0, 1)
+    assert renderer.placed(*poses, rest=rest).moving is None
+    whole = renderer.placed(*poses, rest=rest)
+    for part, expected in zip(renderer.placed(*poses, rest=rest, moving=[0]), whole, strict=True):
+        assert torch.equal(part, expected)
+
+
+# ---------------------------------------------------------------------------------------------- what is launched
+
+VISIBILITY = "visibility"
+SHADOWS = ("still shadows", "still visibility", VISIBILITY)
+
+
+def stage_of(kernel: wp.Kernel) -> str | None:
+    """The stage that a kernel belongs to; None for copies, and for poses, which come before."""
+    module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
+    if module in ("batch", "deform"):
+        return None
+    if module.startswith("visibility") or module == "reference" or key == "_add_rows":
+        return VISIBILITY
+    if module == "silhouette":
+        after = {
+            "_find_edge_colors": "contrasts",
+            "blend": "smoothing",
+            "_measure_adjoint": "smoothing",
+        }
+        return next((name for part, name in after.items() if part in key), "silhouettes")
+    if module == "texture":
+        parts = {"footprints": "footprints", "_expose": "exposure", "_sample": "reflectance"}
+        return next((name for part, name in parts.items() if part in key), "mip pyramids")
+    if module == "raster":
+        return "reflectance" if "interpol" in key else "rasterization"
+    if module in ("transfer", "still"):
+        return "shading" if "_light_cells" in key else "transfer"
+    if module == "slopes":
+        return "contrasts"
+    if module == "film":
+        return "averaging" if "average" in key else "exposure"
+    same = {name: name for name in ("receivers", "shading", "sides")}
+    return {"camera": "clip positions", "mesh": "normals", **same}[module]
+
+
+class Launches:
+    """Counts launches by stage, those of a call and those of its adjoint."""
+
+    def __init__(self, monkeypatch):
+        self.counts: Counter = Counter()
+        launch = wp.launch
+
+        def counted(kernel, *arguments, **options):
+            self.counts[stage_of(kernel)] += 1
+            return launch(kernel, *arguments, **options)
+
+        monkeypatch.setattr(wp, "launch", counted)
+
+    def of(self, call, variables) -> tuple[set, set]:
+        """Stages that a call launches, and those of its adjoint, which is asked for gradients to variables."""
+        results = []
+        for variable in variables:
+            variable.grad.zero_()
+        with wp.Tape() as tape:
+            self.counts.clear()
+            image = call()
+            results.append({name for name in self.counts if name})
+        self.counts.clear()
+        if image.requires_grad:
+            tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4, device=image.device)})
+        return results[0], {name for name in self.counts if name}
+
+
+def said(explanation) -> tuple[set, set]:
+    """Stages that are said to run, and to be played back; all shadows as one."""
+    stages = explanation.stages.values()
+    return tuple(
+        {VISIBILITY if stage.name in SHADOWS else stage.name for stage in stages if getattr(stage, way)}
+        for way in ("forward", "backward")
+    )
+
+
+def texture_fit(renderer):
+    texture = wp.array(np.full((1, 8, 8, 3), 0.5), dtype=wp.vec3, device=renderer.device, requires_grad=True)
+    given = {"textures": [None, None, texture]}
+    return lambda: renderer.draw(**given), [texture], lambda: renderer.explain(**given)
+
+
+def light_fit(renderer):
+    light = free_light(renderer, requires_grad=True)
+    return lambda: renderer.draw(light), [light], lambda: renderer.explain(light)
+
+
+def still_image(renderer):
+    return renderer.draw, [], renderer.explain
+
+
+def pose_fit(renderer, moving=None, **given):
+    poses = poses_of(renderer, (0.1, 0, 0), requires_grad=True)
+
+    def geometry():
+        return renderer.assembly.placed(poses, moving=moving)
+
+    return (
+        lambda: renderer.draw(view=renderer.view(geometry()), **given),
+        [poses.translations],
+        lambda: renderer.explain(geometry=geometry(), **given),
+    )
+
+
+def one_of_three(renderer):
+    return pose_fit(renderer, [0])
+
+
+def light_over_one_of_three(renderer):
+    return pose_fit(renderer, [0], light=free_light(renderer))
+
+
+def radii_fit(renderer):
+    positions, centers, radii = renderer.geometry
+    radii = wp.clone(radii, requires_grad=True) if radii.size else radii
+    geometry = Geometry(positions, centers, radii)
+    variables = [radii] if radii.size else []
+    return (
+        lambda: renderer.draw(view=renderer.view(geometry)),
+        variables,
+        lambda: renderer.explain(geometry=geometry),
+    )
+
+
+def camera_fit(renderer):
+    matrices = wp.clone(renderer.clip_matrices, requires_grad=True)
+    return (
+        lambda: renderer.draw(view=renderer.view(None, matrices)),
+        [matrices],
+        lambda: renderer.explain(clip_matrices=matrices),
+    )
+
+
+FITS = [texture_fit, light_fit, still_image, pose_fit, one_of_three, light_over_one_of_three, radii_fit, camera_fit]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blocks", [True, False])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fit", FITS)
+def test_what_is_said_to_run_runs_and_what_is_said_to_be_left_out_is_left_out(fit, method, blocks, monkeypatch):
+    scene = scene_of(method)
+    if not blocks:
+        scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=0) for body in scene.bodies])
+    call, variables, explain = fit(Renderer(scene))
+    launches = Launches(monkeypatch)
+    for _ in range(3):  # the first call finds out what the others keep
+        explanation = explain()
+        assert launches.of(call, variables) == said(explanation)
+    if not blocks or method == "none":
+        assert not any(explanation[name] for name in SHADOWS)
+
+
+def test_only_what_moves_is_projected_onto_what_stands_still(monkeypatch):
+    """Pairs of receivers and spheres, forward; and the adjoint asks for no gradient to points that stand."""
+    renderer = Renderer(scene_of())
+    call, _, explain = one_of_three(renderer)
+    call()
+    asked = []
+    transmittance = directional.transmittance
+
+    def recorded(points, normals, centers, radii, *arguments, **options):
+        asked.append((points.shape[1], radii.shape[1], points.requires_grad))
+        return transmittance(points, normals, centers, radii, *arguments, **options)
+
+    monkeypatch.setattr(directional, "transmittance", recorded)
+    call()
+    on_still, on_moving = asked
+    assert on_still[1:] == (1, False) and on_moving[1:] == (2, True)
+    vertex_count = len(renderer.assembly.body_of_vertex)
+    assert 0 < on_still[0] < vertex_count - 162 and 0 < on_moving[0] <= 162
+    assert "1 spheres" in explain()["still visibility"].items and "2 spheres" in explain()["visibility"].items
+
+
+def test_rays_are_traced_once(monkeypatch):
+    renderer = Renderer(scene_of())
+    call, _, explain = one_of_three(renderer)
+    assert explain()["still shadows"]
+    call()
+    monkeypatch.setattr(still, "trace_cells", None)
+    call()
+    assert "not seen before" in explain()["still shadows"].forward.why
+
+
+# ---------------------------------------------------------------------------------------------- what is said
+
+
+def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
+    renderer = Renderer(scene_of())
+    call, variables, explain = texture_fit(renderer)
+    assert "the scene is seen for the first time" in str(explain())
+    with wp.Tape() as tape:
+        image = call()
+    tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
+    lines = str(explain()).splitlines()
+    assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
+    assert "–" in rasterization and "kept: the scene's geometry and cameras stand" in rasterization
+    (exposure,) = (line for line in lines[19:] if "exposure" in line)
+    assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
+    assert "2,304 samples" in exposure
+
+
+def test_an_explanation_computes_nothing(monkeypatch):
+    """Not even the spheres of bodies, which take seconds to fit."""
+    scene = scene_of()
+    scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
+    renderer = Renderer(scene)
+    monkeypatch.setattr(assembly, "scene_blockers", None)
+    monkeypatch.setattr(wp, "launch", None)
+    assert "up to 902 receivers × 21 spheres" in str(renderer.explain())
+
+
+def test_tensors_explain_themselves():
+    renderer = TorchRenderer(scene_of())
+    rotations, translations, scales = renderer.scene_poses()
+    geometry = renderer.placed(rotations, translations.requires_grad_(), scales, moving=[1])
+    explanation = renderer.renderer.explain(geometry=geometry)
+    assert explanation["still visibility"].backward and "a gradient to vertices" in explanation["normals"].forward.why
+    light = torch.ones(32, 3, requires_grad=True)
+    colors = torch.ones(3), torch.ones(162, 3, requires_grad=True), None
+    explanation = renderer.renderer.explain(light, albedo=colors, textures=[None, None, torch.ones(4, 4, 3)])
+    assert explanation["shading"].backward.why == "a gradient to light is asked for"
+    assert explanation["reflectance"].backward.why == "a gradient to albedo is asked for"
+    assert not explanation["mip pyramids"].backward
+    matrix = torch.tensor(renderer.renderer.scene.camera.clip_matrix(), dtype=torch.float32, requires_grad=True)
+    assert renderer.renderer.explain(clip_matrices=matrix)["clip positions"].backward
+    assert not renderer.renderer.explain(clip_matrices=matrix)["visibility"].backward

@@ -1,0 +1,440 @@
+"""Sphere fits: the formulas they rest on, what they promise, and how good they are."""
+
+import os
+import stat
+import sys
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.assets.primitives import icosphere
+from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.spheres import Spheres, exact_occlusion, fit_spheres, plot_spheres
+from warpshadow.spheres import cover as stage_1
+from warpshadow.spheres import fit as fit_module
+from warpshadow.spheres import refine as stage_2
+from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.stages.visibility.cones import BLEND, FADE
+from warpshadow.stages.visibility.directional import SOFTNESS, transmittance
+
+SEED = 3
+QUICK = {"steps": 60, "cache": False, "progress": False}
+
+
+def box(size=(1.0, 0.6, 0.8), segments=8) -> Mesh:
+    """A closed box with finely divided sides."""
+    trimesh = pytest.importorskip("trimesh")
+    solid = trimesh.creation.box(extents=size)
+    positions, faces = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, max(size) / segments)
+    return Mesh(positions, faces)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    return Mesh(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(faces))
+
+
+def bumpy() -> Mesh:
+    """An irregular closed mesh, whose best spheres are unlike each other."""
+    ball = icosphere(1.0, 3)
+    x, y, z = ball.positions.astype(np.float64).T
+    grow = 1 + 0.3 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.2 * np.sin(4 * z)
+    return Mesh(ball.positions * grow[:, None] * [1.3, 1.0, 0.7], ball.faces)
+
+
+@pytest.fixture
+def short_cover(monkeypatch):
+    """Fewer steps of stage 1 for tests that do not look at its result."""
+    monkeypatch.setattr(fit_module, "COVER_STEPS_FIRST", 5)
+
+
+# ------------------------------------------------------------------------------ float64 twins
+
+
+def twin_cone(distance):
+    """Cosine of the cone by the distance in radii."""
+    edge = 1 + BLEND
+    cosine, slope = np.sqrt(1 - edge**-2), edge**-3 / np.sqrt(1 - edge**-2)
+    t = np.clip((distance - 1) / BLEND, 0, 1)
+    blend = cosine * (3 * t**2 - 2 * t**3) + BLEND * slope * (t**3 - t**2)
+    return np.where(distance >= edge, np.sqrt(1 - np.maximum(distance, edge) ** -2), blend)
+
+
+def twin_near(distance):
+    t = np.minimum(distance / FADE, 1)
+    return t**2 * (3 - 2 * t)
+
+
+def twin_transmittance(points, directions, spheres, width):
+    """DESIGN.md section 4 with an edge of fixed width, [receiver, direction]."""
+    result = np.ones((len(points), directions.shape[1]))
+    for sphere in spheres:
+        toward = sphere[:3] - points
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = twin_cone(distance / sphere[3])
+        angle = np.arccos(cosine)
+        lo, hi = np.cos(np.minimum(angle + width, np.pi)), np.cos(np.maximum(angle - width, 0))
+        opacity = np.minimum(1, (1 - cosine) / (1 - (hi + lo) / 2)) * twin_near(distance / sphere[3])
+        t = np.einsum("pi,pqi->pq", toward / distance[:, None], directions)
+        t = np.clip((t - lo[:, None]) / (hi - lo)[:, None], 0, 1)
+        result *= 1 - opacity[:, None] * t**2 * (3 - 2 * t)
+    return result
+
+
+def normalized(mesh, device) -> NormalizedMesh:
+    diagonal = np.linalg.norm(np.ptp(mesh.positions, axis=0))
+    return NormalizedMesh((mesh.positions / diagonal).astype(np.float32), mesh.faces, wp.get_device(device))
+
+
+@pytest.fixture
+def refinement(device):
+    """A refinement of a small body, and spheres that receivers see from near, far and inside."""
+    mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
+    spheres, _ = stage_1.greedy_cover(mesh, 12, rng)
+    return stage_2.Refinement(mesh, rng), spheres.astype(np.float32).astype(np.float64)
+
+
+def differences(loss, spheres, step):
+    """Central differences of a loss by centers and logarithms of radii."""
+    result = np.zeros_like(spheres)
+    for index in np.ndindex(spheres.shape):
+        change = np.zeros_like(spheres)
+        change[index] = step
+        grown = np.where(np.arange(4) == 3, spheres * np.exp(change), spheres + change)
+        shrunk = np.where(np.arange(4) == 3, spheres * np.exp(-change), spheres - change)
+        result[index] = (loss(grown) - loss(shrunk)) / (2 * step)
+    return result
+
+
+# ------------------------------------------------------------------------------ stage 1
+
+
+def test_signed_distances_are_those_of_a_box_and_negative_inside(device):
+    half = np.array([0.5, 0.3, 0.4])
+    mesh = normalized(box(2 * half), device)
+    scale = np.linalg.norm(2 * half)
+    points = np.random.default_rng(SEED).uniform(-0.8, 0.8, size=(200, 3))
+    beyond = np.abs(points) - half
+    expected = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    got, slopes = mesh.signed_distances(points / scale)
+    np.testing.assert_allclose(got * scale, expected, atol=1e-5)
+    assert (expected < 0).sum() > 20
+    ahead, _ = mesh.signed_distances(points / scale + 1e-3 * slopes)
+    assert np.median(np.abs(ahead - got - 1e-3)) < 1e-5
+
+
+def twin_cover_energy(spheres, samples, points, area, distance):
+    """Both terms of warpshadow.spheres.cover, with a distance function."""
+    offsets = spheres[:, None, 3:] * samples
+    depth = distance(spheres[:, None, :3] + offsets) / (stage_1.EDGE * spheres[:, 3:])
+    t = np.clip((depth + 1) / 2, 0, 1)
+    outside = (4 / 3 * np.pi * spheres[:, 3] ** 3 * (t**2 * (3 - 2 * t)).mean(axis=1)).sum()
+    gaps = np.linalg.norm(points[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
+    return outside + stage_1.BARE * area * np.maximum(gaps.min(axis=1), 0).mean()
+
+
+def test_the_energy_of_a_cover_and_its_gradient_agree_with_float64(device):
+    """In a box much larger than the spheres, about one face of it, whose distance is that to a plane."""
+    mesh = normalized(box((1.0, 1.0, 1.0), segments=2), device)
+    height = mesh.high[1]
+    rng = np.random.default_rng(SEED)
+    spheres = np.column_stack([0.04 * rng.normal(size=(6, 3)) + [0, height, 0], rng.uniform(0.02, 0.08, 6)])
+    samples = stage_1.ball_samples(64, rng)
+    points = rng.uniform(-0.2, 0.2, size=(200, 3)) * [1, 0, 1] + [0, height, 0]
+
+    def energy(balls):
+        return twin_cover_energy(balls, samples, points, mesh.area, lambda p: p[..., 1] - height)
+
+    got, gradient = stage_1.cover_energy(mesh, spheres, samples, points)
+    assert got == pytest.approx(energy(spheres), rel=1e-4)
+    expected = differences(energy, spheres, 1e-7)
+    assert (np.abs(expected).max(axis=0) > 1e-3 * np.abs(expected).max()).all()
+    np.testing.assert_allclose(gradient, expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_descent_covers_more_of_the_surface_and_leaves_the_mesh_less(device):
+    mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
+    start, _ = stage_1.greedy_cover(mesh, 12, rng)
+    *_, cover = stage_1.descend_cover(mesh, start, 60, rng)
+    samples, points = stage_1.ball_samples(256, rng), mesh.sample(2000, rng)[0]
+    before, after = (stage_1.cover_energy(mesh, each, samples, points)[0] for each in (start, cover))
+    assert after < 0.6 * before
+
+
+@pytest.mark.slow
+def test_without_refinement_a_fit_covers_a_mesh_and_stays_in_it():
+    """On the box, that a few large and many small spheres fill."""
+    report = fit_spheres(box(), 64, refine=False, cache=False, progress=False).report
+    assert report.coverage > 0.75
+    assert report.outside_volume < 0.1
+
+
+# ------------------------------------------------------------------------------ stage 2
+
+
+@pytest.mark.slow
+def test_soft_transmittance_and_loss_agree_with_float64(refinement):
+    fit, spheres = refinement
+    chosen = np.arange(0, fit.RECEIVERS, 97)
+    width = 0.1
+    got = fit.transmittance(spheres, chosen, width)
+    points = fit.points.numpy()[chosen].astype(np.float64)
+    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    np.testing.assert_allclose(got, twin_transmittance(points, directions, spheres, width), atol=2e-4)
+
+
+@pytest.mark.slow
+def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
+    fit, spheres = refinement
+    chosen = np.arange(0, fit.RECEIVERS, 61)
+    width = 0.1
+    points = fit.points.numpy()[chosen].astype(np.float64)
+    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+
+    def loss(balls):
+        error = twin_transmittance(points, directions, balls, width) - fit.visibility[chosen]
+        return ((error @ fit.metric.astype(np.float64)) * fit.weights[chosen] * error).sum() / len(chosen)
+
+    got_loss, got = fit.gradient(spheres, chosen, width)
+    assert got_loss == pytest.approx(loss(spheres), rel=1e-4)
+    expected = differences(loss, spheres, 1e-6)
+    np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+
+
+# ------------------------------------------------------------------------------ spheres and their occlusion
+
+
+def test_exact_occlusion_agrees_with_the_cone_outside_on_and_inside_the_sphere(device):
+    center, radius = np.array([0.3, -0.2, 0.5]), 0.7
+    away = np.array([0.01, 0.1, 0.13, 0.5, 0.999, 1.0, 1.004, 1.02, 1.5, 20.0])
+    outward = fibonacci(16)[: len(away)]
+    points = (center + away[:, None] * radius * outward).astype(np.float32)
+    directions = fibonacci(1024)
+
+    def array(values, kind):
+        return wp.array(np.asarray(values, np.float32), dtype=kind, device=device)
+
+    got = exact_occlusion(
+        array(points[None], wp.vec3),
+        array(directions, wp.vec3),
+        array([[center, center + 9]], wp.vec3),
+        array([[radius, 0.0]], wp.float32),  # a radius of 0 blocks nothing
+    ).numpy()[0]
+    cosine = -outward @ directions.T
+    edge = twin_cone(away)[:, None]
+    expected = (cosine > edge) & (twin_near(away) > 0.5)[:, None]
+    clear = np.abs(cosine - edge) > 2e-3
+    assert clear.mean() > 0.95
+    np.testing.assert_array_equal(got[clear], expected[clear])
+    assert got[4].mean() == pytest.approx(0.5, abs=0.01)  # a hemisphere from inside
+
+
+def test_the_refinement_sees_the_cones_that_the_renderer_sees(device):
+    rng = np.random.default_rng(SEED)
+    points = rng.normal(size=(1, 64, 3))
+    centers, radii = 0.5 * rng.normal(size=(1, 6, 3)), rng.uniform(0.1, 0.6, size=(1, 6))
+
+    def array(values, kind):
+        return wp.array(np.asarray(values, np.float32), dtype=kind, device=device)
+
+    directions = fibonacci(128)
+    spheres = array(centers, wp.vec3), array(radii, wp.float32)
+    got = transmittance(array(points, wp.vec3), None, *spheres, directions).numpy()[0]
+    width = SOFTNESS * cell_radius(128)
+    everywhere = np.broadcast_to(directions, (64, 128, 3))
+    twin = twin_transmittance(points[0], everywhere, np.column_stack([centers[0], radii[0]]), width)
+    np.testing.assert_allclose(got, twin, atol=2e-3)
+
+
+def test_a_similarity_moves_and_scales_spheres():
+    spheres = Spheres([[1, 0, 0], [0, 2, 0]], [0.5, 1.5])
+    quarter_turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    moved = spheres.transformed(rotation=quarter_turn, translation=(0, 0, 3), scale=2.0)
+    np.testing.assert_allclose(moved.centers, [[0, 2, 3], [-4, 0, 3]], atol=1e-6)
+    np.testing.assert_allclose(moved.radii, [1.0, 3.0])
+    both = Spheres.concatenate([spheres, moved])
+    assert len(both) == 4 and len(Spheres.concatenate([])) == 0
+    np.testing.assert_array_equal(both.centers[2:], moved.centers)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Spheres([[0, 0]], [1]), r"centers: got shape \(1, 2\)"),
+        (lambda: Spheres([[0, 0, np.nan]], [1]), "centers: got 1 NaN"),
+        (lambda: Spheres([[0, 0, 0]], [-1]), "radii: got -1"),
+        (lambda: Spheres([[0, 0, 0]], [1, 2]), "radii: got 2 radii for 1 centers"),
+        (lambda: Spheres([[0, 0, 0]], [1]).transformed(scale=0), "scale: got 0"),
+        (lambda: Spheres([[0, 0, 0]], [1]).transformed(rotation=2 * np.eye(3)), "rotation: got"),
+    ],
+)
+def test_spheres_that_are_none_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# ------------------------------------------------------------------------------ fits
+
+
+@pytest.mark.slow
+def test_a_ball_is_one_sphere():
+    fit = fit_spheres(icosphere(2.0, 3), 1, **{**QUICK, "steps": 300})
+    assert fit.spheres.radii[0] == pytest.approx(2.0, rel=0.03)
+    assert np.linalg.norm(fit.spheres.centers[0]) < 0.08
+    assert fit.report.coverage > 0.95
+    assert fit.report.visibility_error < 0.03
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, short_cover):
+    options = {**QUICK, "steps": 120, "device": device}  # enough for spheres to be relocated
+    first, second = (fit_spheres(bumpy(), 10, **options).spheres for _ in range(2))
+    np.testing.assert_array_equal(first.centers, second.centers)
+    np.testing.assert_array_equal(first.radii, second.radii)
+    other = fit_spheres(bumpy(), 10, seed=1, **{**QUICK, "steps": 2, "device": device}).spheres
+    assert not np.array_equal(first.centers, other.centers)
+
+
+@pytest.mark.slow
+def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
+    mesh = bumpy()
+    moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
+    options = {**QUICK, "steps": 10}  # rounding of the moved positions changes last bits, which descent amplifies
+    here, there = (fit_spheres(each, 10, **options).spheres for each in (mesh, moved))
+    np.testing.assert_allclose(here.transformed(translation=(300, -70, 20), scale=50).centers, there.centers, atol=1.0)
+    np.testing.assert_allclose(50 * here.radii, there.radii, atol=1.0)
+    power = Mesh(mesh.positions * np.float32(4), mesh.faces)
+    np.testing.assert_array_equal(4 * here.centers, fit_spheres(power, 10, **options).spheres.centers)
+
+
+@pytest.mark.slow
+def test_refinement_and_more_spheres_lower_the_error(short_cover):
+    cover = fit_spheres(bumpy(), 16, **{**QUICK, "refine": False}).report
+    few, some, many = (fit_spheres(bumpy(), count, **{**QUICK, "steps": 200}).report for count in (4, 16, 40))
+    assert some.visibility_error < 0.8 * cover.visibility_error
+    assert few.visibility_error > some.visibility_error > many.visibility_error
+
+
+@pytest.mark.slow
+def test_a_requested_error_is_met_with_as_few_spheres_as_needed(short_cover):
+    fit = fit_spheres(bumpy(), error=0.06, **{**QUICK, "steps": 150})
+    assert fit.report.visibility_error <= 0.06
+    assert fit.report.sphere_count == len(fit.spheres) <= 64
+
+
+@pytest.mark.slow
+def test_open_and_multi_part_meshes_are_fitted(short_cover):
+    ball = icosphere(1.0, 3)
+    bowl = Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0])
+    grid = np.linspace(-1, 1, 12)
+    x, z = np.meshgrid(grid, grid)
+    index = np.arange(144).reshape(12, 12)
+    corners = [index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
+    for mesh, share in (
+        (bowl, 0.15),
+        (sheet, 0.5),
+        (two, 0.15),
+    ):  # small spheres are a poor sheet: they have a thickness
+        none, fit = (fit_spheres(mesh, count, **{**QUICK, "steps": 200}) for count in (0, 24))
+        assert 0 < len(fit.spheres) <= 24
+        unshadowed, error = (np.hypot(each.report.ground_error, each.report.surface_error) for each in (none, fit))
+        assert error < share * unshadowed
+
+
+def test_no_spheres_are_an_empty_fit():
+    fit = fit_spheres(bumpy(), 0, **QUICK)
+    assert len(fit.spheres) == 0 and fit.report.coverage == 0 and fit.report.ground_error > 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"count": -1}, "count: got -1"),
+        ({"count": 2.5}, "count: got 2.5"),
+        ({"error": 0.0}, "error: got 0.0"),
+        ({"steps": None}, "steps: got None"),
+        ({"steps": 0}, "steps: got 0"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        fit_spheres(bumpy(), **{**QUICK, **arguments})
+
+
+def test_a_mesh_without_surface_is_refused():
+    line = Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]])
+    with pytest.raises(ValueError, match="without area"):
+        fit_spheres(line, 4, **QUICK)
+    with pytest.raises(ValueError, match=r"mesh: got 'cow.obj', expected a Mesh; load_mesh\(path\) reads one"):
+        fit_spheres("cow.obj")
+
+
+# ------------------------------------------------------------------------------ cache and picture
+
+
+@pytest.mark.slow
+def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch, short_cover):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    options = {**QUICK, "cache": True, "steps": 5}
+    made = fit_spheres(bumpy(), 6, **options)
+    (file,) = (tmp_path / "spheres").iterdir()
+    read = fit_spheres(bumpy(), 6, **options)
+    assert not made.report.cached and read.report.cached
+    np.testing.assert_array_equal(made.spheres.centers, read.spheres.centers)
+    assert read.report.ground_error == made.report.ground_error
+
+    file.write_bytes(b"not a fit")
+    with pytest.warns(UserWarning, match="cannot be read"):
+        again = fit_spheres(bumpy(), 6, **options)
+    np.testing.assert_array_equal(made.spheres.centers, again.spheres.centers)
+    assert fit_spheres(bumpy(), 6, **options).report.cached
+    fit_spheres(bumpy(), 7, **options)
+    assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_fits_in_a_folder_that_is_shared_can_be_read_by_others(tmp_path, monkeypatch, short_cover):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    before = os.umask(0o002)
+    try:
+        fit_spheres(bumpy(), 6, **{**QUICK, "cache": True, "steps": 5})
+    finally:
+        os.umask(before)
+    (file,) = (tmp_path / "spheres").iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o664
+
+
+def test_a_picture_needs_matplotlib_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r'package matplotlib: pip install "warpshadow\[plot\]"'):
+        plot_spheres(bumpy(), Spheres([[0, 0, 0]], [0.5]), tmp_path / "spheres.png")
+
+
+def test_the_picture_of_a_fit_is_written(tmp_path):
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "spheres.png"
+    plot_spheres(bumpy(), Spheres([[0, 0, 0]], [0.5]), path)
+    assert path.stat().st_size > 10_000
+
+
+# ------------------------------------------------------------------------------ accuracy and portability
+
+
+@pytest.mark.slow
+def test_64_spheres_on_the_bunny_meet_the_targets():
+    pytest.importorskip("pxr", reason="reading bunny.usd takes usd-core")
+    import warp.examples
+
+    mesh = load_mesh(os.path.join(warp.examples.get_asset_directory(), "bunny.usd"))
+    report = fit_spheres(mesh, 64, cache=False, progress=False).report
+    assert report.ground_error < 0.035
+    assert report.surface_error < 0.045

@@ -1,0 +1,115 @@
+"""Receivers: vertices, points that samples see, and how an image gets its light from them."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.project import to_clip
+from warpshadow.stages.rasterize import Fragments, interpolate, rasterize
+from warpshadow.stages.receivers import find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
+
+# Interpolated float32 positions of size 1.
+FLOAT32 = 2e-6
+# Sums of interpolated positions are linear in the vertices but for the normalization of normals.
+GRADIENT = 5e-3
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+
+def two_triangles(device, cameras: int, requires_grad=False):
+    """A mesh of two bodies of a triangle each, seen by some cameras."""
+    positions = np.array([[(-1, 0, 0), (0, 0, 0), (-0.5, 1, 0), (0.2, 0, 0.1), (1, 0.1, 0), (0.5, 1, 0.2)]])
+    eyes = [(0.2 * k, 0.5, 3.0 - 0.3 * k) for k in range(cameras)]
+    matrices = [ws.Camera.look_at(eye, (0, 0.5, 0), size=(12, 12)).clip_matrix() for eye in eyes]
+    positions = wp.array(positions, dtype=wp.vec3, device=device, requires_grad=requires_grad)
+    faces = wp.array([(0, 1, 2), (3, 4, 5)], dtype=wp.vec3i, device=device)
+    return positions, faces, wp.array(np.array(matrices), dtype=wp.mat44, device=device)
+
+
+def receivers_of(positions, faces, matrices, wants_samples):
+    fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
+    wants = np.array(wants_samples)
+    numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
+    found = find_receivers(positions, vertex_normals(positions, faces), faces, fragments, numbering, wants)
+    return found, fragments
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize("wants_samples", [(False, False), (True, False), (False, True), (True, True)])
+def test_what_samples_get_from_their_receivers_is_what_lies_where_they_look(device, cameras, wants_samples):
+    positions, faces, matrices = two_triangles(device, cameras)
+    found, fragments = receivers_of(positions, faces, matrices, wants_samples)
+    for own, attribute in ((found.points, positions), (found.normals, vertex_normals(positions, faces))):
+        got = interpolate(found.fragments, found.faces, own).numpy()
+        expected = interpolate(fragments, faces, attribute).numpy()
+        assert np.abs(got - expected).max() < FLOAT32
+
+
+def test_vertices_that_only_samples_stand_for_are_not_receivers(device):
+    positions, faces, matrices = two_triangles(device, 1)
+    found, fragments = receivers_of(positions, faces, matrices, (True, False))
+    sample_count = (fragments.face_ids.numpy() == 0).sum()
+    assert found.points.shape == (1, 3 + sample_count) and sample_count > 10
+    np.testing.assert_array_equal(found.points.numpy()[0, :3], positions.numpy()[0, 3:])
+    all_vertices, _ = receivers_of(positions, faces, matrices, (False, False))
+    assert all_vertices.points is positions
+
+
+def test_views_of_one_geometry_share_the_vertices_that_any_of_them_sees(device):
+    positions, faces, matrices = two_triangles(device, 3)
+    normals = vertex_normals(positions, faces)
+    fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
+    numbering = number_receivers(faces, np.array([[False, False, False, True, True, True]]))
+    found = find_receivers(positions, normals, faces, fragments, numbering, np.zeros(2, bool))
+    np.testing.assert_array_equal(found.points.numpy(), positions.numpy()[:, 3:])
+    np.testing.assert_array_equal(found.normals.numpy(), normals.numpy()[:, 3:])
+    np.testing.assert_array_equal(found.of_vertices.numpy(), [-1, -1, -1, 0, 1, 2])
+    np.testing.assert_array_equal(found.faces.numpy()[1], [0, 1, 2])
+    assert found.fragments is fragments
+
+
+def test_vertices_of_seen_faces_and_of_edges_at_silhouettes_have_a_part_in_the_image(device):
+    faces = wp.array([(0, 1, 2), (2, 3, 4), (5, 6, 7)], dtype=wp.vec3i, device=device)
+    face_ids = wp.array([[[-1, 1, 1]], [[-1, -1, -1]]], dtype=wp.int32, device=device)
+    edges = wp.array([[(-1, -1), (-2, -2), (7, 0), (-1, -1)]], dtype=wp.vec2i, device=device)
+    fragments = Fragments(face_ids, None)
+    seen = seen_vertices(fragments, Silhouettes(None, edges, None, None, fragments, faces), 9)
+    np.testing.assert_array_equal(np.argwhere(seen), [[0, vertex] for vertex in (0, 2, 3, 4, 7)])
+
+
+def test_no_vertex_has_a_part_in_an_image_of_nothing(device):
+    positions, faces, matrices = two_triangles(device, 1)
+    away = wp.array(positions.numpy() + [100, 0, 0], dtype=wp.vec3, device=device)
+    clip = to_clip(away, matrices)
+    fragments = rasterize(clip, faces, 12, 12)
+    edges = wp.array(np.full((2, 3), -1), dtype=wp.vec3i, device=device)
+    assert not seen_vertices(fragments, find_silhouettes(fragments, faces, edges, clip), 6).any()
+
+
+def test_gradients_through_receivers_are_central_differences(device, verified_tape):
+    """The samples of a moving mesh stay on their faces, and their receivers move along their rays."""
+    positions, faces, matrices = two_triangles(device, 2, requires_grad=True)
+    rng = np.random.default_rng(0)
+
+    def loss(array):
+        found, _ = receivers_of(array, faces, matrices, (True, False))
+        return found.points, found.normals
+
+    with wp.Tape() as tape:
+        points, normals = loss(positions)
+    weights = rng.normal(size=(2, *points.shape, 3)).astype(np.float32)
+    seeds = [wp.array(weight, dtype=wp.vec3, device=device) for weight in weights]
+    tape.backward(grads={points: seeds[0], normals: seeds[1]})
+    direction = rng.normal(size=(1, 6, 3))
+    losses = []
+    for step in (2e-3, -2e-3):
+        moved = wp.array(positions.numpy() + step * direction, dtype=wp.vec3, device=device)
+        results = loss(moved)
+        if results[0].shape != points.shape:
+            pytest.fail("the step is so large that a sample sees another face")
+        losses.append(sum((w * r.numpy().astype(float)).sum() for w, r in zip(weights, results, strict=True)))
+    products = positions.grad.numpy() * direction
+    assert abs(products.sum() - (losses[0] - losses[1]) / 4e-3) < GRADIENT * np.linalg.norm(products)

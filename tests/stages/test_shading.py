@@ -1,0 +1,95 @@
+"""Shading, the dot product of transfer vectors and light: against NumPy, in batches, and its gradients."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warpshadow.stages import shading
+
+# Sums of up to 10⁴ float32 products of size 1/100.
+FLOAT32 = 5e-6
+# Central differences of functions linear in float32 numbers: exact but for roundings over the step of 0.1.
+GRADIENT = 2e-3
+
+
+BATCHES = [(2, 2), (1, 3), (3, 1), (1, 1)]
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+
+def random_light(device, batches=(2, 2), vertices=7, coefficients=16, requires_grad=False):
+    rng = np.random.default_rng(5)
+    transfer = rng.normal(size=(batches[0], vertices, coefficients)).astype(np.float32)
+    light = rng.normal(size=(batches[1], coefficients, 3)).astype(np.float32)
+    return (
+        wp.array(transfer, device=device, requires_grad=requires_grad),
+        wp.array(light, dtype=wp.vec3, device=device, requires_grad=requires_grad),
+    )
+
+
+@pytest.mark.parametrize("batches", BATCHES)
+@pytest.mark.parametrize("coefficients", [4, 16, 25, 64])
+def test_shading_is_the_dot_product_of_transfer_and_light(device, coefficients, batches):
+    transfer, light = random_light(device, batches, coefficients=coefficients)
+    got = shading.shade(transfer, light)
+    assert not got.requires_grad
+    expected = transfer.numpy().astype(float) @ light.numpy()  # batches of 1 broadcast
+    assert np.abs(got.numpy() - expected).max() < FLOAT32 * np.abs(expected).max()
+
+
+def test_shading_is_linear_in_the_light(device):
+    transfer, light = random_light(device)
+    other = wp.array(np.roll(light.numpy(), 1, axis=1), dtype=wp.vec3, device=device)
+    both = wp.array(2 * light.numpy() - 3 * other.numpy(), dtype=wp.vec3, device=device)
+    expected = 2 * shading.shade(transfer, light).numpy() - 3 * shading.shade(transfer, other).numpy()
+    assert np.abs(shading.shade(transfer, both).numpy() - expected).max() < 5 * FLOAT32
+
+
+def test_light_that_does_not_fit_the_transfer_is_refused(device):
+    transfer, _ = random_light(device)
+    with pytest.raises(ValueError, match=r"light: got shape \(2, 15\), expected \[batch, 16\]"):
+        shading.shade(transfer, wp.zeros((2, 15), dtype=wp.vec3, device=device))
+
+
+def tape_gradients(function, inputs, weights, device):
+    """Gradients of Σ weights · function(*inputs) by the tape."""
+    with wp.Tape() as tape:
+        result = function(*inputs)
+    tape.backward(grads={result: wp.array(weights, dtype=wp.vec3, device=device)})
+    return [tape.gradients[value].numpy().astype(float) for value in inputs]
+
+
+def difference(function, inputs, index, direction, weights, step=0.1):
+    """Central difference of Σ weights · function(*inputs) along a direction of one input."""
+    sums = []
+    for sign in (1, -1):
+        moved = list(inputs)
+        values = inputs[index].numpy() + np.float32(sign * step) * direction
+        moved[index] = wp.array(values, dtype=inputs[index].dtype, device=inputs[index].device)
+        sums.append((weights * function(*moved).numpy().astype(float)).sum())
+    return (sums[0] - sums[1]) / (2 * step)
+
+
+@pytest.mark.parametrize("batches", BATCHES)
+@pytest.mark.parametrize("coefficients", [9, 16, 36])
+def test_gradients_of_shading_are_its_central_differences(device, coefficients, batches, verified_tape):
+    inputs = random_light(device, batches, vertices=300, coefficients=coefficients, requires_grad=True)
+    rng = np.random.default_rng(6)
+    weights = rng.normal(size=(max(batches), 300, 3)).astype(np.float32)
+    gradients = tape_gradients(shading.shade, inputs, weights, device)
+    for index, gradient in enumerate(gradients):
+        for _ in range(3):
+            direction = rng.normal(size=gradient.shape).astype(np.float32)
+            expected = difference(shading.shade, inputs, index, direction, weights)
+            assert abs((gradient * direction).sum() - expected) < GRADIENT * np.linalg.norm(gradient * direction)
+
+
+def test_a_gradient_that_nobody_asks_for_is_not_computed(device):
+    transfer, light = random_light(device, requires_grad=True)
+    transfer.requires_grad = False
+    with wp.Tape() as tape:
+        shaded = shading.shade(transfer, light)
+    tape.backward(grads={shaded: wp.full(shaded.shape, wp.vec3(1.0), dtype=wp.vec3, device=device)})
+    assert transfer.grad is None
+    expected = np.repeat(transfer.numpy().sum(axis=1)[..., None], 3, axis=-1)
+    assert np.abs(light.grad.numpy() - expected).max() < FLOAT32 * 10

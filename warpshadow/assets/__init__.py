@@ -1,0 +1,1 @@
+"""What a scene is made of: meshes, images, environment maps, cameras."""

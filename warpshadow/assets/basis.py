@@ -1,0 +1,116 @@
+"""What light is expressed in: spherical harmonics or cells of directions. Transfer vectors belong to one of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths import sh
+from warpshadow.maths.directions import CHUNK, fibonacci
+
+
+@dataclass(frozen=True)
+class HarmonicBasis:
+    """Real spherical harmonics of an order; the coefficients [order², 3] are those of the light's projection."""
+
+    order: int
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        sh.check_order(self.order)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.order**2
+
+    def functions(self, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient]."""
+        return sh.evaluate(self.order, directions)
+
+    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+        """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
+        if isinstance(light, EnvironmentMap):
+            return light.sh(self.order).copy()
+        sh.order_of("light", light)
+        coefficients = np.zeros((self.size, 3), np.float32)
+        count = min(self.size, len(light))
+        coefficients[:count] = light[:count]
+        return coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class CellBasis:
+    """Cells around directions [direction, 3], one for those nearest to it; the coefficients are their mean radiance."""
+
+    directions: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        expected = "unit vectors [direction, 3]; warpshadow.maths.directions.fibonacci(128) makes 128"
+        directions = check.numbers("directions", self.directions, expected=expected, dtype=np.float64)
+        check.shape(
+            "directions", directions.shape, ("direction", 3), "warpshadow.maths.directions.fibonacci(128) makes 128"
+        )
+        if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+            raise ValueError(f"directions: got others than {expected}")
+        directions.setflags(write=False)
+        object.__setattr__(self, "directions", directions)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return len(self.directions)
+
+    def functions(self, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient], 0 or 1."""
+        nearest = np.argmax(directions @ self.directions.T, axis=1)
+        return np.eye(self.size)[nearest]
+
+    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+        """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
+        if isinstance(light, EnvironmentMap):
+            return light.cells(self.directions).radiance.copy()
+        order = sh.order_of("light", light)
+        return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
+
+
+Basis = HarmonicBasis | CellBasis
+
+
+def check_basis(basis: object) -> None:
+    """Raise ValueError unless it is a basis, or None; the message says how to make one."""
+    if basis is not None and not isinstance(basis, (HarmonicBasis, CellBasis)):
+        order = basis if check.is_integer(basis) and basis in sh.ORDERS else 5
+        raise ValueError(
+            f"basis: got {check.described(basis)}, expected HarmonicBasis({order}) for {order} bands of spherical "
+            "harmonics, CellBasis(warpshadow.maths.directions.fibonacci(128)) for cells of 128 directions, or None for "
+            "what the method computes in"
+        )
+
+
+def describe_coefficients(basis: Basis, count: int) -> str:
+    """What coefficients in a basis are, for messages to those who gave ``count`` of them."""
+    what = f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
+    order = int(round(np.sqrt(count)))
+    others = [f"HarmonicBasis({order})"] if order in sh.ORDERS and order**2 == count else []
+    others += [f"CellBasis(warpshadow.maths.directions.fibonacci({count}))"] if count and not count % CHUNK else []
+    remedy = f"; for {count} make the renderer with basis={' or '.join(others)}" if others else ""
+    return f"coefficients in renderer.basis, {what}{remedy}"
+
+
+def conversion(basis: Basis, other: Basis) -> np.ndarray | None:
+    """The matrix M [other coefficient, coefficient] that takes light from a basis to another; None for the same.
+
+    Transfer vectors T to the other basis become T M.
+    """
+    if basis is other or basis == other:
+        return None
+    if isinstance(other, CellBasis) and not isinstance(basis, CellBasis):
+        return basis.functions(other.directions).astype(np.float32)
+    # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
+    fine = fibonacci(64 * max(basis.size, other.size))
+    own, cells = other.functions(fine), basis.functions(fine)
+    weights = 1 / own.sum(axis=0)[:, None] if isinstance(other, CellBasis) else 4 * np.pi / len(fine)
+    return (weights * (own.T @ cells)).astype(np.float32)

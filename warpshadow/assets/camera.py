@@ -1,0 +1,234 @@
+"""Pinhole cameras, and the map from world space to clip space.
+
+Conventions (OpenCV, with pixel centers at +0.5):
+
+- Camera space: x right, y down, z forward; ``c = R p + t`` takes a world point to it.
+- Pixel space: ``(u, v) = (K c)_xy / c_z``; column j, row i has its center at (j + 0.5, i + 0.5); row 0 is
+  on top.
+- Clip space ``(x, y, z, w)``: ``x/w`` runs from -1 at the left edge of the image to +1 at the right edge,
+  ``y/w`` from -1 at the **top** edge to +1 at the **bottom** edge, and ``z/w = near / c_z`` from 1 at the
+  near plane to 0 at infinity (reversed, without a far plane, so float32 keeps its relative precision at every
+  distance); ``w = c_z``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpshadow import check
+
+# Rotations read from a file are often rounded to six digits.
+_ROTATION_TOLERANCE = 1e-4
+
+# Fields of view below this [degrees] are rather π/2 radians or less.
+_NARROW = 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera (conventions: see the module).
+
+    Args:
+        intrinsics: K [pixels], shape [3, 3], last row (0, 0, 1).
+        rotation: R, world to camera, shape [3, 3].
+        translation: t [scene units], world to camera, shape [3].
+        width: Image width [pixels].
+        height: Image height [pixels].
+        near: Distance of the near plane along z [scene units]; what is nearer is not drawn.
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    intrinsics: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    width: int
+    height: int
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, shape in (("intrinsics", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
+            object.__setattr__(self, name, _array(name, getattr(self, name), shape))
+        for name in ("width", "height"):
+            object.__setattr__(self, name, check.pixel_count(name, getattr(self, name)))
+        object.__setattr__(self, "near", check.positive("near", self.near))
+        if not np.array_equal(self.intrinsics[2], (0.0, 0.0, 1.0)):
+            raise ValueError(f"intrinsics: got last row {self.intrinsics[2].tolist()}, expected [0, 0, 1]")
+        focal = self.intrinsics[:2, :2]
+        if abs(np.linalg.det(focal)) <= 1e-12 * np.abs(focal).max() ** 2:
+            raise ValueError(f"intrinsics: got a singular matrix {self.intrinsics.tolist()}, expected focal lengths")
+        _check_rotation("rotation", self.rotation)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float],
+        target: Sequence[float],
+        *,
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        fov_y: float = 40.0,
+        size: tuple[int, int] = (256, 256),
+        near: float = 0.01,
+    ) -> Camera:
+        """Place a camera with square pixels at ``eye`` so that ``target`` lies in the middle of the image.
+
+        Args:
+            eye: Center of projection [scene units], shape [3].
+            target: Point looked at [scene units], shape [3].
+            up: Direction that points up in the image, shape [3], any length.
+            fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
+            size: Width and height [pixels].
+            near: Distance of the near plane [scene units].
+        Raises:
+            ValueError: naming the argument; so when eye and target coincide or up is parallel to the view.
+        """
+        origin, goal, top = (_array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
+        view = goal - origin
+        distance = np.linalg.norm(view)
+        if distance <= 1e-9 * max(np.abs(origin).max(), np.abs(goal).max()):
+            raise ValueError(f"target: got {goal.tolist()}, expected a point away from eye {origin.tolist()}")
+        forward = view / distance
+        right = np.cross(forward, top)
+        if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
+            raise ValueError(
+                f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}"
+            )
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        width, height = check.image_size(size)
+        intrinsics = _centered_intrinsics(fov_y, width, height)
+        return cls(intrinsics, rotation, -rotation @ origin, width, height, near)
+
+    @classmethod
+    def from_opengl(
+        cls,
+        view: np.ndarray,
+        projection: np.ndarray | None = None,
+        *,
+        fov_y: float | None = None,
+        size: tuple[int, int] = (256, 256),
+        near: float | None = None,
+    ) -> Camera:
+        """Convert an OpenGL camera (x right, y up, z backward; column vectors; image origin at the bottom).
+
+        Args:
+            view: World to eye, a rotation and a translation [scene units], shape [4, 4].
+            projection: Perspective projection to OpenGL's clip space, shape [4, 4]; off-center ones are
+                welcome.
+            fov_y: In place of ``projection``: vertical field of view [degrees].
+            size: Width and height [pixels].
+            near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with
+                ``fov_y``.
+        Raises:
+            ValueError: naming the argument; so when the view is not rigid or the projection not a
+                perspective.
+        """
+        view = _array("view", view, (4, 4))
+        if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
+            raise ValueError(f"view: got last row {view[3].tolist()}, expected [0, 0, 0, 1]")
+        _check_rotation("view", view[:3, :3])
+        width, height = check.image_size(size)
+        if (projection is None) == (fov_y is None):
+            raise ValueError("projection, fov_y: expected exactly one of them")
+        if fov_y is not None:
+            intrinsics = _centered_intrinsics(fov_y, width, height)
+            near = 0.01 if near is None else near
+        else:
+            projection = _array("projection", projection, (4, 4))
+            if not np.array_equal(projection[3], (0.0, 0.0, -1.0, 0.0)) or projection[:2, 3].any():
+                raise ValueError(
+                    f"projection: got {projection.tolist()}, expected a perspective, last row [0, 0, -1, 0] "
+                    "and no translation of x and y"
+                )
+            # ndc = (P c) / c_z with c in OpenGL's axes; then u = (1 + x) width/2 and v = (1 - y) height/2.
+            half = np.array([[0.5 * width], [-0.5 * height]])
+            center = np.array([0.5 * width, 0.5 * height])
+            intrinsics = np.eye(3)
+            intrinsics[:2] = half * projection[:2, :3] * (1.0, -1.0, -1.0)
+            intrinsics[:2, 2] += center
+            if near is None:
+                near = projection[2, 3] / (projection[2, 2] - 1.0)
+        flip = np.diag([1.0, -1.0, -1.0])
+        return cls(intrinsics, flip @ view[:3, :3], flip @ view[:3, 3], width, height, near)
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Center of projection [scene units], shape [3]."""
+        return -self.rotation.T @ self.translation
+
+    def resized(self, factor: float) -> Camera:
+        """The same view on an image ``factor`` times as wide and high (supersampling: 2, 3, ...)."""
+        factor = check.positive("factor", factor)
+        width, height = self.width * factor, self.height * factor
+        if max(abs(width - round(width)), abs(height - round(height))) > 1e-6:  # a third of 384, in floating point
+            raise ValueError(
+                f"factor: got {factor}, which makes {self.width} x {self.height} pixels {width} x {height}; "
+                "expected whole numbers"
+            )
+        intrinsics = np.diag([factor, factor, 1.0]) @ self.intrinsics
+        return Camera(intrinsics, self.rotation, self.translation, round(width), round(height), self.near)
+
+    def clip_matrix(self) -> np.ndarray:
+        """World to clip space (convention: see the module), float64, shape [4, 4]."""
+        to_ndc = np.array([[2.0 / self.width, 0.0, -1.0], [0.0, 2.0 / self.height, -1.0]])
+        matrix = np.zeros((4, 4))
+        world_to_camera = np.column_stack([self.rotation, self.translation])
+        matrix[:2] = to_ndc @ self.intrinsics @ world_to_camera
+        matrix[2, 3] = self.near
+        matrix[3] = world_to_camera[2]
+        return matrix
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel coordinates of world points, float64.
+
+        Args:
+            points: World positions [scene units], shape [..., 3].
+        Returns:
+            (u, v) [pixels], shape [..., 2]; NaN for points on or behind the plane of the eye, which have no
+            image.
+        """
+        homogeneous = (np.asarray(points, np.float64) @ self.rotation.T + self.translation) @ self.intrinsics.T
+        depth = homogeneous[..., 2:]
+        return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rays through the pixel centers, in world space, float64.
+
+        Returns:
+            The eye [scene units], shape [3], and unit directions, shape [height, width, 3].
+        """
+        v, u = np.mgrid[0.5 : self.height, 0.5 : self.width]
+        pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+        directions = pixels @ np.linalg.inv(self.intrinsics).T @ self.rotation
+        return self.eye, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def _array(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:
+    array = check.numbers(name, values, expected=f"numbers {list(shape)}", dtype=np.float64)
+    check.shape(name, array.shape, shape)
+    check.finite(name, array)
+    array.setflags(write=False)
+    return array
+
+
+def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
+    if not (check.is_number(fov_y) and 0.0 < fov_y < 180.0):
+        raise ValueError(f"fov_y: got {check.described(fov_y)}, expected degrees between 0 and 180")
+    if fov_y < _NARROW:
+        warnings.warn(
+            f"fov_y: got {fov_y:g} degrees, which is as narrow as a telescope's; if these are radians, they are "
+            f"{np.degrees(fov_y):.4g} degrees",
+            stacklevel=3,
+        )
+    focal = 0.5 * height / np.tan(np.radians(0.5 * fov_y))
+    return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+
+
+def _check_rotation(name: str, matrix: np.ndarray) -> None:
+    orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() <= _ROTATION_TOLERANCE
+    if not orthonormal or np.linalg.det(matrix) < 0.0:
+        raise ValueError(f"{name}: got {matrix.tolist()}, expected a rotation (orthonormal, determinant +1)")

@@ -1,0 +1,354 @@
+"""Pixel files: OpenEXR, Radiance, PNG and JPEG, as linear float32 arrays. Nothing here knows about light.
+
+Row 0 is the top. PNG and JPEG hold sRGB, which is decoded and encoded exactly; alpha is linear everywhere.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets import files
+
+
+class ImageError(ValueError):
+    """A picture, or a file of one, that cannot be used; the message says what was found and is accepted."""
+
+
+def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
+    """Read a picture as linear values.
+
+    OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
+    that has them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG, JPEG:
+    gray or RGB, with or without alpha, taken for sRGB; turned upright as their EXIF orientation says.
+
+    Args:
+        path: A .exr, .hdr, .pic, .png, .jpg or .jpeg file.
+        part: Name or index of the part of a multi-part OpenEXR file; the first by default.
+        max_pixels: Refuse larger pictures, judged by the header before any pixel is read.
+
+    Returns:
+        float32 [height, width, channel] with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGB, alpha) channels.
+
+    Raises:
+        ImageError: for what is not such a file, is truncated, deep, too large, or has other channels.
+        FileNotFoundError: when the file does not exist.
+    """
+    path = check.path("path", path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image file")
+    if part is not None and reader is not _read_exr:
+        raise ImageError(f"{path}: got part {part!r}, but only .exr files have parts")
+    try:
+        return reader(path, part, max_pixels)
+    except ImageError as error:
+        raise ImageError(f"{path}: {error}") from error
+
+
+def read_rgb(path: str | Path, *, part: str | int | None = None) -> np.ndarray:
+    """Read a picture as :func:`read_image` does, as RGB: gray is repeated, alpha dropped."""
+    pixels = read_image(path, part=part)
+    return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
+
+
+def write_image(path: str | Path, pixels: np.ndarray) -> None:
+    """Write a picture of linear values; the file appears complete or not at all.
+
+    Args:
+        path: A .exr file (float32, ZIP compressed, any values), or a .png, .jpg or .jpeg file (8-bit sRGB;
+            values are clipped to [0, 1], alpha is not sRGB encoded).
+        pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 (RGB, alpha)
+            channels; JPEG has no alpha.
+
+    Raises:
+        ImageError: for another extension or shape, or NaN in a PNG or JPEG.
+        OSError: where the file cannot be written.
+    """
+    path = check.path("path", path)
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_WRITERS)}")
+    pixels = check.pixels("pixels", pixels, expected="linear values [height, width, channel]", error=ImageError)
+    shape = pixels.shape
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
+        raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
+    try:
+        with files.whole(path) as unfinished:
+            writer(unfinished, pixels)
+    except ImageError as error:
+        raise ImageError(f"{path}: {error}") from error
+    except RuntimeError as error:  # OpenEXR's, of a disk that is full
+        raise OSError(f"{path}: {error}") from error
+
+
+def _check_size(width: int, height: int, max_pixels: int) -> None:
+    if width < 1 or height < 1 or width * height > max_pixels:
+        raise ImageError(f"got {width} x {height} pixels, expected 1 to {max_pixels} (see max_pixels)")
+
+
+# ---------------------------------------------------------------------------------------------------- OpenEXR
+
+
+def _read_exr(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    import OpenEXR
+
+    try:
+        parts = OpenEXR.File(str(path), header_only=True).parts
+    except Exception as error:  # its messages and exception types vary with the damage
+        raise ImageError(f"not an OpenEXR file, or its header is damaged ({error})") from error
+    chosen = _find_part([candidate.name() for candidate in parts], part)
+    if parts[chosen].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        raise ImageError("got deep pixels, expected flat ones (scanline or tiled)")
+    for candidate in parts:  # the library reads them all
+        lower, upper = candidate.header["dataWindow"]
+        width, height = (np.subtract(upper, lower, dtype=np.int64) + 1).tolist()
+        _check_size(width, height, max_pixels)
+    header = {channel.name: channel for channel in parts[chosen].header["channels"]}
+    names = _find_channels(list(header))
+    if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in header.values()):
+        raise ImageError(f"got subsampled channels among {', '.join(header)}, expected all at full resolution")
+
+    try:
+        complete = OpenEXR.File(str(path), separate_channels=True).parts
+    except Exception as error:
+        raise ImageError(f"truncated or damaged ({error})") from error
+    if len(complete) < len(parts):  # the library prints a warning and leaves a damaged part out
+        raise ImageError(f"truncated or damaged: only {len(complete)} of {len(parts)} parts could be read")
+    return np.stack([complete[chosen].channels[name].pixels.astype(np.float32) for name in names], axis=-1)
+
+
+def _find_part(names: list[str], part: str | int | None) -> int:
+    if part is None:
+        return 0
+    if isinstance(part, int) and 0 <= part < len(names):
+        return part
+    if part in names:
+        return names.index(part)
+    raise ImageError(f"got part {part!r}, expected 0 to {len(names) - 1} or one of {', '.join(map(repr, names))}")
+
+
+def _find_channels(names: list[str]) -> list[str]:
+    """Names of the color channels, then alpha, of the unnamed layer or else of the only one with color."""
+    colors = {}
+    for layer in {name.rpartition(".")[0] for name in names}:
+        prefix = f"{layer}." if layer else ""
+        for color in ("Y", "RGB"):
+            if {prefix + channel for channel in color} <= set(names):
+                colors[layer] = [prefix + channel for channel in color + "A" if prefix + channel in names]
+    if "" in colors:
+        return colors[""]
+    if len(colors) == 1:
+        return colors.popitem()[1]
+    raise ImageError(
+        f"got channels {', '.join(names)} ({len(colors)} layers with color), expected R, G, B or Y, in one layer"
+    )
+
+
+def _write_exr(path: Path, pixels: np.ndarray) -> None:
+    import OpenEXR
+
+    name = {1: "Y", 3: "RGB", 4: "RGBA"}[pixels.shape[2]]
+    pixels = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels}).write(str(path))
+
+
+# --------------------------------------------------------------------------------------------------- Radiance
+
+_RESOLUTION = re.compile(rb"([+-])([XY]) +(\d+) +([+-])([XY]) +(\d+)\s*")
+
+
+def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    """Read RGBE: Ward, "Real Pixels", Graphics Gems II, and the file format notes of Radiance."""
+    with path.open("rb") as file:
+        if not file.readline(80).startswith((b"#?RADIANCE", b"#?RGBE")):
+            raise ImageError("not a Radiance file: it does not start with #?RADIANCE or #?RGBE")
+        exposure = np.ones(3)
+        while line := file.readline(4096).strip():
+            key, _, value = line.partition(b"=")
+            if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
+                raise ImageError(f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe")
+            if key in (b"EXPOSURE", b"COLORCORR"):  # the product of all, already multiplied into the pixels
+                exposure *= _positive_numbers(key, value)
+        resolution = _RESOLUTION.fullmatch(line := file.readline(80))
+        if not resolution or resolution[2] == resolution[5]:
+            raise ImageError(f"got resolution line {line!r}, expected one like b'-Y 512 +X 1024'")
+        major_sign, major_axis, major, minor_sign, _, minor = resolution.groups()
+        major, minor = int(major), int(minor)
+        _check_size(minor, major, max_pixels)
+        rgbe = _decode_rgbe(file.read(), major, minor)
+    pixels = np.ldexp(rgbe[..., :3].astype(np.float32), rgbe[..., 3:].astype(np.int32) - (128 + 8))
+    pixels[rgbe[..., 3] == 0] = 0
+    if major_axis == b"X":
+        pixels, major_sign, minor_sign = pixels.swapaxes(0, 1), minor_sign, major_sign
+    # Radiance's Y points up and its X right; ours is row 0 at the top.
+    pixels = pixels[:: -1 if major_sign == b"+" else 1, :: -1 if minor_sign == b"-" else 1]
+    return np.ascontiguousarray(pixels / exposure.astype(np.float32))
+
+
+def _positive_numbers(key: bytes, value: bytes) -> np.ndarray:
+    """One number, or three, of a header line."""
+    try:
+        numbers = np.array(value.split(), dtype=np.float64)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.size not in (1, 3) or not (np.isfinite(numbers) & (numbers > 0)).all():
+        raise ImageError(f"got {key.decode()}={value.decode(errors='replace')}, expected positive numbers")
+    return numbers
+
+
+def _decode_rgbe(data: bytes, line_count: int, width: int) -> np.ndarray:
+    """Decode scanlines, each flat or run-length encoded in the old or new way, to uint8 [line, pixel, 4]."""
+    lines = np.empty((line_count, width, 4), dtype=np.uint8)
+    start = 0
+    for line in range(line_count):
+        is_new_style = (
+            8 <= width < 32768 and data[start : start + 2] == b"\2\2" and data[start + 2 : start + 3] < b"\x80"
+        )
+        decode = _decode_planes if is_new_style else _decode_pixels
+        try:
+            lines[line], start = decode(data, start, width)
+        except (IndexError, ValueError):
+            raise ImageError(f"truncated or damaged: line {line} of {line_count} cannot be decoded") from None
+    return lines
+
+
+def _decode_planes(data: bytes, start: int, width: int) -> tuple[np.ndarray, int]:
+    """Decode a new-style line: four planes of runs (count above 128, value) and literals (count, values)."""
+    if data[start + 2] << 8 | data[start + 3] != width:
+        raise ValueError("the line has another width")
+    start += 4
+    plane = bytearray()
+    while len(plane) < 4 * width:
+        count = data[start]
+        if count > 128:
+            plane += data[start + 1 : start + 2] * (count - 128)
+            start += 2
+        else:
+            plane += data[start + 1 : start + 1 + count]
+            start += 1 + count
+    return np.frombuffer(plane, dtype=np.uint8).reshape(4, width).T, start
+
+
+def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int]:
+    """Decode a flat or old-style line: (1, 1, 1, n) repeats a pixel n times, a second in a row 256 n."""
+    pixels = np.frombuffer(data, dtype=np.uint8, offset=start, count=min(width, (len(data) - start) // 4) * 4)
+    pixels = pixels.reshape(-1, 4)
+    index = np.arange(len(pixels))
+    is_run = (pixels[:, :3] == 1).all(axis=1)
+    source = np.maximum.accumulate(np.where(is_run, -1, index))
+    shift = np.minimum(8 * (index - source - 1), 24)
+    counts = np.where(is_run, pixels[:, 3].astype(np.int64) << np.maximum(shift, 0), 1)
+    used = int(np.searchsorted(np.cumsum(counts), width)) + 1
+    if counts[:used].sum() != width or source[0] < 0:
+        raise ValueError("the line has another width")
+    return pixels[np.repeat(source[:used], counts[:used])], start + 4 * used
+
+
+# ----------------------------------------------------------------------------------------------- PNG and JPEG
+
+
+def auto_exposure(image: np.ndarray) -> float:
+    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
+    covered = image[image[..., 3] > 0]
+    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
+    return float(-np.log2(bright)) if bright > 0 else 0.0
+
+
+def exposed(image: np.ndarray, stops: float) -> np.ndarray:
+    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
+    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
+    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
+
+
+def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Decode sRGB values in [0, 1] (IEC 61966-2-1), in the precision of the argument."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values in [0, 1] as sRGB (IEC 61966-2-1), in the precision of the argument."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    from PIL import Image, ImageOps
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # max_pixels is the limit here
+            picture = Image.open(path, formats=["PNG", "JPEG"])
+    except Image.DecompressionBombError as error:
+        raise ImageError(str(error)) from error
+    except Image.UnidentifiedImageError as error:
+        raise ImageError("not a PNG or JPEG file, or its header is damaged") from error
+    with picture:
+        _check_size(*picture.size, max_pixels)
+        has_alpha = picture.has_transparency_data
+        _load(picture)
+        ImageOps.exif_transpose(picture, in_place=True)
+        if picture.mode.startswith("I"):  # 16-bit gray
+            codes = np.asarray(picture).astype(np.uint16)
+        else:
+            if path.suffix.lower() == ".png" and _png_depth(path) == 16:
+                warnings.warn(f"{path}: 16-bit color is read at 8 bits", stacklevel=3)
+            color = "L" if picture.mode in ("1", "L", "LA") else "RGB"
+            codes = np.asarray(picture.convert({"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color))
+    codes = codes.reshape(*codes.shape[:2], -1)
+    code_max = np.iinfo(codes.dtype).max
+    pixels = srgb_to_linear(np.arange(code_max + 1) / code_max).astype(np.float32)[codes]
+    if codes.shape[2] in (2, 4):
+        pixels[..., -1] = codes[..., -1] / np.float32(code_max)
+    return pixels
+
+
+def _load(picture) -> None:
+    """Decode the pixels; Pillow raises any of these on a damaged file."""
+    try:
+        picture.load()
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise ImageError(f"truncated or damaged ({error})") from error
+
+
+def _png_depth(path: Path) -> int:
+    """Bits per channel, from the 25th byte of the file."""
+    with path.open("rb") as file:
+        return file.read(25)[-1]
+
+
+def _write_pillow(path: Path, pixels: np.ndarray) -> None:
+    from PIL import Image
+
+    is_jpeg = path.suffix.lower() != ".png"
+    if is_jpeg and pixels.shape[2] == 4:
+        raise ImageError("got 4 channels, expected 1 or 3 because JPEG has no alpha")
+    if np.isnan(pixels).any():
+        raise ImageError(f"got {int(np.isnan(pixels).sum())} NaN values, expected numbers")
+    encoded = np.clip(pixels, 0, 1).astype(np.float64)
+    encoded[..., :3] = linear_to_srgb(encoded[..., :3])
+    codes = np.floor(encoded * 255 + 0.5).astype(np.uint8)
+    picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
+    if is_jpeg:
+        picture.save(path, quality=95, subsampling=0)
+    else:
+        picture.save(path)
+
+
+_READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {
+    ".exr": _read_exr,
+    **dict.fromkeys([".hdr", ".pic"], _read_radiance),
+    **dict.fromkeys([".png", ".jpg", ".jpeg"], _read_pillow),
+}
+_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
+    ".exr": _write_exr,
+    **dict.fromkeys([".png", ".jpg", ".jpeg"], _write_pillow),
+}

@@ -1,0 +1,194 @@
+"""Triangle meshes: files, primitives, topology, unwrapping and vertex normals.
+
+Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals.
+Vertices keep the order they have in the file. Texture coordinates have their origin at the lower left of the
+image, v up.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets import files
+from warpshadow.assets.topology import Surface, join_faces
+
+
+class MeshError(ValueError):
+    """A mesh, or a mesh file, that cannot be used; the message says what is wrong and where."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh on the host, validated; its arrays are read-only copies.
+
+    Args:
+        positions: Vertex positions [scene units], float32, shape [vertex, 3].
+        faces: Indices of positions, counter-clockwise seen from outside, int32, shape [face, 3].
+        uvs: Texture coordinates, origin at the lower left of the image, float32, shape [uv, 2], or None.
+        uv_faces: Indices of uvs, int32, shape [face, 3], or None.
+        name: What messages call the mesh.
+
+    Raises:
+        MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
+    """
+
+    positions: np.ndarray = field(repr=False)
+    faces: np.ndarray = field(repr=False)
+    uvs: np.ndarray | None = field(default=None, repr=False)
+    uv_faces: np.ndarray | None = field(default=None, repr=False)
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        """Copy, convert and validate the arrays."""
+        self._set("positions", _coordinates("positions", self.positions, 3, "vertex"))
+        self._set("faces", _indices("faces", self.faces, len(self.positions), "vertex"))
+        if self.uvs is not None and self.uv_faces is not None:
+            self._set("uvs", _coordinates("uvs", self.uvs, 2, "uv"))
+            self._set("uv_faces", _indices("uv_faces", self.uv_faces, len(self.uvs), "uv"))
+            if len(self.uv_faces) != self.face_count:
+                raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
+        elif self.uvs is not self.uv_faces:
+            missing = "uvs" if self.uvs is None else "uv_faces"
+            raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
+
+    def _set(self, name: str, array: np.ndarray) -> None:
+        array.setflags(write=False)
+        object.__setattr__(self, name, array)
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, referenced by a face or not."""
+        return len(self.positions)
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles."""
+        return len(self.faces)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around the vertices that faces refer to, each shape [3]."""
+        used = self.positions[np.unique(self.faces)]
+        return used.min(axis=0), used.max(axis=0)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of the arrays, in hexadecimal; the name does not count."""
+        digest = hashlib.sha256()
+        for array in (self.positions, self.faces, self.uvs, self.uv_faces):
+            digest.update(b"none" if array is None else f"{array.shape}".encode() + array.tobytes())
+        return digest.hexdigest()
+
+    @functools.cached_property
+    def surface(self) -> Surface:
+        """How its faces are joined."""
+        return join_faces(self.positions, self.faces, self.uv_faces)
+
+    def transformed(
+        self,
+        *,
+        rotation: np.ndarray | None = None,
+        translation: np.ndarray | None = None,
+        scale: float | np.ndarray = 1.0,
+    ) -> Mesh:
+        """Scale, then rotate, then translate; a transform that mirrors also turns the faces over.
+
+        Args:
+            rotation: Matrix that multiplies column vectors, shape [3, 3]; the identity by default.
+            translation: Offset [scene units], shape [3]; none by default.
+            scale: One factor, or one for each axis, shape [3].
+
+        Returns:
+            A new mesh with the same uvs and name.
+        """
+        rotation = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        translation = np.zeros(3) if translation is None else np.asarray(translation, np.float64)
+        check.shape("rotation", rotation.shape, (3, 3))
+        check.shape("translation", translation.shape, (3,))
+        part = MeshPart(self.positions, self.faces, self.uvs, self.uv_faces)
+        moved = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
+        return replace(self, positions=moved.positions, faces=moved.faces, uv_faces=moved.uv_faces)
+
+    def write(self, path: str | Path) -> None:
+        """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""
+        path = Path(path)
+        if path.suffix.lower() != ".obj":
+            raise MeshError(f"{path}: got extension {path.suffix!r}, expected .obj")
+        lines = ["v {:.9g} {:.9g} {:.9g}".format(*position) for position in self.positions.tolist()]
+        if self.uvs is None or self.uv_faces is None:
+            lines += ["f {} {} {}".format(*face) for face in (self.faces + 1).tolist()]
+        else:
+            lines += ["vt {:.9g} {:.9g}".format(*uv) for uv in self.uvs.tolist()]
+            corners = np.stack([self.faces, self.uv_faces], axis=-1).reshape(-1, 6) + 1
+            lines += ["f {}/{} {}/{} {}/{}".format(*corner) for corner in corners.tolist()]
+        with files.whole(path) as unfinished:
+            unfinished.write_text("\n".join(lines) + "\n")
+
+
+def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:
+    """Copy to float32 [item, width]; MeshError when empty, of another shape, not finite or too large."""
+    expected = f"an array [{item}, {width}]; load_mesh(path) reads a file"
+    values = check.numbers(name, values, expected=expected, error=MeshError)
+    if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
+        raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
+    bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{name}: got NaN, Inf or numbers beyond {check.LARGEST:g} at {len(bad)} of {len(values)} "
+            f"(first at {item} {bad[0]}: {values[bad[0]].tolist()}), expected finite numbers"
+        )
+    return values
+
+
+def _indices(name: str, faces: np.ndarray, count: int, item: str) -> np.ndarray:
+    """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
+    check.numbers(name, faces, expected="integers [face, 3]", error=MeshError)
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        polygons = "; triangulate other polygons" if faces.ndim == 2 and faces.shape[1] > 3 else ""
+        raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face{polygons}")
+    if not np.issubdtype(faces.dtype, np.integer):
+        raise MeshError(f"{name}: got {faces.dtype}, expected integers, such as faces.astype(int)")
+    bad = np.argwhere((faces < 0) | (faces >= count))
+    if len(bad):
+        face, corner = bad[0]
+        counts_from_one = faces.min() == 1 and faces.max() == count
+        raise MeshError(
+            f"{name}: got {len(bad)} indices out of range "
+            f"(first at face {face}: {item} {faces[face, corner]}), expected 0 to {count - 1}"
+            f"{f'; those that count from 1 are {name} - 1 here' if counts_from_one else ''}"
+        )
+    return np.array(faces, dtype=np.int32, order="C")
+
+
+# ------------------------------------------------------------------------------------------------------ files
+
+
+class MeshPart(NamedTuple):
+    """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates."""
+
+    positions: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray | None = None
+    uv_faces: np.ndarray | None = None
+    welded: int = 0
+    remark: str = ""
+
+
+def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:
+    """Apply x ↦ linear x + translation; a mirroring turns the faces over."""
+    positions = part.positions.astype(np.float64) @ linear.T + translation
+    part = part._replace(positions=positions.astype(np.float32))
+    return turned_over(part) if np.linalg.det(linear) < 0 else part
+
+
+def turned_over(part: MeshPart) -> MeshPart:
+    """Reverse the winding of every face."""
+    return part._replace(faces=part.faces[:, ::-1], uv_faces=None if part.uv_faces is None else part.uv_faces[:, ::-1])

@@ -1,0 +1,234 @@
+"""Mesh files: OBJ, PLY, GLB, STL and USD, read without reordering vertices."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.mesh import Mesh, MeshError, MeshPart, moved_part, turned_over
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read an OBJ, PLY, STL, GLB/glTF or USD file as one mesh.
+
+    Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes
+    of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), faces refer
+    to the first of the vertices that are duplicated only for their uvs (same position, and same normal where
+    the file stores normals), so that a seam does not break the shading; without uvs they stay as they are.
+    A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
+    uvs are kept only when every face has them.
+
+    Args:
+        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
+
+    Returns:
+        The mesh, named after the file.
+
+    Raises:
+        MeshError: for what is not such a file, or holds no usable triangles.
+        FileNotFoundError: when the file does not exist.
+        ImportError: for USD without the package usd-core.
+
+    Warns:
+        Once, with the counts of degenerate faces, duplicate faces, unreferenced vertices, and dropped uvs.
+    """
+    path = check.path("path", path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise MeshError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such mesh file")
+    try:
+        mesh, remarks = _concatenate(reader(path), path.stem)
+    except (MeshError, ImportError) as error:
+        raise type(error)(f"{path}: {error}") from error
+    except Exception as error:  # the readers of other libraries raise anything on a damaged file
+        raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
+    if remarks:
+        warnings.warn(f"{path}: {', '.join(remarks)}", stacklevel=2)
+    return mesh
+
+
+def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, list[str]]:
+    """Join parts into one mesh and remark on what may surprise."""
+    vertex_count = sum(len(part.positions) for part in parts)
+    parts = [part for part in parts if len(part.faces)]
+    if not parts:
+        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle")
+    positions, faces = _stack((part.positions, part.faces) for part in parts)
+    textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
+    uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
+    mesh = Mesh(positions, faces, uvs, uv_faces, name)
+
+    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
+    counts = {
+        "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
+        "duplicate faces": mesh.face_count - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)),
+        "unreferenced vertices": mesh.vertex_count - len(np.unique(mesh.faces)) - sum(part.welded for part in parts),
+    }
+    remarks = [f"{count} {what}" for what, count in counts.items() if count]
+    remarks += [part.remark for part in parts if part.remark]
+    if 0 < len(textured) < len(parts):
+        remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
+    return mesh, remarks
+
+
+def _stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate pairs of values and faces; the faces' indices move along."""
+    values, faces = zip(*blocks, strict=True)
+    offsets = np.cumsum([0] + [len(block) for block in values[:-1]])
+    moved = [block + offset for block, offset in zip(faces, offsets, strict=True)]
+    return np.concatenate(values), np.concatenate(moved)
+
+
+def _fan(corner_counts: np.ndarray) -> np.ndarray:
+    """Corner numbers [triangle, 3] of the fans that triangulate consecutive polygons."""
+    if (corner_counts < 3).any():
+        polygon = np.flatnonzero(corner_counts < 3)[0]
+        raise MeshError(f"faces: got {corner_counts[polygon]} corners at face {polygon}, expected 3 or more")
+    triangle_counts = corner_counts - 2
+    first = np.repeat(np.cumsum(corner_counts) - corner_counts, triangle_counts)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(triangle_counts) - triangle_counts, triangle_counts)
+    return np.stack([first, first + step + 1, first + step + 2], axis=1)
+
+
+def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
+    """Let faces refer to the first of the vertices that agree in all attributes."""
+    rows = np.column_stack(attributes) + 0.0  # makes -0 equal to 0
+    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first[group.reshape(-1)][faces]
+
+
+def _read_obj(path: Path) -> list[MeshPart]:
+    """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
+    positions, uvs, corners, uv_corners, corner_counts = [], [], [], [], []
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.split("\n"), start=1):
+        try:
+            match line.partition("#")[0].split():
+                case ["v", x, y, z, *_]:
+                    positions.append((float(x), float(y), float(z)))
+                case ["vt", u, *rest]:
+                    uvs.append((float(u), float(rest[0]) if rest else 0.0))
+                case ["f", *tokens]:
+                    corner_counts.append(len(tokens))
+                    for token in tokens:
+                        vertex, _, others = token.partition("/")
+                        corners.append(_obj_index(vertex, len(positions)))
+                        if uv := others.partition("/")[0]:
+                            uv_corners.append(_obj_index(uv, len(uvs)))
+                case ["v" | "vt", *coordinates]:
+                    raise ValueError(f"{len(coordinates)} coordinates are too few")
+        except ValueError as error:
+            raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
+    faces = _fan(np.array(corner_counts, dtype=np.int64))
+    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
+    if not uv_corners:
+        return [part]
+    if len(uv_corners) < len(corners):
+        missing = len(corners) - len(uv_corners)
+        return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
+    return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
+
+
+def _obj_index(token: str, count: int) -> int:
+    """Zero-based index of a one-based one, or of one that counts back from the last item so far."""
+    index = int(token)
+    return index + count if index < 0 else index - 1
+
+
+def _read_trimesh(path: Path) -> list[MeshPart]:
+    """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
+    import trimesh
+
+    if path.suffix.lower() == ".gltf":
+        json.loads(path.read_bytes())  # on bad JSON trimesh would read a model.gltf beside the file instead
+    scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, geometry = scene.graph[node]
+        shape = scene.geometry[geometry]
+        if isinstance(shape, trimesh.Trimesh):
+            parts.append(moved_part(_trimesh_part(shape), transform[:3, :3], transform[:3, 3]))
+    return parts
+
+
+def _trimesh_part(shape) -> MeshPart:
+    """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
+    positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
+    corner_uvs = _ply_corner_uvs(shape)
+    if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
+        return MeshPart(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3))
+    uvs = getattr(shape.visual, "uv", None)
+    if uvs is None:
+        return MeshPart(positions, faces)
+    # Normals in the cache are the file's; shape.vertex_normals computes missing ones, which differ at seams.
+    normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
+    welded = _weld(faces, positions, *normals)
+    return MeshPart(positions, welded, uvs, faces, len(np.unique(faces)) - len(np.unique(welded)))
+
+
+def _ply_corner_uvs(shape) -> np.ndarray | None:
+    """The uvs [corner, 2] of a PLY file that stores them with faces; trimesh gives each vertex only one."""
+    data = shape.metadata.get("_ply_raw", {}).get("face", {}).get("data", {})
+    names = data.dtype.names or () if isinstance(data, np.ndarray) else data
+    if "texcoord" not in names:
+        return None
+    uvs = data["texcoord"]  # binary files hold [count, values], ASCII files the values alone
+    return np.asarray(uvs["f1"] if getattr(uvs.dtype, "names", None) else uvs).reshape(-1, 2)
+
+
+def _read_usd(path: Path) -> list[MeshPart]:
+    """Read the visible meshes of a USD stage in world space, y up."""
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError:
+        raise ImportError("USD needs the package usd-core: pip install usd-core") from None
+
+    stage = Usd.Stage.Open(str(path))
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    to_y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if z_up else np.eye(3)
+    parts = []
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        mesh = UsdGeom.Mesh(prim)
+        if (
+            mesh
+            and mesh.ComputeVisibility(time) != UsdGeom.Tokens.invisible
+            and mesh.ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+        ):
+            world = np.array(transforms.GetLocalToWorldTransform(prim))  # multiplies row vectors
+            part = _usd_part(mesh, UsdGeom.PrimvarsAPI(prim), time)
+            parts.append(moved_part(part, to_y_up @ world[:3, :3].T, to_y_up @ world[3, :3]))
+    return parts
+
+
+def _usd_part(mesh, primvars, time) -> MeshPart:
+    """Take the arrays of a UsdGeom.Mesh, polygons triangulated, in its own space."""
+    positions = np.array(mesh.GetPointsAttr().Get(time) or [], dtype=np.float32).reshape(-1, 3)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], dtype=np.int64)
+    corner_counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
+    if corner_counts.sum() != len(corners):
+        raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
+    faces = _fan(corner_counts)
+    part = MeshPart(positions, corners[faces])
+    st = primvars.GetPrimvar("st")
+    uv_items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
+    if st.HasValue() and st.GetInterpolation() in uv_items:
+        uvs = np.array(st.Get(time), dtype=np.float32)
+        indices = np.array(st.GetIndices(time) if st.IsIndexed() else np.arange(len(uvs)))
+        part = part._replace(uvs=uvs, uv_faces=indices[uv_items[st.GetInterpolation()]][faces])
+    return turned_over(part) if mesh.GetOrientationAttr().Get() == "leftHanded" else part
+
+
+_READERS: dict[str, Callable[[Path], list[MeshPart]]] = {
+    ".obj": _read_obj,
+    **dict.fromkeys([".ply", ".stl", ".glb", ".gltf"], _read_trimesh),
+    **dict.fromkeys([".usd", ".usda", ".usdc", ".usdz"], _read_usd),
+}

@@ -1,0 +1,115 @@
+"""Skies: environment maps made of formulas, and the map that tests orientation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.image import srgb_to_linear
+from warpshadow.assets.light import LUMINANCE, EnvironmentMap, check_height
+from warpshadow.maths import sh
+
+# ---------------------------------------------------------------------------------------- maps from a formula
+
+
+def draw_test_map(height: int = 256) -> EnvironmentMap:
+    """Draw a map that shows which way is which: a color for each half-axis, a grid every 15°, and labels."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = 2 * height
+    towards = sh.equirectangular_directions(height)
+    axis = np.abs(towards).argmax(axis=-1)
+    negative = np.take_along_axis(towards, axis[..., None], axis=-1)[..., 0] < 0
+    colors = np.array([[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]])
+    picture = Image.fromarray(colors[axis, negative.astype(int)].astype(np.uint8))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=height / 7)
+    for step in range(24):
+        draw.line([(step * width / 24, 0), (step * width / 24, height)], fill=(60, 60, 60))
+        draw.line([(0, step * height / 12), (width, step * height / 12)], fill=(60, 60, 60))
+    labels = [("-Z", 0, 0.5), ("+X", 0.25, 0.5), ("+Z", 0.5, 0.5), ("-X", 0.75, 0.5), ("-Z", 1, 0.5)]
+    labels += [(text, quarter / 4, row) for text, row in (("+Y", 0.09), ("-Y", 0.91)) for quarter in range(5)]
+    for text, u, v in labels:
+        draw.text(
+            (u * width, v * height),
+            text,
+            fill="white",
+            font=font,
+            anchor="mm",
+            stroke_width=2,
+            stroke_fill="black",
+        )
+    return EnvironmentMap(srgb_to_linear(np.asarray(picture) / 255))
+
+
+def synthetic_sky(
+    sun_direction: Sequence[float] = (0.5, 0.7, 0.2),
+    *,
+    sun_strength: float = 3.0,
+    sun_radius: float = 1.5,
+    ground_albedo: float = 0.2,
+    height: int = 256,
+) -> EnvironmentMap:
+    """Make a clear daylight sky with a sun, over a diffuse ground.
+
+    The unit is what the sky alone does: its irradiance on the ground is π in luminance; white ground looks 1.
+    The sky is the CIE standard clear sky (ISO 15469, type 12), blue with a pale haze at the horizon; the sun
+    reddens as it sinks. The ground is as bright as sky and sun make it, and fades into the haze.
+
+    Args:
+        sun_direction: Direction to the sun, of any length, shape [3]; below the horizon there is no sun.
+        sun_strength: Irradiance of the sun on a surface that faces it, as a multiple of π.
+        sun_radius: Angular radius [degrees], at least half a pixel (the real sun's is 0.27).
+        ground_albedo: Reflectance of the ground.
+        height: Rows of the map.
+    """
+    sun = check.numbers("sun_direction", sun_direction, expected="a direction (x, y, z)", dtype=np.float64)
+    check.finite("sun_direction", sun)
+    check.shape("sun_direction", sun.shape, (3,))
+    if not np.any(sun):
+        raise ValueError("sun_direction: got a zero vector, expected a direction")
+    for name, value in (("sun_strength", sun_strength), ("sun_radius", sun_radius), ("ground_albedo", ground_albedo)):
+        if not (check.is_number(value) and value >= 0):
+            raise ValueError(f"{name}: got {check.described(value)}, expected a number of 0 or more")
+    check_height(height)
+    sun /= np.linalg.norm(sun)
+    towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
+    edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
+    on_level = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]  # ∫ max(cos θ, 0) dω over a pixel of each row
+    up = towards[..., 1]
+    above = up > 0
+    sun_angle = np.arccos(np.clip(towards @ sun, -1, 1))
+
+    sun_color = _sunlight(max(sun[1], 0.0))
+    glow = 1 + 10 * (np.exp(-3 * sun_angle) - np.exp(-1.5 * np.pi)) + 0.45 * np.cos(sun_angle) ** 2
+    gradation = 1 - np.exp(-0.32 / np.maximum(up, 1e-3))
+    haze = np.exp(-5 * np.maximum(up, 0))[..., None]
+    near_sun = np.exp(-3 * sun_angle)[..., None]
+    color = (1 - haze) * _chroma([0.22, 0.45, 1.0]) + haze * _chroma([0.75, 0.88, 1.0])
+    color = (1 - near_sun) * color + near_sun * sun_color
+    sky = (above * glow * gradation)[..., None] * color
+    sky *= np.pi / np.sum(sky @ LUMINANCE * on_level)
+
+    pixel = np.pi / height
+    radius = max(np.radians(sun_radius), pixel / 2)
+    disc = np.clip((radius + pixel / 2 - sun_angle) / pixel, 0, 1)
+    disc *= above * np.pi * sun_strength / np.sum(disc * weights)
+
+    on_ground = np.pi + np.sum(disc * on_level) * sun_color
+    distance_haze = np.exp(np.minimum(20 * up, 0))[..., None]
+    horizon = sky[height // 2 - 1]
+    ground = (1 - distance_haze) * (ground_albedo / np.pi * on_ground) + distance_haze * horizon
+    return EnvironmentMap(np.where(above[..., None], sky + disc[..., None] * sun_color, ground))
+
+
+def _chroma(rgb: Sequence[float]) -> np.ndarray:
+    """The color at luminance 1."""
+    return np.array(rgb) / (LUMINANCE @ rgb)
+
+
+def _sunlight(elevation_sine: float) -> np.ndarray:
+    """Color of the sun through the air mass of Kasten and Young (1989), at luminance 1."""
+    degrees = np.degrees(np.arcsin(elevation_sine))
+    air_mass = 1 / (elevation_sine + 0.50572 * (degrees + 6.07995) ** -1.6364)
+    return _chroma(np.exp(-np.array([0.07, 0.12, 0.25]) * air_mass))  # Rayleigh at 610, 550, 465 nm and thin haze

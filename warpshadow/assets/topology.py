@@ -1,0 +1,166 @@
+"""Topology: neighbors across edges, pieces that wind alike, and whether they are closed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow import check
+
+# --------------------------------------------------------------------------------------------------- topology
+
+_NOT_MANIFOLD = -2
+
+
+def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
+    """Find the face on the other side of each edge.
+
+    Args:
+        faces: Indices of positions, shape [face, 3]: edges belong together by position topology, whatever the uvs.
+        positions: Vertices, shape [vertex, 3]; when given, those at the same place count as one, as a mesh needs
+            whose faces have vertices of their own.
+
+    Returns:
+        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
+        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
+        and has no neighbors itself.
+    """
+    check.shape("faces", faces.shape, ("face", 3))
+    faces = faces.astype(np.int64) if positions is None else _places(positions)[faces]
+    across = np.full(faces.shape, -1, np.int32)
+    proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
+    first, last = ends.reshape(-1, 2).T
+    _, edge, sharing = np.unique(first * (faces.max(initial=0) + 1) + last, return_inverse=True, return_counts=True)
+    owner = np.repeat(proper, 3)
+    total = np.zeros(len(sharing), np.int64)
+    np.add.at(total, edge, owner)
+    found = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
+    across[proper] = found.reshape(-1, 3)
+    return across
+
+
+def _places(positions: np.ndarray) -> np.ndarray:
+    """Number the places of vertices, the same for those at the same, shape [vertex]."""
+    order = np.lexsort(positions.T)
+    is_new = (np.diff(positions[order], axis=0) != 0).any(axis=1)
+    places = np.zeros(len(positions), np.int64)
+    places[order[1:]] = np.cumsum(is_new)
+    return places
+
+
+class Surface(NamedTuple):
+    """How the faces of a mesh are joined, and what they enclose.
+
+    Faces joined along an edge wind alike: where some wind against most of their piece, they are turned over. So normals
+    of neighbors add up, and one side of a piece is its front, all over. On a one-sided piece (a Möbius strip) they
+    cannot, and stay as they are. Of faces listed twice, as in "double-sided" exports, the copies wind as the first, or
+    their normals would cancel.
+    """
+
+    faces: np.ndarray
+    """Indices of positions, int32 of shape [face, 3]."""
+    uv_faces: np.ndarray | None
+    """Indices of uvs, int32 of shape [face, 3]."""
+    neighbors: np.ndarray
+    """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
+    is_closed: bool
+    """Whether no face shows its back to those outside: two share each edge and wind alike, and pieces look outward.
+
+    A shell that is hollow inside does not count as closed: it costs a launch more, and gets the same image.
+    """
+
+
+def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
+    """Join the faces; those that are listed again, with either winding, become as the first of them."""
+    places = _places(positions)[faces]
+    first = _first_of_equal(places)
+    own = np.unique(first)
+    if len(own) == len(first):
+        return _joined(positions, faces, uv_faces)
+    joined = _joined(positions, faces[own], None if uv_faces is None else uv_faces[own])
+    row = np.searchsorted(own, first)
+    wanted = _places(positions)[joined.faces][row]
+    is_turned = ~np.any([(np.roll(wanted, k, axis=1) == places).all(axis=1) for k in range(3)], axis=0)
+    corner = (_with_turned(places, is_turned)[:, :, None] == wanted[:, None, :]).argmax(axis=2)
+    across = np.take_along_axis(joined.neighbors[row], corner, axis=1)
+    return Surface(
+        _with_turned(faces, is_turned),
+        None if uv_faces is None else _with_turned(uv_faces, is_turned),
+        np.where(across < 0, across, own[across]).astype(np.int32),
+        joined.is_closed,
+    )
+
+
+def _first_of_equal(places: np.ndarray) -> np.ndarray:
+    """The first face with the same three corners as each, in any order; a face without area is its own."""
+    corners = np.sort(places, axis=1)
+    _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    has_area = (np.diff(corners, axis=1) != 0).all(axis=1)
+    return np.where(has_area, first[group.ravel()], np.arange(len(places)))
+
+
+def _joined(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
+    """Join faces of which none is listed twice."""
+    neighbors, places = edge_neighbors(faces, positions), _places(positions)[faces]
+    first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
+    across = np.maximum(neighbors, 0)
+    runs_back = (first[across] == last[:, :, None]) & (last[across] == first[:, :, None])
+    winds_alike = runs_back.any(axis=2) | (neighbors < 0)
+    if not winds_alike.all():
+        is_turned = _turned(neighbors, winds_alike)
+        winds_alike ^= is_turned[:, None] ^ is_turned[across]
+        winds_alike |= neighbors < 0
+        faces, neighbors = (_with_turned(values, is_turned) for values in (faces, neighbors))
+        uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
+    is_proper = (places != first).all(axis=1)
+    has_no_border = winds_alike.all() and (neighbors[is_proper] >= 0).all()
+    is_closed = has_no_border and (_volumes(positions, faces[is_proper], neighbors, is_proper) > 0).all()
+    return Surface(faces, uv_faces, neighbors, bool(is_closed))
+
+
+def _volumes(positions: np.ndarray, faces: np.ndarray, neighbors: np.ndarray, is_proper: np.ndarray) -> np.ndarray:
+    """What each piece of a mesh without borders encloses, negative where its faces look inward."""
+    a, b, c = np.moveaxis((positions - positions[0].astype(np.float64))[faces], 1, 0)
+    parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    _, piece = np.unique(_pieces_of(neighbors)[is_proper], return_inverse=True)
+    return np.bincount(piece, weights=parts)
+
+
+def _pieces_of(neighbors: np.ndarray) -> np.ndarray:
+    """Number of the piece that each face belongs to; those joined across an edge belong together."""
+    face, edge = np.nonzero(neighbors >= 0)
+    return _connected(face, neighbors[face, edge], len(neighbors))
+
+
+def _connected(ends: np.ndarray, other_ends: np.ndarray, count: int) -> np.ndarray:
+    """Number of the part of a graph that each of its nodes is in."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(ends)), (ends, other_ends)), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
+    """Faces to turn over, as few as can be, so that neighbors wind alike, bool of shape [face].
+
+    A graph has two nodes a face, "as it is" and "turned over". Nodes of neighbors that wind alike are joined, so each
+    piece of the mesh is there in both windings; the one that turns fewer faces over is taken.
+    """
+    count = len(neighbors)
+    face, edge = np.nonzero(neighbors >= 0)
+    other = neighbors[face, edge] + np.where(winds_alike[face, edge], 0, count)
+    ends = np.concatenate([face, face + count]), np.concatenate([other, (other + count) % (2 * count)])
+    part = _connected(*ends, 2 * count)
+    as_it_is, over = part[:count], part[count:]
+    kept = np.bincount(as_it_is, minlength=len(part))
+    return (kept[as_it_is] < kept[over]) | ((kept[as_it_is] == kept[over]) & (as_it_is > over))
+
+
+def _with_turned(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
+    """What faces have for each corner, [face, 3], with that of some faces the other way round."""
+    turned = np.where(is_turned[:, None], values[:, ::-1], values)
+    turned.setflags(write=False)
+    return turned

@@ -1,0 +1,114 @@
+"""Batches: every array of a stage has a leading dimension of instances, and a length of 1 serves them all."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import warp as wp
+
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.tape import launch
+
+
+def common_batch(arrays: Mapping[str, Any]) -> int:
+    """The common length of the leading dimensions of arrays, None passed over; a length of 1 serves any.
+
+    Raises:
+        ValueError: naming the array whose length is another.
+    """
+    counts = {name: len(array) for name, array in arrays.items() if array is not None}
+    first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
+    for name, got in counts.items():
+        if got not in (1, count):
+            each, whole = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
+            raise ValueError(
+                f"{name}: got a batch of {got}, expected 1 or {count}, as {first} has; for all {got * count} pairs "
+                f"repeat each of {each} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {whole} "
+                f"{count} times, repeat({count}, 1, …)"
+            )
+    return count
+
+
+@functools.cache
+def _copy_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique")
+    def copy(
+        # in
+        part: wp.array2d(dtype=dtype),
+        first: int,
+        # out
+        whole: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns an item of an instance."""
+        batch, item = wp.tid()
+        whole[batch, first + item] = part[wp.min(batch, part.shape[0] - 1), wp.min(item, part.shape[1] - 1)]
+
+    return copy
+
+
+def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: int | None = None) -> wp.array:
+    """Put arrays of items after one another, for every instance.
+
+    Args:
+        parts: Arrays of one dtype, shape [batch, count], or [batch, 1] where one item serves them all.
+        counts: Items of each part.
+        instances: Length of the batch, by default the parts' own.
+
+    Differentiable: parts.
+    """
+    if instances is None:
+        instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
+    whole = wp.empty(
+        (instances, sum(counts)),
+        dtype=parts[0].dtype,
+        device=parts[0].device,
+        requires_grad=any(part.requires_grad for part in parts),
+    )
+    first = 0
+    for part, count in zip(parts, counts, strict=True):
+        dim = instances, count
+        launch(_copy_kernel(part.dtype), dim=dim, inputs=[part, first], outputs=[whole], device=part.device)
+        first += count
+    return whole
+
+
+def expand(array: wp.array, instances: int) -> wp.array:
+    """Repeat an array of shape [1, item] for every instance; one that has the instances stays as it is.
+
+    Differentiable: array.
+    """
+    if array.shape[0] == instances:
+        return array
+    if array.shape[0] != 1:
+        raise ValueError(f"array: got a batch of {array.shape[0]}, expected 1 or {instances}")
+    return concatenate([array], array.shape[1:], instances=instances)
+
+
+@functools.cache
+def _add_kernel(dtype: type) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # in
+        values: wp.array2d(dtype=dtype),
+        # out
+        totals: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns a total."""
+        batch, item = wp.tid()
+        totals[batch, item] = totals[batch, item] + values[batch, item]
+
+    return add
+
+
+def accumulate(values: wp.array, totals: wp.array) -> None:
+    """Add values [batch, item] to totals, off the tape; on a CPU NumPy does, twice as fast as a kernel."""
+    if is_readable(totals.device):
+        totals.numpy()[...] += values.numpy()
+        return
+    kernel = _add_kernel(totals.dtype)
+    wp.launch(kernel, dim=totals.shape, inputs=[values], outputs=[totals], device=totals.device, record_tape=False)
+
+
+def rows(images: Any) -> Any:
+    """View images [batch, height, width] as [batch, sample]; None stays None."""
+    return None if images is None else images.reshape((images.shape[0], -1))

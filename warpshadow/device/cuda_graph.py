@@ -1,0 +1,106 @@
+"""Graphs: an iteration whose shapes stand still, captured once and replayed as a single launch.
+
+On a GPU an iteration is some hundred kernels of a few microseconds each, and Python takes longer to launch them than
+they take to run. A CUDA graph holds all of them, forward and backward, and is launched at once:
+
+    turn = wp.zeros((1, 2), dtype=wp.vec3, device=device, requires_grad=True)
+    step = Captured(with_gradients(lambda: compare(renderer.draw(view=place(turn)), target), [turn]), device)
+    for _ in range(100):
+        loss = step()
+        optimizer.step([turn.grad.flatten()])   # writes to turn where it is
+
+What is captured is what is launched, on arrays where they are in memory: what changes from one call to the next has to
+be written into the same arrays (``array.assign``, ``wp.copy``), and what Python decides is decided at the capture. So
+nothing is read back meanwhile: inputs are not checked for NaN and indices, and images have room for as many silhouettes
+as there can be. A function of other shapes takes a graph of its own.
+
+Memory that is allocated inside belongs to the graph (by CUDA's stream-ordered allocator, Warp's default), so tapes and
+arrays that the function makes and lets go cost nothing at a replay.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+import warp as wp
+
+from warpshadow.device.constants import collected
+from warpshadow.device.tape import recorded
+from warpshadow.device.threads import one_at_a_time
+
+Result = TypeVar("Result")
+
+
+def is_readable(device: wp.Device) -> bool:
+    """Whether arrays can be read without waiting: on a CPU, unless what would fill them is only being captured."""
+    return device.is_cpu and not device.is_capturing
+
+
+def is_captured(device: wp.Device) -> bool:
+    """Whether calls are captured on a device. On a CPU they are not: its graphs save nothing and run on one thread."""
+    return device.is_cuda
+
+
+class Captured(Generic[Result]):
+    """A function that is called as it is at first, captured at the second call, and replayed from then on.
+
+    The first call compiles kernels, checks inputs and fills what is kept between calls, none of which a capture can do.
+    Each call runs the function's launches once.
+
+    Args:
+        function: What to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
+        device: Where it launches.
+
+    Raises:
+        RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
+            synchronizes or copies from the host while it is captured. It is then captured anew at the next call.
+
+    Not yet run on a GPU; on a CPU the tests capture and replay pose fits.
+    """
+
+    def __init__(self, function: Callable[[], Result], device: wp.DeviceLike):
+        self._function = function
+        self._device = wp.get_device(device)
+        self._has_run = False
+        self._captured: tuple[wp.Graph, Result, list[wp.array]] | None = None
+
+    @one_at_a_time
+    def __call__(self) -> Result:
+        """Call or replay it; the captured call's result is written anew by each replay."""
+        if not is_captured(self._device) or not self._has_run:
+            result = self._function()
+            self._has_run = True
+            return result
+        if self._captured is None:
+            self._captured = self._capture()
+        graph, result, _constants = self._captured
+        wp.capture_launch(graph)
+        return result
+
+    def _capture(self) -> tuple[wp.Graph, Result, list[wp.array]]:
+        if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
+            raise RuntimeError(f"{self._device}: a capture that allocates needs wp.set_mempool_enabled")
+        with collected() as constants, wp.ScopedCapture(device=self._device) as capture:
+            result = self._function()
+        return capture.graph, result, constants
+
+
+def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) -> Callable[[], wp.array]:
+    """Make a function that evaluates a loss and leaves its gradient in the variables' ``grad``.
+
+    Args:
+        loss: Evaluates to a float32 array of one item, by launches that a tape records.
+        variables: Arrays that require a gradient; what was in their gradients is overwritten.
+
+    Returns:
+        A function that returns the loss, as an array on its device.
+    """
+
+    def evaluate() -> wp.array:
+        for variable in variables:
+            variable.grad.zero_()
+        with recorded() as tape:
+            value = loss()
+        tape.backward(value)
+        return value
+
+    return evaluate

@@ -1,0 +1,343 @@
+"""Lanes: how one thread works on several receivers at once.
+
+Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
+a thread owns a *group* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
+vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
+only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
+
+How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
+are, so the width is among the flags. ``python demos/benchmark.py --lanes`` times what else could be chosen.
+"""
+
+import contextlib
+import functools
+import os
+import sys
+import warnings
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.parallel import split_row
+from warpshadow.maths.directions import CHUNK
+
+LANES_VARIABLE = "WARPSHADOW_LANES"
+BITS_VARIABLE = "WARPSHADOW_VECTOR_BITS"
+"""Environment variables that replace what follows from the CPU."""
+
+LANE_COUNTS = (1, 2, 4, 8, 16)
+REGISTER_BITS = (128, 256, 512)
+
+Chunk = wp.types.vector(length=CHUNK, dtype=wp.float32)
+"""Coefficients of one receiver that reach the vector units together."""
+
+_FLOAT_BITS = 32
+
+_HOST_FLAG = "-march=native"
+
+_WHOLE_LOOPS = ("-fno-unroll-loops", "-fno-slp-vectorize")
+"""Flags that leave loops alone, so that one over lanes becomes a vector instruction.
+
+A loop that the compiler unrolls is vectorized again only in part: on a Zen 4, 16 lanes take 1.2 to 1.7 times as long.
+But a loop wider than a register has to be unrolled: otherwise its values stay in memory, and it takes four to eight
+times as long.
+"""
+
+
+@functools.cache
+def _diagnostics() -> dict[str, Any]:
+    """Warp's report about the machine; empty where it fails."""
+    try:
+        with contextlib.redirect_stdout(None):
+            return wp.print_diagnostics()
+    except Exception:  # nothing but speed depends on it
+        return {}
+
+
+def cpu_name() -> str:
+    """LLVM's name of the CPU that kernels are compiled for."""
+    return _diagnostics().get("cpu_name", "unknown")
+
+
+def _cpu_features() -> frozenset[str]:
+    """What LLVM finds that the CPU can do, by its names; empty where Warp does not tell."""
+    return frozenset(_diagnostics().get("cpu_features", ()))
+
+
+def _own_flags() -> str:
+    """Warp's flags for all CPU kernels, which those of a module replace."""
+    flags = getattr(wp.config, "cpu_compiler_flags", None)
+    return _HOST_FLAG if flags is None else flags
+
+
+def _from_environment(name: str, choices: tuple[int, ...]) -> int | None:
+    """What an environment variable says; None if it says nothing.
+
+    Raises:
+        ValueError: for what is not among the choices.
+    """
+    text = os.environ.get(name)
+    if not text:
+        return None
+    check.choice(name, text, map(str, choices))
+    return int(text)
+
+
+def register_bits() -> int:
+    """Width of the vector registers that kernels with lanes are compiled for [bits]."""
+    forced = _from_environment(BITS_VARIABLE, REGISTER_BITS)
+    if forced is not None:
+        return forced
+    features = _cpu_features() if _HOST_FLAG in _own_flags().split() else frozenset()
+    return 512 if "avx512f" in features else 256 if "avx" in features else 128
+
+
+def lane_count(device: wp.DeviceLike) -> int:
+    """Receivers of one thread: a vector register's worth on a CPU, one on a GPU."""
+    if not wp.get_device(device).is_cpu:
+        return 1
+    return _from_environment(LANES_VARIABLE, LANE_COUNTS) or register_bits() // _FLOAT_BITS
+
+
+def compiler_flags(lanes: int) -> str:
+    """The compiler's flags for CPU kernels with a number of lanes.
+
+    Loops are left whole where those over lanes fit a register, and so do those over bands, of which there are 8 at
+    most. Elsewhere Warp's own flags unroll them: with registers of 128 bits they are up to twice as fast.
+    """
+    own, bits = _own_flags(), register_bits()
+    if _HOST_FLAG not in own.split():
+        return own  # for any CPU of the kind
+    is_whole = lanes * _FLOAT_BITS <= bits and bits >= 8 * _FLOAT_BITS
+    base, loops = (_HOST_FLAG, _WHOLE_LOOPS) if is_whole else (own, ())
+    return _accepted_flags(base, (*loops, f"-mprefer-vector-width={bits}"))
+
+
+@functools.cache
+def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
+    """Join flags, but for those that the compiler refuses, of which a warning tells."""
+    if _builds(" ".join((base, *flags))):
+        return " ".join((base, *flags))
+    refused = [flag for flag in flags if not _builds(f"{base} {flag}")]
+    message = f"Warp's compiler refuses {' '.join(refused)}: kernels are built without, and may be slow"
+    warnings.warn(message, stacklevel=2)
+    return " ".join((base, *(flag for flag in flags if flag not in refused)))
+
+
+def _empty_kernel(flags: str) -> wp.Kernel:
+    @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
+    def do_nothing():
+        """What the compiler makes of the flags is all that matters."""
+
+    return do_nothing
+
+
+def _builds(flags: str) -> bool:
+    """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
+    try:
+        wp.launch(_empty_kernel(flags), dim=1, device="cpu", record_tape=False)
+    except Exception:  # Warp raises no other
+        return False
+    return True
+
+
+def module_options(lanes: int) -> dict[str, Any]:
+    """Options of modules whose kernels loop over lanes.
+
+    Unrolled by Warp, such loops take ten times as long to compile.
+    """
+    return {"max_unroll": 1} | ({"cpu_compiler_flags": compiler_flags(lanes)} if lanes > 1 else {})
+
+
+@functools.cache
+def use_vector_registers(module_name: str) -> None:
+    """Give the kernels on chunks of a Python module the flags that follow the CPU, before the first is built.
+
+    Importing the module does not ask for the CPU: that starts Warp.
+    """
+    wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
+
+
+def group_count(vertex_count: int, lanes: int) -> int:
+    """Groups, and so threads, that ``vertex_count`` receivers take."""
+    return -(-vertex_count // lanes)
+
+
+@functools.cache
+def lane_type(lanes: int) -> type:
+    """Vector of float32 with a lane for each receiver of a thread."""
+    return wp.types.vector(length=lanes, dtype=wp.float32)
+
+
+class LaneFunctions(NamedTuple):
+    """Kernel functions on lanes that Warp's vectors lack."""
+
+    is_any_above: wp.Function
+    find_group: wp.Function
+    load: wp.Function
+    load_products: wp.Function
+    add_vectors: wp.Function
+    add_to_sphere: wp.Function
+    load_rows: wp.Function
+    add_rows: wp.Function
+    store_rows: wp.Function
+    store_columns: wp.Function
+    sqrt: wp.Function
+    total: wp.Function
+
+
+@functools.cache
+def lane_functions(lanes: int) -> LaneFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane = lane_type(lanes)
+
+    # Warp's maximum and sum of a vector go from item to item, each waiting for the one before.
+    @wp.func_native(f"""
+    bool is_above = false;
+    for (int lane = 0; lane < {lanes}; ++lane)
+        is_above |= value.c[lane] > limit;
+    return is_above;
+    """)
+    def is_any_above(value: Lane, limit: float) -> bool: ...  # type: ignore[empty-body]
+
+    @wp.func_native(f"""
+    float part[{lanes}];
+    for (int lane = 0; lane < {lanes}; ++lane)
+        part[lane] = value.c[lane];
+    for (int half = {lanes} / 2; half > 0; half /= 2)
+        for (int lane = 0; lane < half; ++lane)
+            part[lane] += part[lane + half];
+    return part[0];
+    """)
+    def total(value: Lane) -> float: ...  # type: ignore[empty-body]
+
+    @wp.func
+    def find_group(row: int, vertex_count: int):
+        """Instance and group of a row, where the groups of all instances follow each other."""
+        return split_row(row, (vertex_count + (lanes - 1)) // lanes)
+
+    @wp.func
+    def load(values: wp.array(dtype=wp.vec3), group: int):
+        """The x, y and z of a group's vectors."""
+        last = values.shape[0] - 1
+        x = Lane()
+        y = Lane()
+        z = Lane()
+        for lane in range(lanes):
+            value = values[wp.min(group * lanes + lane, last)]
+            x[lane] = value[0]
+            y[lane] = value[1]
+            z[lane] = value[2]
+        return x, y, z
+
+    @wp.func
+    def load_products(
+        a: wp.array2d(dtype=wp.float32),
+        b: wp.array2d(dtype=wp.float32),
+        begin: int,
+        count: int,
+        group: int,
+        scratch: wp.array(dtype=Lane),
+    ):
+        """scratch[k] = a b of the group's vertices in the column ``begin`` + k, 0 past the last vertex."""
+        for k in range(count):
+            value = Lane()
+            for lane in range(wp.min(lanes, a.shape[0] - group * lanes)):
+                vertex = group * lanes + lane
+                value[lane] = a[vertex, begin + k] * b[vertex, begin + k]
+            scratch[k] = value
+
+    @wp.func
+    def add_vectors(x: Lane, y: Lane, z: Lane, group: int, values: wp.array(dtype=wp.vec3)):
+        """Add to a group's vectors."""
+        for lane in range(wp.min(lanes, values.shape[0] - group * lanes)):
+            wp.atomic_add(values, group * lanes + lane, wp.vec3(x[lane], y[lane], z[lane]))
+
+    @wp.func
+    def add_to_sphere(
+        dx: Lane,
+        dy: Lane,
+        dz: Lane,
+        radius: Lane,
+        batch: int,
+        sphere: int,
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+    ):
+        """Add a group's share to the gradients of a sphere, those that are wanted."""
+        if adj_centers:
+            wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(dx), total(dy), total(dz)))
+        if adj_radii:
+            wp.atomic_add(adj_radii, batch, sphere, total(radius))
+
+    @wp.func
+    def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
+        """scratch[k] = rows[the group's vertices, k], 0 past the last vertex."""
+        for k in range(rows.shape[1]):
+            value = Lane()
+            for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+                value[lane] = rows[group * lanes + lane, k]
+            scratch[k] = value
+
+    @wp.func
+    def add_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the group's vertices, k] += scratch[k]."""
+        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+            vertex = group * lanes + lane
+            for k in range(rows.shape[1]):
+                rows[vertex, k] = rows[vertex, k] + scratch[k][lane]
+
+    @wp.func
+    def store_columns(
+        scratch: wp.array(dtype=Lane), begin: int, count: int, group: int, rows: wp.array2d(dtype=wp.float32)
+    ):
+        """rows[the group's vertices, begin + k] = scratch[k] for ``count`` columns."""
+        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
+            vertex = group * lanes + lane
+            for k in range(count):
+                rows[vertex, begin + k] = scratch[k][lane]
+
+    @wp.func
+    def store_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):
+        """rows[the group's vertices, k] = scratch[k]."""
+        store_columns(scratch, 0, rows.shape[1], group, rows)
+
+    @wp.func
+    def sqrt(value: Lane):
+        """Square root of each lane."""
+        root = Lane()
+        for lane in range(lanes):
+            root[lane] = wp.sqrt(value[lane])
+        return root
+
+    return LaneFunctions(
+        is_any_above,
+        find_group,
+        load,
+        load_products,
+        add_vectors,
+        add_to_sphere,
+        load_rows,
+        add_rows,
+        store_rows,
+        store_columns,
+        sqrt,
+        total,
+    )
+
+
+def as_chunks(rows: wp.array | None) -> wp.array | None:
+    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; what is left over is not in it."""
+    if rows is None:
+        return None
+    instances, row_count, count = rows.shape
+    chunks = wp.array(
+        ptr=rows.ptr,
+        dtype=Chunk,
+        shape=(instances, row_count, count // CHUNK),
+        strides=(*rows.strides[:2], CHUNK * rows.strides[2]),
+        device=rows.device,
+    )
+    chunks._ref = rows  # the memory stays while the view does
+    return chunks

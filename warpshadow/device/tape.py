@@ -1,0 +1,96 @@
+"""Warp's tape: adjoints written by hand go under it, and what needs no gradient stays off it.
+
+Warp has one tape for the process: launches of all threads land on the tape that any of them has opened. Here a thread
+may have one of its own, which other threads neither see nor close. Tapes that others open by ``with wp.Tape()`` are
+the process's, as they were.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import warp as wp
+
+
+class _TapeOfThread(threading.local):
+    """Warp's ``runtime.tape`` as each thread sees it; Warp asks and sets it by this attribute alone."""
+
+    def __init__(self) -> None:
+        self.own: list[wp.Tape | None] = []  # the thread's, the last of which is in use; without any the process's is
+
+    def __get__(self, runtime: Any, owner: type | None = None) -> Any:
+        if runtime is None:
+            return self
+        return self.own[-1] if self.own else vars(runtime).get("tape")
+
+    def __set__(self, runtime: Any, tape: wp.Tape | None) -> None:
+        if self.own:
+            self.own[-1] = tape
+        else:
+            vars(runtime)["tape"] = tape
+
+
+_Runtime = wp._src.context.Runtime  # Warp has no public way
+if "tape" not in vars(_Runtime):
+    _Runtime.tape = _TapeOfThread()
+
+
+@contextlib.contextmanager
+def recorded() -> Iterator[wp.Tape]:
+    """Record what this thread launches on a tape of its own, whatever tape is open around it or in other threads."""
+    with _own_tape(wp.Tape()) as tape:
+        yield tape
+
+
+@contextlib.contextmanager
+def unrecorded() -> Iterator[None]:
+    """Record nothing that this thread launches."""
+    with _own_tape(None):
+        yield
+
+
+@contextlib.contextmanager
+def _own_tape(tape: wp.Tape | None) -> Iterator[Any]:
+    own = _Runtime.tape.own
+    own.append(tape)
+    try:
+        yield tape
+    finally:
+        own.pop()
+
+
+def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None]) -> None:
+    """Record an adjoint on the tape that is recording, if one is and any of the arrays requires a gradient.
+
+    Args:
+        adjoint: Launches that add to the gradients of the inputs, called when the tape plays back.
+        arrays: What it reads and writes the gradients of; the tape zeroes them; None is passed over.
+    """
+    tape = wp._src.context.runtime.tape  # Warp has no public way to ask
+    wanted = [array for array in arrays if array is not None and array.requires_grad]
+    if tape is not None and wanted:
+        tape.record_func(adjoint, wanted)
+
+
+def launch(
+    kernel: wp.Kernel, dim: int | Sequence[int], *, inputs: Sequence[Any], outputs: Sequence[wp.array], device: Any
+) -> None:
+    """Launch a kernel, on the tape only if an input requires a gradient.
+
+    Warp records every launch, and playing it back compiles its adjoint and runs it, be a gradient asked for or not.
+    """
+    is_wanted = any(isinstance(value, wp.array) and value.requires_grad for value in inputs)
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=is_wanted)
+
+
+def varies(inputs: Iterable[wp.array]) -> bool:
+    """Whether one of some arrays requires a gradient."""
+    return any(array.requires_grad for array in inputs)
+
+
+def launch_new(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array]) -> wp.array:
+    """Launch a kernel whose result has the shape of the launch, on the tape that records."""
+    result = wp.empty(dim, dtype=dtype, device=inputs[0].device, requires_grad=varies(inputs))
+    launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=result.device)
+    return result

@@ -1,0 +1,33 @@
+"""Threads: any number of them may call the library, which does the work of one call after another.
+
+Loading modules and making kernels is not thread-safe in Warp (1.19: two threads that load at once lose kernels). One
+lock guards both, and what renderers keep between calls. These hold it: renderers, fits of spheres, `tune`, deformation
+graphs, captured graphs, and everything in torch. The functions of single stages do not. Little is lost by it: a call
+runs on all cores (:mod:`warpshadow.device.parallel`), and Python between launches runs one thread at a time.
+"""
+
+import functools
+import os
+import threading
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+one_call = threading.RLock()
+"""Held by the thread whose call runs."""
+
+if hasattr(os, "register_at_fork"):  # a child would wait for ever for a thread that it does not have
+    os.register_at_fork(before=one_call.acquire, after_in_parent=one_call.release, after_in_child=one_call.release)
+
+
+def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function that waits until no other thread is in one of these."""
+
+    @functools.wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        with one_call:
+            return function(*args, **kwargs)
+
+    return alone

@@ -1,0 +1,1 @@
+"""Mathematics in NumPy: spherical harmonics, directions and their cells, spatial sorting."""

@@ -1,0 +1,87 @@
+"""Cells of the sphere of directions: Q directions, each standing for a solid angle of 4π/Q, in compact bundles of 4."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.maths.spatial_sort import compact_order
+
+CHUNK = 16
+"""Directions that fill a vector register; their number is a multiple of it."""
+
+BUNDLE = 4
+"""Directions that are culled together."""
+
+
+def check_count(name: str, count: int) -> None:
+    """Raise ValueError unless ``count`` is a positive multiple of 16."""
+    if not check.is_integer(count) or count <= 0 or count % CHUNK:
+        raise ValueError(f"{name}: got {count!r}, expected a positive multiple of {CHUNK}")
+
+
+@functools.cache
+def fibonacci(count: int) -> np.ndarray:
+    """Fibonacci directions z = 1 − (2i+1)/Q, φ = π(1+√5)(i+½), ordered so that each run of 4, 8, 16, … is compact.
+
+    Args:
+        count: Number of directions Q, a multiple of 16.
+
+    Returns:
+        Unit vectors, float64 of shape [Q, 3], not writable.
+    """
+    check_count("count", count)
+    i = np.arange(count)
+    z = 1 - (2 * i + 1) / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * (i + 0.5)
+    radius = np.sqrt(1 - z**2)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+    directions = directions[compact_order(directions, runs=(CHUNK, BUNDLE))]
+    directions.flags.writeable = False
+    return directions
+
+
+def cell_radius(count: int) -> float:
+    """Angular radius ρ = 2/√Q of a disc with a cell's solid angle [rad]."""
+    return 2 / np.sqrt(count)
+
+
+def edge_width(softness: float, count: int) -> float:
+    """Half-width w = κ·ρ of a shadow's soft edge towards ``count`` cells [rad].
+
+    Raises:
+        ValueError: for a width of π/4 or more, where an edge is no edge, and below 0.002, where float32 loses it.
+    """
+    width = softness * cell_radius(count) if check.is_number(softness) else -1.0
+    if not 2e-3 <= width < np.pi / 4:
+        raise ValueError(
+            f"softness: got {softness!r} for {count} directions, expected {2e-3 / cell_radius(count):.3g} to "
+            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from 0.002 to π/4)"
+        )
+    return width
+
+
+class BundleCones(NamedTuple):
+    """The cone around each bundle: axes [bundle, 3], cosine and sine of the half-angle [bundle].
+
+    A half-angle that culls nothing is given as an axis of zero length with cosine 0 and sine 1.
+    """
+
+    axes: np.ndarray
+    cosine: np.ndarray
+    sine: np.ndarray
+
+
+def bundle_cones(directions: np.ndarray, width: float = 0.0) -> BundleCones:
+    """Bound every run of 4 directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
+
+    All three together must stay within 180°, where cosines order angles; a bundle that is too wide culls nothing.
+    """
+    bundles = directions.reshape(-1, BUNDLE, 3)
+    axes = bundles.mean(axis=1)
+    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
+    cosine = np.minimum(np.einsum("bqx,bx->bq", bundles, axes).min(axis=1), 1.0)
+    is_wide = cosine < max(np.cos(np.radians(80)), np.sin(width))
+    cosine = np.where(is_wide, 0.0, cosine)
+    return BundleCones(np.where(is_wide[:, None], 0.0, axes), cosine, np.sqrt(1 - cosine**2))

@@ -1,0 +1,1 @@
+"""What runs and what is kept: from a scene to its images."""

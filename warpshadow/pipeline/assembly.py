@@ -1,0 +1,388 @@
+"""Assembly: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
+
+import functools
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, concatenate
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.maths.spatial_sort import z_order
+from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.scene import SPHERE_METHODS, Scene
+from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.poses import Poses
+
+
+class _GeometryArrays(NamedTuple):
+    positions: Any  # [batch, vertex] vec3
+    centers: Any  # [batch, sphere] vec3
+    radii: Any  # [batch, sphere] float32
+
+
+class Geometry(_GeometryArrays):
+    """What can move: the vertices of all bodies, and the spheres that stand in for them.
+
+    Args:
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        centers: Spheres' centers [scene units], vec3 of shape [batch, sphere].
+        radii: Spheres' radii [scene units], float32 of shape [batch, sphere].
+        moving: Bodies that differ from the scene's, from 0; None where any may. The others are the same in every
+            instance, and no gradient to them is asked for.
+    """
+
+    moving: tuple[int, ...] | None = None
+
+    def __new__(cls, positions: Any, centers: Any, radii: Any, *, moving: Iterable[int] | None = None) -> "Geometry":
+        """Make a tuple of the three arrays that remembers what moves."""
+        self = super().__new__(cls, positions, centers, radii)
+        self.moving = None if moving is None else tuple(sorted(set(moving)))
+        return self
+
+    def _replace(self, **parts: Any) -> "Geometry":
+        """Exchange some of the arrays, or ``moving``, which else stays as it is."""
+        moving = parts.pop("moving", self.moving)
+        return Geometry(*super()._replace(**parts), moving=moving)
+
+
+def as_geometry(name: str, given: Any) -> Geometry:
+    """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
+
+    Raises:
+        ValueError: for anything else, by the name of the argument.
+    """
+    if isinstance(given, Geometry):
+        return given
+    if not isinstance(given, (tuple, list)) or len(given) != len(Geometry._fields):
+        count = f" of {len(given)}" if isinstance(given, (tuple, list)) else ""
+        raise ValueError(
+            f"{name}: got {type(given).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
+            f"tuple of {', '.join(Geometry._fields)}"
+        )
+    return Geometry(*given)
+
+
+class Assembly:
+    """What all poses of a scene share: topology, and the bodies' shapes at rest, each in its own space.
+
+    Args:
+        scene: The scene; its spheres are fitted when first asked for.
+        device: Where the arrays live.
+        progress: Show progress of the fits.
+
+    Attributes:
+        faces: Indices of vertices, vec3i of shape [face]; those of a body wind alike.
+        uvs: Texture coordinates, vec2 of shape [1, uv].
+        uv_faces: Indices of uvs, vec3i of shape [face].
+        first_vertex, first_face: Where each body begins, and the end of the last, NumPy of shape [body + 1].
+    """
+
+    def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
+        self.scene = scene
+        self.device = wp.get_device(device)
+        self._progress = progress
+        self._faces_of: dict[tuple[int, int], wp.array] = {}
+        meshes = [body.mesh for body in scene.bodies]
+        uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
+        surfaces = [mesh.surface for mesh in meshes]
+        faces = [surface.faces for surface in surfaces]
+        uv_faces = [np.zeros_like(each.faces) if each.uv_faces is None else each.uv_faces for each in surfaces]
+        self.first_vertex = _starts([mesh.positions for mesh in meshes])
+        self.first_face = _starts([mesh.faces for mesh in meshes])
+        self.faces = self._array(_stacked_faces(faces, self.first_vertex), wp.vec3i)
+        self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
+        self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
+
+    @functools.cached_property
+    def vertex_order(self) -> np.ndarray:
+        """Order in which neighboring vertices of a body follow each other, shape [vertex]."""
+        orders = [z_order(body.mesh.positions.astype(np.float64)) for body in self.scene.bodies]
+        return np.concatenate([first + order for first, order in zip(self.first_vertex[:-1], orders, strict=True)])
+
+    @functools.cached_property
+    def body_of_face(self) -> np.ndarray:
+        """Body that each face belongs to, shape [face]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face))
+
+    @functools.cached_property
+    def body_of_vertex(self) -> np.ndarray:
+        """Body that each vertex belongs to, shape [vertex]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex))
+
+    @functools.cached_property
+    def surfaces(self) -> wp.array | None:
+        """Body that each face belongs to, int32 of shape [face]; None where there is one."""
+        return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
+
+    @functools.cached_property
+    def edges(self) -> wp.array:
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.assets.topology.edge_neighbors`."""
+        parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
+        moved = [
+            np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)
+        ]
+        return self._array(np.concatenate(moved), wp.vec3i)
+
+    @functools.cached_property
+    def is_two_sided(self) -> np.ndarray:
+        """Bodies that may be seen from behind, those that are not closed, bool of shape [body]."""
+        return np.array([not body.mesh.surface.is_closed for body in self.scene.bodies])
+
+    @functools.cached_property
+    def two_sided_faces(self) -> wp.array:
+        """Faces of those bodies, int32 of shape [item]."""
+        return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
+
+    @functools.cached_property
+    @one_at_a_time
+    def _spheres(self) -> list:
+        """Spheres of each body in its own space; none where the method asks for none."""
+        return scene_blockers(self.scene, device=self.device, progress=self._progress)
+
+    @property
+    def sphere_counts(self) -> np.ndarray:
+        """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for."""
+        if "_spheres" in self.__dict__:
+            return np.diff(self.first_sphere)
+        if self.scene.visibility.method not in SPHERE_METHODS:
+            return np.zeros(len(self.scene.bodies), int)
+        blockers = [body.blockers for body in self.scene.bodies]
+        return np.array([count if isinstance(count, int) else len(count) for count in blockers])
+
+    @functools.cached_property
+    def first_sphere(self) -> np.ndarray:
+        """Where each body's spheres begin, and the end of the last, shape [body + 1]."""
+        return _starts([spheres.radii for spheres in self._spheres])
+
+    @functools.cached_property
+    def rest(self) -> Geometry:
+        """The bodies at rest, each in its own space; the batch is 1."""
+        positions = np.concatenate([body.mesh.positions for body in self.scene.bodies])
+        centers = np.concatenate([spheres.centers for spheres in self._spheres])
+        radii = np.concatenate([spheres.radii for spheres in self._spheres])
+        return Geometry(
+            self._array(positions[None], wp.vec3),
+            self._array(centers[None], wp.vec3),
+            self._array(radii[None], wp.float32),
+            moving=(),
+        )
+
+    @functools.cached_property
+    def poses(self) -> Poses:
+        """Where the scene has its bodies; the batch is 1."""
+        bodies = self.scene.bodies
+        return Poses(
+            self._array(np.stack([body.rotation_matrix() for body in bodies])[None], wp.mat33),
+            self._array(np.stack([body.translation for body in bodies])[None], wp.vec3),
+            self._array(np.array([[body.scale for body in bodies]]), wp.float32),
+        )
+
+    @functools.cached_property
+    def scene_geometry(self) -> Geometry:
+        """Where the scene has its bodies and their spheres; the batch is 1."""
+        return self.placed()
+
+    @one_at_a_time
+    def placed(
+        self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[int] | None = None
+    ) -> Geometry:
+        """Place the bodies in the world, in arrays of their own.
+
+        Args:
+            poses: Of each body, by default the scene's.
+            rest: The bodies in their own spaces, by default as their meshes are.
+                Either batch may be 1 and then serves every instance of the other.
+            moving: Bodies that ``poses`` move, from 0; None for any. The others stand where the scene has them, without
+                a gradient, unless ``rest`` is that of :meth:`deformed`: what it deforms is among those that move.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: poses, rest.
+        """
+        poses = self.poses if poses is None else poses
+        rest = self.rest if rest is None else as_geometry("rest", rest)
+        check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
+        if moving is not None:
+            check.instance("moving", moving, Iterable, "a list of the numbers of bodies, such as [0]")
+        if moving is None or rest.moving is None:
+            return Geometry(
+                poses.points(rest.positions, self._vertex_bodies),
+                poses.points(rest.centers, self._sphere_bodies),
+                poses.radii(rest.radii, self._sphere_bodies),
+            )
+        bodies = {*moving, *rest.moving}
+        for number in bodies:
+            check.index("moving", number, len(self.scene.bodies), "body")
+        vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
+        still = self.scene_geometry
+        return Geometry(
+            exchanged(
+                still.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
+            ),
+            exchanged(
+                still.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])
+            ),
+            exchanged(still.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            moving=bodies,
+        )
+
+    @staticmethod
+    def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
+        """Where the items of some bodies begin and end, consecutive bodies together and those without items left out.
+
+        Args:
+            starts: Where each body's items begin, and the end of the last: :attr:`first_vertex`, :attr:`first_sphere`
+                or :attr:`first_face`.
+            bodies: The bodies, from 0.
+        """
+        runs: list[tuple[int, int]] = []
+        for first, end in ((int(starts[number]), int(starts[number + 1])) for number in sorted(bodies)):
+            if runs and runs[-1][1] == first:
+                runs[-1] = runs[-1][0], end
+            elif end > first:
+                runs.append((first, end))
+        return runs
+
+    @one_at_a_time
+    def graph(self, number: int, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
+
+        Args:
+            number: The body, from 0.
+            count: Nodes that carry a vertex.
+
+        Raises:
+            ValueError: when the body has too few spheres.
+        """
+        check.index("number", number, len(self.scene.bodies), "body")
+        body = self.scene.bodies[number]
+        return DeformationGraph.bind(
+            body.mesh.positions, self._spheres[number].centers, count=count, device=self.device
+        )
+
+    @one_at_a_time
+    def deformed(
+        self,
+        number: int,
+        positions: wp.array | None = None,
+        centers: wp.array | None = None,
+        radii: wp.array | None = None,
+        *,
+        rest: Geometry | None = None,
+    ) -> Geometry:
+        """Exchange the shape of one body at rest.
+
+        Args:
+            number: The body, from 0.
+            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
+            centers: Its spheres' centers, vec3 of shape [batch, sphere].
+            radii: Its spheres' radii, float32 of shape [batch, sphere].
+                What is None stays as it is in ``rest``.
+            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
+
+        Returns:
+            All bodies at rest, for :meth:`placed`, in arrays of their own.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: positions, centers, radii, rest.
+        """
+        check.index("number", number, len(self.scene.bodies), "body")
+        rest = self.rest if rest is None else as_geometry("rest", rest)
+        first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
+        return Geometry(
+            _spliced("positions", rest.positions, positions, first_vertex),
+            _spliced("centers", rest.centers, centers, first_sphere),
+            _spliced("radii", rest.radii, radii, first_sphere),
+            moving=None if rest.moving is None else {*rest.moving, number},
+        )
+
+    @property
+    def casting(self) -> list[int]:
+        """Bodies that cast shadows, from 0."""
+        return [number for number, body in enumerate(self.scene.bodies) if body.casts_shadow]
+
+    def casting_mesh(self, positions: wp.array, bodies: Collection[int] | None = None) -> wp.Mesh | None:
+        """Make the mesh that rays meet: the faces of what casts shadows.
+
+        Args:
+            positions: Vertices of all bodies [scene units], vec3 of shape [vertex]; they are copied.
+            bodies: Which bodies count, from 0; None for all.
+
+        Returns:
+            None where no such body casts a shadow.
+        """
+        casting = [number for number in self.casting if bodies is None or number in bodies]
+        if not casting:
+            return None
+        faces = self.faces.numpy()[np.isin(self.body_of_face, casting)]
+        return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
+
+    def faces_of(self, first: int, end: int) -> wp.array:
+        """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
+        if (first, end) not in self._faces_of:
+            faces = self.faces.numpy()
+            own = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
+            self._faces_of[first, end] = self._array(own, wp.vec3i)
+        return self._faces_of[first, end]
+
+    @functools.cached_property
+    def _vertex_bodies(self) -> wp.array:
+        return self._members(self.first_vertex)
+
+    @functools.cached_property
+    def _sphere_bodies(self) -> wp.array:
+        return self._members(self.first_sphere)
+
+    def _members(self, starts: np.ndarray) -> wp.array:
+        """Body of each item, int32."""
+        return self._array(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), wp.int32)
+
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _starts(parts: list[np.ndarray]) -> np.ndarray:
+    """Where each part begins when they are put after one another, and the end of the last."""
+    return np.cumsum([0, *map(len, parts)])
+
+
+def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
+    return np.concatenate([part + first for part, first in zip(parts, starts[:-1], strict=True)])
+
+
+def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
+    """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
+    if part is None:
+        return exchanged(whole, [], lambda *_: whole)
+    first, end = place.tolist()
+    check.shape(name, part.shape, ("batch", end - first))
+    common_batch({"rest": whole, name: part})
+    return exchanged(whole, [(first, end)], lambda *_: part)
+
+
+def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
+    """Exchange runs of items of a whole.
+
+    Args:
+        whole: Shape [batch, item].
+        runs: Where each begins and ends, rising.
+        part_of: Makes what comes in place of a run, shape [batch, item], given its begin and end.
+
+    Returns:
+        Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
+
+    Differentiable: whole, where it is not exchanged, and parts.
+    """
+    pieces, last = [] if runs else [whole], 0
+    for first, end in runs:
+        pieces += [whole[:, last:first]] if first > last else []
+        pieces.append(part_of(first, end))
+        last = end
+    pieces += [whole[:, last:]] if runs and last < whole.shape[1] else []
+    return concatenate(pieces, [piece.shape[1] for piece in pieces])

@@ -1,0 +1,451 @@
+"""The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
+
+Geometry and cameras make a view, which has transfer vectors; they and light make shading; shading, albedo and textures
+make the image. What a call leaves out, and why, :meth:`Renderer.explain` says.
+"""
+
+import functools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.basis import Basis, check_basis
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.tape import unrecorded
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
+from warpshadow.pipeline.lighting import Light, Lighting
+from warpshadow.pipeline.plan import ALBEDO, LIGHT, TEXTURES, Explanation, Ledger, ViewFacts, exposes_albedo, plan_image
+from warpshadow.pipeline.reflectance import Given, Reflectance
+from warpshadow.pipeline.views import Prospect, View, Viewer
+from warpshadow.scene.scene import AUTO, SCENE, Scene
+from warpshadow.stages import film
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.silhouettes.smooth import find_edge_colors, smooth_silhouettes
+from warpshadow.stages.slopes import pull_surfaces
+
+COARSE_FACE = 400
+"""Pixels of an average face beyond which shading at its corners draws a warning."""
+
+
+class Renderer:
+    """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
+
+    Geometry and cameras of the scene itself stand still, so that their image costs a dot product and a gather. All
+    methods are differentiable under Warp's tape in the arrays they are given, as far as those require gradients.
+
+    Args:
+        scene: The scene.
+        cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
+            batch.
+        device: Warp device, "cpu" by default.
+        basis: What free light is expressed in; None for what the method computes in: cells of directions
+            ("directional") or spherical harmonics.
+        progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        scene: The scene; a method "auto" has been replaced by what was chosen.
+        cameras: Those that see the scene.
+        has_camera_batch: Whether they were given as a batch.
+        ledger: How long stages took; with ``ledger.waits``, stages on a GPU are waited for.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Threads may share it: their calls come one after another. Copied or pickled, it takes along what it was made of, and
+    the copy computes the rest anew when it is asked for.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        cameras: Sequence[Camera] | None = None,
+        device: wp.DeviceLike = "cpu",
+        basis: Basis | None = None,
+        progress: bool = False,
+    ):
+        check.instance("scene", scene, Scene, SCENE)
+        check_basis(basis)
+        where = check.device("device", device)
+        if scene.visibility.method == AUTO:
+            from warpshadow.tuning.tune import resolved  # which renders to find out
+
+            scene = resolved(scene, device=where, progress=progress)
+        self._arguments = {
+            "scene": scene,
+            "cameras": cameras,
+            "device": str(where),
+            "basis": basis,
+            "progress": progress,
+        }
+        self.scene = scene
+        self.has_camera_batch = cameras is not None
+        self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
+        self.device = where
+        self.progress = progress
+        self.assembly = Assembly(scene, device=self.device, progress=progress)
+        self.ledger = Ledger()
+        self._viewer = Viewer(self.assembly, self.cameras, self.ledger, progress=progress)
+        self._lighting = Lighting(self.assembly, basis, self.ledger, progress=progress)
+        self._reflectance = Reflectance(self.assembly, self.ledger)
+        self.basis = self._lighting.basis
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made of."""
+        return self._arguments
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make it anew."""
+        self.__init__(**state)  # type: ignore[misc]
+
+    # ------------------------------------------------------------------------------------------ geometry and cameras
+
+    @property
+    @one_at_a_time
+    def geometry(self) -> Geometry:
+        """Where the scene has its bodies and their spheres; the batch is 1. Not to be written to."""
+        return self.assembly.scene_geometry
+
+    @property
+    def clip_matrices(self) -> wp.array:
+        """The cameras, mat44 of shape [camera]."""
+        return self._viewer.clip_matrices
+
+    @one_at_a_time
+    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """See a geometry through cameras; the last view again if nothing that it depends on changed.
+
+        A view sees what it is given as it is now: arrays may change afterwards, unless they require a gradient. (On a
+        GPU values are not compared, since the host would have to wait for them: hold on to a view that stands.)
+
+        Args:
+            geometry: Instances of vertices and spheres, by default the scene's own.
+            clip_matrices: Cameras, mat44 of shape [batch], by default :attr:`clip_matrices`; see
+                :func:`warpshadow.stages.project.compose_clip_matrices`.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: geometry, clip_matrices.
+        """
+        return self._viewer.see(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+
+    @functools.cached_property
+    def scene_view(self) -> View:
+        """What the cameras see of the scene."""
+        view = self.view()
+        self._warn_of_coarse_faces(view.fragments)
+        return view
+
+    @one_at_a_time
+    def body_ids(self, view: View | None = None) -> np.ndarray:
+        """Body that each sample sees, -1 for none, shape [batch, height, width]."""
+        view = self._own(view)
+        face_ids = view.fragments.face_ids.numpy()
+        return np.where(face_ids >= 0, self.assembly.body_of_face[face_ids], -1)
+
+    def _own(self, view: View | None) -> View:
+        """A view of this renderer, by default the scene's; those of others keep what others computed."""
+        if view is None:
+            return self.scene_view
+        if view.assembly is not self.assembly:
+            raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
+        return view
+
+    def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
+        """Say which bodies show faces so large that light at their corners alone misses shadows."""
+        bodies = self.scene.bodies
+        body_of_face = self.assembly.body_of_face
+        sample_counts, face_counts = np.zeros((2, len(bodies)))
+        for face_ids in fragments.face_ids.numpy():
+            seen = face_ids[face_ids >= 0]
+            sample_counts += np.bincount(body_of_face[seen], minlength=len(bodies))
+            face_counts += np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
+        pixels_per_face = sample_counts / self.scene.supersampling**2 / np.maximum(face_counts, 1)
+        for number, body in enumerate(bodies):
+            if body.receivers == "vertex" and not self._lighting.is_traced and pixels_per_face[number] > COARSE_FACE:
+                warnings.warn(
+                    f"body number {number + 1} ({body.mesh.name!r}): a face covers {pixels_per_face[number]:.0f} "
+                    "pixels on average, and light is evaluated at its corners alone; "
+                    'receivers = "pixel" evaluates it at every pixel',
+                    stacklevel=2,
+                )
+
+    # ------------------------------------------------------------------------------------------ light and reflectance
+
+    @functools.cached_property
+    @one_at_a_time
+    def transfer(self) -> wp.array:
+        """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
+
+        Cameras share the receivers at vertices, for which there is one view.
+        """
+        return self._lighting.transfer(self.scene_view)
+
+    @property
+    def scene_shading(self) -> wp.array:
+        """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [view, receiver]."""
+        return self.shade()
+
+    @one_at_a_time
+    def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
+        """Light the receivers of a view.
+
+        Args:
+            light: Known light, as a map or SH coefficients, by default the scene's: it is shaded as accurately as the
+                method can. Free light, an array of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient],
+                is differentiable.
+            view: By default the scene's own.
+
+        Returns:
+            Shading, vec3 of shape [batch, receiver].
+
+        Raises:
+            ValueError: naming the argument; so where rays are asked for a gradient to geometry.
+
+        Differentiable: light, view.
+        """
+        return self._lighting.shade(self._own(view), light)
+
+    @property
+    def albedo(self) -> wp.array:
+        """Reflectance that the scene's samples see, vec3 of shape [camera, height, width]."""
+        return self.reflect()
+
+    @one_at_a_time
+    def reflect(
+        self,
+        albedo: Sequence[wp.array | None] | None = None,
+        textures: Sequence[wp.array | None] | None = None,
+        view: View | None = None,
+    ) -> wp.array:
+        """Find the reflectance that samples see.
+
+        Args:
+            albedo: For each body, vec3 of shape [batch, 1] or [batch, vertex]; None for what the scene has.
+            textures: For each body, vec3 of shape [batch, height, width], which needs uvs; None for what the scene has.
+            view: By default the scene's own.
+
+        Returns:
+            vec3 of shape [batch, height, width].
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: albedo, textures, view.
+        """
+        return self._reflectance.find(self._own(view), albedo, textures)
+
+    @one_at_a_time
+    def seen_texels(self, number: int) -> np.ndarray:
+        """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
+
+        Args:
+            number: The body, from 0; it needs a texture.
+
+        Returns:
+            Float32 of shape [height, width]: 0 where no sample sees the texel; see
+            :func:`warpshadow.stages.textures.sample.seen_texels`.
+
+        Raises:
+            ValueError: for a body without a texture.
+        """
+        return self._reflectance.seen_texels(self.scene_view, number)
+
+    # ------------------------------------------------------------------------------------------ image
+
+    @one_at_a_time
+    def draw(
+        self,
+        light: Light | None = None,
+        *,
+        albedo: Sequence[wp.array | None] | None = None,
+        textures: Sequence[wp.array | None] | None = None,
+        view: View | None = None,
+    ) -> wp.array:
+        """Draw images.
+
+        Args:
+            light: As for :meth:`shade`.
+            albedo: As for :meth:`reflect`.
+            textures: As for :meth:`reflect`.
+            view: From :meth:`view`, by default the scene's own.
+                Batches of 1 serve every instance of the others.
+
+        Returns:
+            Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
+
+        Raises:
+            ValueError: naming the argument, what it got and what it accepts.
+
+        Differentiable: light, albedo, textures, view.
+        """
+        view = self._own(view)
+        lit = self.shade(light, view)
+        varying = _varying(view.facts, light, albedo, textures)
+        plan, timed = plan_image(view.facts, varying, supersampling=self.scene.supersampling), self.ledger.timed
+        receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
+        if exposes_albedo(varying):
+            samples = self._reflectance.expose(view, self._white(view, lit), plan.exposure, albedo, textures)
+        else:
+            reflected = self.reflect(albedo, textures, view)
+            with timed(plan.exposure, [lit, reflected, clip_positions]):
+                samples = film.expose(
+                    receivers.fragments, receivers.faces, lit, reflected, at_points=not plan.contrasts
+                )
+        edge_colors = None
+        if plan.contrasts:
+            with timed(plan.contrasts, [clip_positions]):
+                edge_colors = find_edge_colors(
+                    samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected
+                )
+                pull_surfaces(
+                    samples,
+                    receivers.fragments,
+                    receivers.faces,
+                    lit,
+                    reflected,
+                    silhouettes,
+                    edge_colors,
+                    clip_positions,
+                )
+        with timed(plan.smoothing, [samples, clip_positions]):
+            smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
+        if not plan.averaging:
+            return smoothed
+        with timed(plan.averaging, [smoothed]):
+            return film.average(smoothed, self.scene.supersampling)
+
+    def _white(self, view: View, lit: wp.array) -> wp.array:
+        """The samples of a view if every surface were white, kept while its shading is."""
+        if view.kept.white is None or view.kept.white[1] is not lit:
+            _, height, width = view.fragments.face_ids.shape
+            albedo = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.device)
+            white = film.expose(view.receivers.fragments, view.receivers.faces, lit, albedo)
+            if not view.keeps:
+                return white
+            view.kept.white = white, lit
+        return view.kept.white[0]
+
+    def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
+        """Render the image of the scene.
+
+        Args:
+            light: Environment map or SH coefficients [order², 3] in place of the scene's.
+
+        Returns:
+            Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or
+            [camera, height, width, 4] where cameras were given; the background is 0.
+        """
+        with unrecorded():
+            images = self.draw(light).numpy().copy()
+        return images if self.has_camera_batch else images[0]
+
+    # ------------------------------------------------------------------------------------------ what runs
+
+    @one_at_a_time
+    def explain(
+        self,
+        light: Any = None,
+        *,
+        albedo: Sequence[Any] | None = None,
+        textures: Sequence[Any] | None = None,
+        view: View | None = None,
+        geometry: Geometry | None = None,
+        clip_matrices: Any = None,
+    ) -> Explanation:
+        """Say what the next call computes, stage by stage, and what it leaves out, and why.
+
+        Args:
+            light: As for :meth:`draw`, or a tensor, as for :class:`warpshadow.torch.TorchRenderer`; so all others.
+            albedo: As for :meth:`draw`.
+            textures: As for :meth:`draw`.
+            view: As for :meth:`draw`: then only what comes after it is explained.
+            geometry: As for :meth:`view`, which is explained with it.
+            clip_matrices: As for :meth:`view`.
+
+        Returns:
+            The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
+            it does or does not run; then the same of the adjoints. Nothing is computed.
+        """
+        if not isinstance(light, EnvironmentMap | np.ndarray):
+            light = _as_array(light, wp.vec3, 2)
+        colors, images = (
+            None if given is None else [_as_array(item, wp.vec3, ndim) for item in given]
+            for given, ndim in ((albedo, 2), (textures, 3))
+        )
+        if view is None:
+            if geometry is not None:
+                geometry = as_geometry("geometry", geometry)
+                dtypes = wp.vec3, wp.vec3, wp.float32
+                arrays = (_as_array(array, dtype, 2) for array, dtype in zip(geometry, dtypes, strict=True))
+                geometry = Geometry(*arrays, moving=geometry.moving)
+            prospect = self._viewer.plan(geometry, _as_array(clip_matrices, wp.mat44, 1))
+        else:
+            prospect = Prospect(None, self._own(view).facts, view, view.still)
+        _, facts, view, still = prospect
+        kept = None if view is None else view.kept
+        varying = _varying(facts, light, colors, images)
+        plans = [
+            prospect.plan,
+            self._lighting.plan(facts, light, view=view, still=still),
+            self._reflectance.plan(facts, colors, images, kept, exposes=exposes_albedo(varying)),
+            plan_image(facts, varying, supersampling=self.scene.supersampling),
+        ]
+        stages = [stage for plan in plans if plan is not None for stage in plan.stages()]
+        return Explanation(stages, self.ledger.timings, is_host=self.device.is_cpu or self.ledger.waits)
+
+
+def _varying(view: ViewFacts, light: Light | None, albedo: Given, textures: Given) -> list[str]:
+    """What requires a gradient."""
+    given = {LIGHT: [light], ALBEDO: albedo or (), TEXTURES: textures or ()}
+    return [
+        *view.varying,
+        *(name for name, arrays in given.items() if any(getattr(array, "requires_grad", False) for array in arrays)),
+    ]
+
+
+def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
+    """An array, or a tensor as one, with the batch dimension that it may lack; None stays None."""
+    if given is None or isinstance(given, wp.array):
+        return given
+    tensor = given.detach()
+    while tensor.ndim < ndim + len(getattr(dtype, "_shape_", ())):
+        tensor = tensor[None]
+    return wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
+
+
+def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Cameras whose images are a batch, checked."""
+    check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
+    if not cameras:
+        raise ValueError("cameras: got none, expected at least one, or None for the scene's")
+    first = cameras[0]
+    for number, camera in enumerate(cameras):
+        check.instance(f"cameras[{number}]", camera, Camera, "a Camera")
+        if (camera.width, camera.height, camera.near) != (first.width, first.height, first.near):
+            raise ValueError(
+                f"cameras[{number}]: got {camera.width} × {camera.height} pixels and near = {camera.near}, "
+                f"expected {first.width} × {first.height} and {first.near}, as the first has"
+            )
+    return tuple(cameras)
+
+
+def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
+    """Render a scene once; for several images of it, keep a :class:`Renderer`.
+
+    Args:
+        scene: The scene.
+        device: Warp device.
+        progress: Show progress where something takes longer than a second.
+
+    Returns:
+        Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
+    """
+    return Renderer(scene, device=device, progress=progress).render()

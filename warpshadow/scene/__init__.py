@@ -1,0 +1,1 @@
+"""Scenes: bodies, light and camera, their files, and scenes made at random."""

@@ -1,0 +1,96 @@
+"""Blockers: the spheres that stand in for the bodies of a scene."""
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.mesh import Mesh
+from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
+from warpshadow.spheres import Spheres, fit_spheres
+
+
+def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
+    """Find the spheres of each body, in its own space, fitting those that are wanted.
+
+    A flat body with the middles of all others on its front side is a ground (or a wall): one sphere that touches it
+    from behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets
+    none.
+    """
+    if scene.visibility.method not in SPHERE_METHODS:
+        return [Spheres.concatenate([])] * len(scene.bodies)
+    grounds = _ground_spheres(scene)
+    return [_body_spheres(body, ground, device, progress) for body, ground in zip(scene.bodies, grounds, strict=True)]
+
+
+def fitted_counts(scene: Scene) -> dict[int, int]:
+    """Find the bodies to whose meshes spheres are fitted: neither grounds, nor those with spheres of their own.
+
+    Returns:
+        Numbers of the bodies, from 0, and how many spheres each asks for.
+    """
+    grounds = _ground_spheres(scene)
+    return {
+        number: count for number, count in enumerate(map(_wanted, scene.bodies)) if count and grounds[number] is None
+    }
+
+
+def _wanted(body: Body) -> int:
+    """How many spheres a body asks for."""
+    return 0 if isinstance(body.blockers, Spheres) else body.blockers
+
+
+def _ground_spheres(scene: Scene) -> list[Spheres | None]:
+    """The sphere of each body that asks for some and is a ground."""
+    meshes = [body.world_mesh() for body in scene.bodies]
+    points = [mesh.positions[np.unique(mesh.faces)] for mesh in meshes]
+    return [
+        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]]) if _wanted(body) else None
+        for k, body in enumerate(scene.bodies)
+    ]
+
+
+def _body_spheres(body: Body, ground: Spheres | None, device: wp.DeviceLike, progress: bool) -> Spheres:
+    if isinstance(body.blockers, Spheres):
+        return body.blockers
+    if body.blockers == 0:
+        return Spheres.concatenate([])
+    if ground is not None:
+        inverse = body.rotation_matrix().T
+        return ground.transformed(
+            rotation=inverse, translation=-inverse @ body.translation / body.scale, scale=1 / body.scale
+        )
+    return fit_spheres(body.mesh, body.blockers, device=device, progress=progress).spheres
+
+
+def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
+    """The sphere that stands in for a flat mesh seen from its front, None if that is not how it is seen.
+
+    It touches the plane below the other bodies, and its radius is such that from their mean position it blocks the
+    solid angle that the mesh does.
+    """
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    if not others or not normal.any():
+        return None
+    normal /= np.linalg.norm(normal)
+    points = corners.reshape(-1, 3)
+    middle = points.mean(axis=0)
+    *_, axes = np.linalg.svd(points - middle, full_matrices=False)
+    seen_from = np.concatenate(others)
+    size = np.ptp((points - middle) @ axes.T, axis=0)
+    is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
+    # a body may stand in the ground, and a fit may start with one deep in it
+    is_in_front = all(np.mean((other - middle) @ normal) > 0 for other in others)
+    if not is_flat or not is_in_front:
+        return None
+    height = np.mean((seen_from - middle) @ normal)
+    a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
+    length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    numerator = (a * np.cross(b, c)).sum(axis=1)
+    denominator = length_a * length_b * length_c
+    denominator += (a * b).sum(axis=1) * length_c + (b * c).sum(axis=1) * length_a + (c * a).sum(axis=1) * length_b
+    solid_angle = 2 * np.abs(np.arctan2(numerator, denominator)).sum()
+    cosine = 1 - solid_angle / (2 * np.pi)
+    sine = min(np.sqrt(1 - cosine**2), 0.999)  # beyond, float32 would not place a sphere so large on the plane
+    radius = height * sine / (1 - sine)
+    foot = seen_from.mean(axis=0) - height * normal
+    return Spheres((foot - radius * normal)[None].astype(np.float32), np.array([radius], np.float32))

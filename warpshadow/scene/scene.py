@@ -1,0 +1,278 @@
+"""Scenes: bodies, light, camera and how visibility is computed."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.image import ImageError, read_rgb
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.mesh import Mesh, MeshError
+from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.maths import sh
+from warpshadow.maths.directions import check_count, edge_width
+from warpshadow.scene.toml_tables import located
+from warpshadow.spheres import Spheres
+from warpshadow.stages.visibility.directional import SOFTNESS
+from warpshadow.stages.visibility.exponential import THRESHOLDS
+from warpshadow.stages.visibility.merging import MERGING, check_merging
+from warpshadow.stages.visibility.zonal_logs import LOGS
+
+SPHERE_METHODS = ("directional", "log-sh")
+METHODS = (*SPHERE_METHODS, "none", "ray-traced")
+AUTO = "auto"
+RECEIVERS = ("vertex", "pixel")
+
+SCENE = "a Scene; load_scene(path) reads one"
+"""What functions that take a scene say they expect."""
+
+COLORS = ".npy"
+"""What a file of colors for each vertex is called; other text is no albedo."""
+
+_SPHERES = ".npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """How visibility is computed.
+
+    Args:
+        method: "directional" transmittance of spheres, "log-sh" of spheres, "none" (no shadows), or "ray-traced"
+            visibility of the meshes, the reference. "auto" leaves the choice to
+            :func:`warpshadow.tuning.tune.resolved`.
+        directions: Number of direction cells of "directional", a multiple of 16.
+        softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
+        merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
+            ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
+        order: Number of SH bands, 2 to 8: of "log-sh", and of the light that "none" shades with.
+        log: Logarithm of one cap of "log-sh": "eigen" or "cap".
+        base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
+        samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
+        error: Largest relative error of shading that "auto" is to accept.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    method: str = "directional"
+    directions: int = 128
+    softness: float = SOFTNESS
+    merging: float = MERGING
+    order: int = 8
+    log: str = "eigen"
+    base: str = "quadratic"
+    samples: int = 1024
+    error: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check.choice("method", self.method, (*METHODS, AUTO))
+        check_count("directions", self.directions)
+        sh.check_order(self.order)
+        check.choice("log", self.log, LOGS)
+        check.choice("base", self.base, THRESHOLDS)
+        if not check.is_integer(self.samples) or self.samples < 1:
+            raise ValueError(f"samples: got {self.samples!r}, expected a positive whole number of directions")
+        if not (check.is_number(self.error) and self.error > 0):
+            raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
+        edge_width(self.softness, self.directions)
+        check_merging(self.merging)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
+
+    The path of a file, relative to the current folder, stands for what is in it, as in scene files.
+
+    Args:
+        mesh: The mesh, or a file that :func:`warpshadow.load_mesh` reads.
+        albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it.
+        texture: Reflectance as an image in place of ``albedo``, linear RGB of shape [height, width, 3], or a file that
+            :func:`warpshadow.read_image` reads; needs uvs.
+        blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
+            casts no shadow, by rays neither. A flat body with all else on its front side is a ground, for which any
+            number means one sphere touching it from behind.
+        rotation: Axis-angle vector [degrees], shape [3].
+        translation: Offset [scene units], shape [3].
+        scale: Factor, positive.
+        receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
+            of few faces needs to receive a shadow.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    mesh: Mesh
+    albedo: np.ndarray | tuple[float, float, float] = (0.8, 0.8, 0.8)
+    texture: np.ndarray | None = field(default=None, repr=False)
+    blockers: int | Spheres = 64
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+    receivers: str = "vertex"
+
+    def __post_init__(self) -> None:
+        """Read files, validate, and hold arrays as float32."""
+        self._read_files()
+        expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
+        check.instance("mesh", self.mesh, Mesh, expected)
+        object.__setattr__(self, "albedo", self._checked_albedo())
+        if self.texture is not None:
+            object.__setattr__(self, "texture", self._checked_texture(self.texture))
+        if not isinstance(self.blockers, Spheres):
+            if not check.is_integer(self.blockers) or self.blockers < 0:
+                raise ValueError(
+                    f"blockers: got {check.described(self.blockers)}, expected a number of spheres, 0 or more, or "
+                    "Spheres, such as fit_spheres(mesh).spheres, or an .npz file of them"
+                )
+            object.__setattr__(self, "blockers", int(self.blockers))
+        remedies = {"rotation": "an axis-angle vector in degrees; scipy's Rotation.as_rotvec(degrees=True) makes one"}
+        for name in ("rotation", "translation"):
+            vector = check.numbers(name, getattr(self, name), expected="three numbers", dtype=np.float64)
+            check.shape(name, vector.shape, (3,), remedies.get(name, ""))
+            check.finite(name, vector)
+            object.__setattr__(self, name, vector)
+        if not (check.is_number(self.scale) and 0 < self.scale <= check.LARGEST):
+            raise ValueError(
+                f"scale: got {check.described(self.scale)}, expected a positive number up to {check.LARGEST:g} for all "
+                "axes; mesh.transformed(scale=(x, y, z)) stretches a mesh"
+            )
+        check.choice("receivers", self.receivers, RECEIVERS)
+
+    @property
+    def casts_shadow(self) -> bool:
+        """Whether the body blocks light."""
+        return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
+
+    def _read_files(self) -> None:
+        """Put what files hold in place of their paths."""
+        readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
+            ("mesh", load_mesh, "", MeshError),
+            ("texture", read_rgb, "", ImageError),
+            ("albedo", _read_colors, COLORS, ValueError),
+            ("blockers", Spheres.read, _SPHERES, ValueError),
+        )
+        for name, read, suffix, error in readers:
+            value = getattr(self, name)
+            if check.is_path(value) and str(value).endswith(suffix):
+                path = check.file(name, value)
+                with located(name, error):
+                    object.__setattr__(self, name, read(path))
+
+    def _checked_albedo(self) -> np.ndarray:
+        count = self.mesh.vertex_count
+        expected = "3 finite numbers, or an .npy file of [vertex, 3]"
+        albedo = check.numbers("albedo", self.albedo, expected=expected)
+        if albedo.shape not in ((3,), (count, 3)):
+            raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
+        _check_reflectance("albedo", albedo)
+        if getattr(self.albedo, "dtype", None) == np.uint8:  # as it is, all but black
+            check.pixels("albedo", self.albedo, expected=expected)
+        return albedo
+
+    def _checked_texture(self, image: np.ndarray) -> np.ndarray:
+        if self.mesh.uvs is None:
+            raise ValueError(
+                f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs, as "
+                "warpshadow.assets.unwrap.unwrap makes them"
+            )
+        texture = check.pixels("texture", image, expected="linear RGB [height, width, 3], or the path of a picture")
+        check.shape("texture", texture.shape, ("height", "width", 3), check.channels_last(texture.shape))
+        if texture.size == 0:
+            raise ValueError(f"texture: got shape {texture.shape}, expected at least one texel")
+        _check_reflectance("texture", texture)
+        return texture
+
+    def rotation_matrix(self) -> np.ndarray:
+        """The rotation as a matrix, float64 of shape [3, 3] (Rodrigues' formula)."""
+        angle = np.radians(np.linalg.norm(self.rotation))
+        if angle == 0:
+            return np.eye(3)
+        x, y, z = np.array(self.rotation) / np.linalg.norm(self.rotation)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+    def world_mesh(self) -> Mesh:
+        """The mesh in world space."""
+        return self.mesh.transformed(
+            rotation=self.rotation_matrix(), translation=np.array(self.translation), scale=self.scale
+        )
+
+
+def _read_colors(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"got {path} ({error}), expected an .npy file of [vertex, 3]") from error
+
+
+def _check_reflectance(name: str, values: np.ndarray) -> None:
+    """Raise ValueError unless all values are in [0, 1]; seal them."""
+    check.finite(name, values)
+    if (values < 0).any() or (values > 1).any():
+        raise ValueError(
+            f"{name}: got values from {values.min()} to {values.max()}, expected reflectances in [0, 1], linear: those "
+            "of sRGB colors from 0 to 255 are warpshadow.assets.image.srgb_to_linear(colors / 255)"
+        )
+    values.setflags(write=False)
+
+
+def check_supersampling(count: object) -> None:
+    """Raise ValueError unless it is a number of samples across a pixel, 1 to 16."""
+    if not check.is_integer(count) or count not in range(1, 17):
+        raise ValueError(f"supersampling: got {check.described(count)}, expected a whole number from 1 to 16")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is rendered.
+
+    Args:
+        bodies: One or more bodies; they cast shadows on each other and on themselves.
+        light: Environment map, or SH coefficients [order², 3], or the path of a map, relative to the current folder.
+        camera: The camera.
+        visibility: How visibility is computed.
+        supersampling: Each pixel averages this many samples across and down, which smooths silhouettes.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    """
+
+    bodies: tuple[Body, ...]
+    light: EnvironmentMap | np.ndarray
+    camera: Camera
+    visibility: Visibility = field(default_factory=Visibility)
+    supersampling: int = 2
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check.instance("bodies", self.bodies, Iterable, "a list of one or more: [Body(mesh)]")
+        object.__setattr__(self, "bodies", tuple(self.bodies))
+        if not self.bodies:
+            raise ValueError("bodies: got none, expected one or more")
+        for number, body in enumerate(self.bodies):
+            check.instance(f"bodies[{number}]", body, Body, "a Body, as Body(mesh) makes it of a mesh")
+        check.instance("camera", self.camera, Camera, "a Camera; several go to Renderer(scene, cameras=[…])")
+        check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
+        given: Any = self.light
+        if check.is_path(given):
+            path = check.file("light", given)
+            with located("light", ImageError):
+                object.__setattr__(self, "light", EnvironmentMap.read(path))
+        if not isinstance(self.light, EnvironmentMap):
+            expected = "an EnvironmentMap, the path of one, or SH coefficients [order², 3]"
+            light = check.numbers("light", self.light, expected=expected)
+            remedies = {0: "EnvironmentMap.constant(radiance) is light from everywhere", 3: "EnvironmentMap(pixels)"}
+            check.shape("light", light.shape, ("order²", 3), remedies.get(light.ndim, ""))
+            check.finite("light", light)
+            order = sh.order_of("light", light)
+            with located("light"):
+                sh.check_order(order)
+            light.setflags(write=False)
+            object.__setattr__(self, "light", light)
+        check_supersampling(self.supersampling)

@@ -1,0 +1,1 @@
+"""The paper, a stage a file: from vertices and spheres to an image."""

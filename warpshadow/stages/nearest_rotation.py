@@ -1,0 +1,72 @@
+"""The rotation that is nearest to a matrix: how nine free numbers become one.
+
+It is a file, and so a module of Warp's, of its own: the singular value decomposition takes seconds to compile.
+"""
+
+import warp as wp
+
+from warpshadow.device.tape import record_adjoint
+
+
+@wp.kernel(enable_backward=False)
+def _nearest_rotations(
+    # in
+    matrices: wp.array2d(dtype=wp.mat33),
+    # out
+    rotations: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a rotation, U diag(1, 1, det UVᵀ) Vᵀ of the singular value decomposition M = U Σ Vᵀ."""
+    batch, body = wp.tid()
+    m = wp.mat33d(matrices[batch, body])
+    u, _s, v = wp.svd3(m / wp.sqrt(wp.ddot(m, m)))
+    one = wp.float64(1.0)
+    middle = wp.diag(wp.vec3d(one, one, wp.sign(wp.determinant(u) * wp.determinant(v))))
+    rotations[batch, body] = wp.mat33(u * middle * wp.transpose(v))
+
+
+@wp.kernel(enable_backward=False)
+def _nearest_rotations_adjoint(
+    # in
+    matrices: wp.array2d(dtype=wp.mat33),
+    rotations: wp.array2d(dtype=wp.mat33),
+    adj_rotations: wp.array2d(dtype=wp.mat33),
+    # out
+    adj_matrices: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a rotation.
+
+    With M = R S, S symmetric, dR = R [ω]ₓ, where (tr S I − S) ω is the axial vector of RᵀdM − dMᵀR. (The adjoint of
+    Warp's svd3 divides by differences of singular values, which are equal where M is a rotation.)
+    """
+    batch, body = wp.tid()
+    r = wp.mat33d(rotations[batch, body])
+    s = wp.transpose(r) * wp.mat33d(matrices[batch, body])
+    g = wp.transpose(r) * wp.mat33d(adj_rotations[batch, body])
+    axial = wp.vec3d(g[2, 1] - g[1, 2], g[0, 2] - g[2, 0], g[1, 0] - g[0, 1])
+    turn = wp.inverse(wp.trace(s) * wp.identity(n=3, dtype=wp.float64) - s) * axial
+    adj_matrices[batch, body] = adj_matrices[batch, body] + wp.mat33(r * wp.skew(turn))
+
+
+def nearest_rotations(matrices: wp.array) -> wp.array:
+    """Find the rotations R that minimize |R − M|.
+
+    Args:
+        matrices: M, mat33 of shape [batch, body], each near to one rotation alone.
+
+    Returns:
+        Rotations, mat33 of shape [batch, body].
+
+    Differentiable: matrices.
+    """
+    rotations = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device, requires_grad=matrices.requires_grad)
+    kept = wp.empty_like(rotations, requires_grad=False)  # the caller may change those that it gets
+    options = {"dim": matrices.shape, "device": matrices.device, "record_tape": False}
+    wp.launch(_nearest_rotations, inputs=[matrices], outputs=[rotations], **options)
+    wp.copy(kept, rotations)
+
+    def adjoint() -> None:
+        inputs = [matrices, kept, rotations.grad]
+        wp.launch(_nearest_rotations_adjoint, inputs=inputs, outputs=[matrices.grad], **options)
+
+    record_adjoint(adjoint, [matrices, rotations])
+    return rotations

@@ -1,0 +1,122 @@
+"""Projection: from the world to clip space, by cameras that may move."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch
+from warpshadow.device.tape import launch
+from warpshadow.device.threads import one_at_a_time
+
+
+@wp.kernel
+def _compose_clip_matrices(
+    # in
+    intrinsics: wp.array(dtype=wp.mat33),
+    rotations: wp.array(dtype=wp.mat33),
+    translations: wp.array(dtype=wp.vec3),
+    to_ndc: wp.mat33,
+    near: float,
+    # out
+    clip_matrices: wp.array(dtype=wp.mat44),
+):
+    """One thread owns one camera: the rows of [K R | K t] in clip space, the depth row apart."""
+    camera = wp.tid()
+    rotation = rotations[wp.min(camera, rotations.shape[0] - 1)]
+    translation = translations[wp.min(camera, translations.shape[0] - 1)]
+    project = to_ndc * intrinsics[wp.min(camera, intrinsics.shape[0] - 1)]
+    r = project * rotation
+    t = project * translation
+    clip_matrices[camera] = wp.mat44(
+        r[0, 0], r[0, 1], r[0, 2], t[0],
+        r[1, 0], r[1, 1], r[1, 2], t[1],
+        0.0, 0.0, 0.0, near,
+        rotation[2, 0], rotation[2, 1], rotation[2, 2], translation[2],
+    )  # fmt: skip
+
+
+@one_at_a_time
+def compose_clip_matrices(
+    intrinsics: wp.array, rotations: wp.array, translations: wp.array, *, size: tuple[int, int], near: float = 0.01
+) -> wp.array:
+    """Compose the maps from world to clip space of cameras whose parameters are free.
+
+    Args:
+        intrinsics: K [pixels], last row (0, 0, 1), mat33 of shape [batch].
+        rotations: R, world to camera, mat33 of shape [batch], from
+            :func:`warpshadow.stages.rotations.rotation_matrices`.
+        translations: t [scene units], world to camera, vec3 of shape [batch].
+            Any batch may be 1 and then serves every instance.
+        size: Width and height [pixels] of the image that K is for.
+        near: Distance of the near plane [scene units].
+    Returns:
+        As :meth:`Camera.clip_matrix`, mat44 of shape [batch].
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    Differentiable: intrinsics (so focal lengths and principal point), rotations, translations.
+    """
+    width, height = check.image_size(size)
+    variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
+    check.finite_arrays(variables)
+    to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
+    clip_matrices = wp.empty(
+        common_batch(variables),
+        dtype=wp.mat44,
+        device=intrinsics.device,
+        requires_grad=any(array.requires_grad for array in variables.values()),
+    )
+    launch(
+        _compose_clip_matrices,
+        dim=clip_matrices.shape,
+        inputs=[*variables.values(), to_ndc, check.positive("near", near)],
+        outputs=[clip_matrices],
+        device=intrinsics.device,
+    )
+    return clip_matrices
+
+
+@wp.kernel
+def _to_clip(
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    clip_matrices: wp.array(dtype=wp.mat44),
+    # out
+    clip_positions: wp.array2d(dtype=wp.vec4),
+):
+    """One thread owns one vertex of one instance."""
+    instance, vertex = wp.tid()
+    p = positions[wp.min(instance, positions.shape[0] - 1), vertex]
+    matrix = clip_matrices[wp.min(instance, clip_matrices.shape[0] - 1)]
+    clip_positions[instance, vertex] = matrix * wp.vec4(p[0], p[1], p[2], 1.0)
+
+
+def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
+    """Take world positions to clip space (convention: see the module).
+
+    Args:
+        positions: World positions [scene units], vec3, shape [batch, vertex].
+        clip_matrices: ``Camera.clip_matrix()`` of each instance, mat44, shape [batch].
+            Either batch may be 1 and then serves every instance of the other.
+    Returns:
+        Clip positions, vec4, shape [batch, vertex].
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    Differentiable: positions, clip_matrices.
+    """
+    check.finite_arrays({"clip_matrices": clip_matrices})
+    batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
+    clip_positions = wp.empty(
+        (batch_count, positions.shape[1]),
+        dtype=wp.vec4,
+        device=positions.device,
+        requires_grad=positions.requires_grad or clip_matrices.requires_grad,
+    )
+    launch(
+        _to_clip,
+        dim=clip_positions.shape,
+        inputs=[positions, clip_matrices],
+        outputs=[clip_positions],
+        device=positions.device,
+    )
+    return clip_positions

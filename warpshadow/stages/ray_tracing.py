@@ -1,0 +1,317 @@
+"""What the approximations are judged by: the mesh itself, by rays through its bounding volume hierarchy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.basis import Basis
+from warpshadow.device.parallel import launch_slices, split_row
+from warpshadow.maths.directions import CHUNK, fibonacci
+from warpshadow.stages.light_samples import CellSamples, LightSamples
+
+_RAY_COST = 200.0
+"""Nanoseconds that a ray takes."""
+
+_ROUNDING = 2.0**-21
+"""How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
+
+_UPRIGHT = 1.0e-3
+"""Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
+in front of it then, whatever rounding says."""
+
+_RAISE = 1.0e-4
+"""Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
+
+
+@wp.func
+def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
+    """Whether a ray from a receiver meets a face, in float64, where coordinates and their differences are exact.
+
+    A receiver on a face, to float32's rounding, is put slightly above it, on the side of its own normal. It so gets no
+    shadow from the face and its neighbors in the plane, but does where light comes from behind them. For all other
+    faces rays start at the receiver itself, so that nothing is too thin or too near to cast a shadow.
+    """
+    a = wp.vec3d(corner_a) - wp.vec3d(point)
+    b = wp.vec3d(corner_b) - wp.vec3d(point)
+    c = wp.vec3d(corner_c) - wp.vec3d(point)
+    across = wp.cross(b - a, c - a)
+    drop = wp.dot(across, a)  # from the plane to the receiver, times |across|
+    largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
+    if wp.abs(drop) <= wp.float64(_ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
+        length = wp.length(across)
+        is_behind = wp.dot(across, wp.vec3d(normal)) < wp.float64(-_UPRIGHT) * length
+        height = wp.where(is_behind, -_RAISE, _RAISE)
+        move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
+        a -= move
+        b -= move
+        c -= move
+        drop = wp.dot(across, a)
+    ray = wp.vec3d(toward)
+    u = wp.dot(ray, wp.cross(c, b))
+    v = wp.dot(ray, wp.cross(a, c))
+    w = wp.dot(ray, wp.cross(b, a))
+    least = wp.min(u, wp.min(v, w))
+    most = wp.max(u, wp.max(v, w))
+    return (least >= wp.float64(0.0) or most <= wp.float64(0.0)) and drop * wp.dot(across, ray) > wp.float64(0.0)
+
+
+@wp.func
+def _escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
+    if mesh == wp.uint64(0):
+        return True
+    # the boxes' slabs need a slope
+    slope = wp.vec3(
+        wp.where(toward[0] == 0.0, 1.0e-20, toward[0]),
+        wp.where(toward[1] == 0.0, 1.0e-20, toward[1]),
+        wp.where(toward[2] == 0.0, 1.0e-20, toward[2]),
+    )
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, slope)
+    face = int(0)
+    while wp.bvh_query_next(query, face):
+        a = wp.mesh_get_point(mesh, 3 * face)
+        b = wp.mesh_get_point(mesh, 3 * face + 1)
+        c = wp.mesh_get_point(mesh, 3 * face + 2)
+        if _is_met(point, normal, toward, a, b, c):
+            return False
+    return True
+
+
+@wp.kernel(enable_backward=False)
+def _trace_visibility(
+    first_row: int,
+    worker: int,
+    # in
+    mesh: wp.uint64,
+    points: wp.array2d[wp.vec3],
+    normals: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
+    # out
+    visibility: wp.array3d[wp.uint8],
+):
+    """Each thread owns one ray: a receiver and a direction."""
+    row, direction = wp.tid()
+    batch, vertex = split_row(first_row + row, points.shape[1])
+    normal = normals[batch, vertex]
+    toward = directions[direction]
+    escapes = wp.uint8(0)
+    if wp.dot(normal, toward) > 0.0 and _escapes(mesh, points[batch, vertex], normal, toward):
+        escapes = wp.uint8(1)
+    visibility[batch, vertex, direction] = escapes
+
+
+def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, directions: wp.array) -> wp.array:
+    """Trace which directions every receiver sees past the mesh, exactly.
+
+    Receivers may lie on the mesh. Directions below a receiver's horizon (n·ω ≤ 0) are not traced and count as blocked.
+
+    Args:
+        mesh: What blocks the light, one mesh for all batches; build it once, it holds the hierarchy. None for nothing.
+        points: Receiver positions [scene units], vec3, shape [batch, vertex].
+        normals: Unit normals of the receivers, vec3, shape [batch, vertex].
+        directions: Unit directions toward the light, vec3, shape [direction].
+
+    Returns:
+        1 where the ray escapes, else 0; uint8, shape [batch, vertex, direction].
+
+    Raises:
+        ValueError: naming the argument whose shape or value does not fit.
+
+    Differentiable: no.
+    """
+    check.shape("points", points.shape, ("batch", "vertex"))
+    check.shape("normals", normals.shape, points.shape)
+    check.shape("directions", directions.shape, ("direction",))
+    visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
+    launch_slices(
+        _trace_visibility,
+        dim=(points.size, *directions.shape),
+        cost=_RAY_COST,
+        inputs=[_id(mesh), points, normals, directions],
+        outputs=[visibility],
+        device=points.device,
+    )
+    return visibility
+
+
+def _id(mesh: wp.Mesh | None) -> wp.uint64:
+    return wp.uint64(0) if mesh is None else mesh.id
+
+
+@wp.kernel(enable_backward=False)
+def _trace_shading(
+    first_row: int,
+    worker: int,
+    # in
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    directions: wp.array2d[wp.vec3],
+    radiance: wp.array2d[wp.vec3],
+    # out
+    shading: wp.array[wp.vec3],
+):
+    """A thread owns a receiver."""
+    receiver = first_row + wp.tid()
+    chosen = int(wp.rand_init(17, receiver) % wp.uint32(directions.shape[0]))
+    point = points[receiver]
+    normal = normals[receiver]
+    total = wp.vec3()
+    for sample in range(directions.shape[1]):
+        toward = directions[chosen, sample]
+        cosine = wp.dot(normal, toward)
+        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
+            total += cosine * radiance[chosen, sample]
+    shading[receiver] = total / wp.pi
+
+
+def trace_shading(
+    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, samples: LightSamples, *, progress: bool = False
+) -> wp.array:
+    """Trace the shading of receivers: the radiance of a white surface, single bounce, as a path tracer gives it.
+
+    Args:
+        mesh: What blocks the light, None for nothing.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        samples: Directions drawn from the light.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        Shading, vec3 of shape [receiver].
+
+    Differentiable: no.
+    """
+    device = points.device
+    directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
+    radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
+    shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+        launch_slices(
+            _trace_shading,
+            dim=[part.stop - part.start],
+            cost=_RAY_COST * directions.shape[1],
+            inputs=[_id(mesh), points[part], normals[part], directions, radiance],
+            outputs=[shading[part]],
+            device=device,
+        )
+    return shading
+
+
+def trace_transfer(
+    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, basis: Basis, count: int, *, progress: bool = False
+) -> wp.array:
+    """Trace transfer vectors: light of the basis is then shadowed by the mesh itself, exactly but for sampling.
+
+    Args:
+        mesh: What blocks the light, None for nothing.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        basis: What the light is expressed in.
+        count: Number of directions, evenly over the sphere.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        Transfer vectors, float32 of shape [receiver, coefficient].
+
+    Differentiable: no.
+    """
+    directions = fibonacci(-(-count // CHUNK) * CHUNK)
+    towards = wp.array(directions, dtype=wp.vec3, device=points.device)
+    functions = (4 / len(directions) * basis.functions(directions)).astype(np.float32)
+    transfer = np.empty((points.shape[0], basis.size), np.float32)
+    for part in _parts(points.shape[0], 2**22 // len(directions), progress):
+        visibility = trace_visibility(
+            mesh,
+            points[part].reshape((1, -1)),
+            normals[part].reshape((1, -1)),
+            towards,
+        )
+        cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
+        transfer[part] = (visibility.numpy()[0] * cosine) @ functions
+    return wp.array(transfer, device=points.device)
+
+
+@wp.kernel(enable_backward=False)
+def _trace_cells(
+    first_row: int,
+    worker: int,
+    # in
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    numbers: wp.array[wp.int32],
+    directions: wp.array2d[wp.vec3],
+    cells: wp.array2d[wp.int32],
+    radiance: wp.array3d[wp.float32],
+    # out
+    light: wp.array3d[wp.float32],
+):
+    """A thread owns a receiver, whose cells are zero before."""
+    receiver = first_row + wp.tid()
+    chosen = int(wp.rand_init(17, numbers[receiver]) % wp.uint32(directions.shape[0]))
+    point = points[receiver]
+    normal = normals[receiver]
+    for sample in range(directions.shape[1]):
+        toward = directions[chosen, sample]
+        cosine = wp.dot(normal, toward) / wp.pi
+        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
+            cell = cells[chosen, sample]
+            for channel in range(light.shape[1]):
+                light[receiver, channel, cell] = (
+                    light[receiver, channel, cell] + cosine * radiance[chosen, sample, channel]
+                )
+
+
+def trace_cells(
+    mesh: wp.Mesh | None,
+    points: wp.array,
+    normals: wp.array,
+    numbers: wp.array,
+    samples: CellSamples,
+    *,
+    progress: bool = False,
+) -> wp.array:
+    """Trace how much light each cell of directions sends past a mesh: :func:`trace_shading`, apart for each cell.
+
+    Args:
+        mesh: What blocks the light, None for nothing.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        numbers: What tells the receivers apart, int32 of shape [receiver]: one gets the same rays whoever is with it.
+        samples: Directions drawn from the light.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        ∫ L V max(n·ω, 0) dω / π over each cell, float32 of shape [receiver, channel, cell].
+
+    Differentiable: no.
+    """
+    shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
+    light = wp.zeros(shape, dtype=wp.float32, device=points.device)
+    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+        launch_slices(
+            _trace_cells,
+            dim=[part.stop - part.start],
+            cost=_RAY_COST * samples.directions.shape[1],
+            inputs=[_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
+            outputs=[light[part]],
+            device=points.device,
+        )
+    return light
+
+
+def _parts(total: int, size: int, progress: bool) -> Iterator[slice]:
+    """Cut a range into slices of at most ``size``, with a progress bar over them."""
+    from tqdm import tqdm
+
+    size = max(size, 1)
+    with tqdm(total=total, desc="tracing rays", unit="point", delay=1, disable=not progress) as bar:
+        for start in range(0, total, size):
+            stop = min(start + size, total)
+            yield slice(start, stop)
+            bar.update(stop - start)

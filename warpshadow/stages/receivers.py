@@ -1,0 +1,271 @@
+"""Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
+
+They are the vertices of what is seen, and for bodies that want it the points that the samples see. Where a surface is
+seen from behind (:mod:`warpshadow.stages.sides`), they are others, at the same places, with opposite normals.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import common_batch, rows
+from warpshadow.device.constants import constant
+from warpshadow.device.tape import launch
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.silhouettes.find import Silhouettes
+
+
+class Receivers(NamedTuple):
+    """Receivers of every instance."""
+
+    points: wp.array  # [batch, receiver − still] vec3
+    normals: wp.array  # [batch, receiver − still] vec3
+    faces: wp.array  # [face or side + own] vec3i, indices of receivers
+    of_vertices: wp.array  # [vertex, and their backs if any is seen] int32, -1 for none
+    fragments: Fragments  # pixel receivers add a degenerate face (r, r, r) each, which its sample sees
+    still: np.ndarray = np.empty(0, int)  # [still], vertices that are the first receivers; points are of those after
+
+
+@wp.func
+def _outward(number: int, count: int):
+    """Sign of the normal of a side of a face or of a vertex, of which there are ``count``."""
+    return wp.where(number < count, 1.0, -1.0)
+
+
+@wp.kernel
+def _gather(
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    sides: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    vertices: wp.array(dtype=wp.int32),
+    samples: wp.array2d(dtype=wp.int32),
+    # out
+    points: wp.array2d(dtype=wp.vec3),
+    point_normals: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver: a vertex, or a sample's point, −1 for none."""
+    batch, receiver = wp.tid()
+    instance = wp.min(batch, positions.shape[0] - 1)
+    own = receiver - vertices.shape[0]
+    if own < 0:
+        vertex = vertices[receiver] % positions.shape[1]
+        points[batch, receiver] = positions[instance, vertex]
+        point_normals[batch, receiver] = _outward(vertices[receiver], positions.shape[1]) * normals[instance, vertex]
+    else:
+        side = int(0)
+        weights = wp.vec3(1.0, 0.0, 0.0)
+        view = wp.min(batch, sides.shape[0] - 1)
+        sample = samples[view, own]
+        if sample >= 0:
+            side = sides[view, sample]
+            weights = barycentrics[view, sample]
+        corners = faces[side % faces.shape[0]]
+        i = corners[0]
+        j = corners[1]
+        k = corners[2]
+        points[batch, receiver] = (
+            weights[0] * positions[instance, i]
+            + weights[1] * positions[instance, j]
+            + weights[2] * positions[instance, k]
+        )
+        point_normals[batch, receiver] = _outward(side, faces.shape[0]) * wp.normalize(
+            weights[0] * normals[instance, i] + weights[1] * normals[instance, j] + weights[2] * normals[instance, k]
+        )
+
+
+@wp.kernel
+def _weigh_own(
+    # in
+    is_own: wp.array(dtype=wp.bool),
+    barycentrics: wp.array(dtype=wp.vec3),
+    # out
+    weights: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a sample; all of the weight is on the first corner where the receiver is its own."""
+    sample = wp.tid()
+    if is_own[sample]:
+        weights[sample] = wp.vec3(1.0, 0.0, 0.0)
+    else:
+        weights[sample] = barycentrics[sample]
+
+
+class Numbering(NamedTuple):
+    """Which vertices are receivers, and their numbers."""
+
+    vertices: wp.array | None  # [receiver − still] int32, those after the still ones; None for all as they are
+    still: np.ndarray  # [still]
+    faces: wp.array  # [face or side] vec3i
+    of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
+
+    @property
+    def receiver_count(self) -> int:
+        """Number of receivers at vertices."""
+        return len(self.still) + (self.of_vertices.size if self.vertices is None else self.vertices.size)
+
+
+def number_receivers(
+    faces: wp.array,
+    keeps_vertex: np.ndarray,
+    is_still: np.ndarray | None = None,
+    order: np.ndarray | None = None,
+) -> Numbering:
+    """Choose the vertices that are receivers.
+
+    Args:
+        faces: Vertex indices, vec3i of shape [face].
+        keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
+        is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
+        order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
+            side. None for their own.
+    """
+    device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
+    if side_count == 1 and keeps_vertex.all() and is_still is None and order is None:
+        of_vertices = constant(np.arange(vertex_count), wp.int32, device)
+        return Numbering(None, np.empty(0, int), faces, of_vertices)
+    is_still = np.zeros(vertex_count, bool) if is_still is None else is_still
+    order = np.arange(vertex_count) if order is None else order
+    shifts = vertex_count * np.arange(side_count)
+    order = (order + shifts[:, None]).ravel()
+    stays, moves = (keeps_vertex & is_still).ravel(), (keeps_vertex & ~is_still).ravel()
+    still, vertices = order[stays[order]], order[moves[order]]
+    of_vertices = np.full(keeps_vertex.size, -1, np.int32)
+    of_vertices[np.concatenate([still, vertices])] = np.arange(len(still) + len(vertices))
+    corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
+    return Numbering(
+        wp.array(vertices, dtype=wp.int32, device=device),
+        still,
+        wp.array(corners, dtype=wp.vec3i, device=device),
+        wp.array(of_vertices, dtype=wp.int32, device=device),
+    )
+
+
+def find_receivers(
+    positions: wp.array,
+    normals: wp.array,
+    faces: wp.array,
+    fragments: Fragments,
+    numbering: Numbering,
+    wants_samples: np.ndarray,
+) -> Receivers:
+    """Gather the points at which light is evaluated.
+
+    Args:
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
+        faces: Vertex indices, vec3i of shape [face].
+        fragments: What each sample sees, one batch for all or one each.
+        numbering: The vertices that are receivers: all of those of a face that a sample sees, unless the face wants
+            samples; with their backs where fragments have sides.
+        wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
+
+    Returns:
+        Receivers; where no face wants samples, many views of one geometry share them.
+
+    Differentiable: positions, normals, barycentrics of the fragments.
+    """
+    device = positions.device
+    vertices, still, receiver_faces, of_vertices = numbering
+    sides = fragments.face_ids if fragments.sides is None else fragments.sides
+    receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
+    samples, own_count = None, 0
+    batch_count = len(positions)
+    has_own = wants_samples.any()
+    if has_own:
+        batch_count = common_batch({"positions": positions, "fragments": sides})
+        own_samples, receiver_fragments = _own_samples(
+            receiver_fragments, np.resize(wants_samples, len(receiver_faces))
+        )
+        own_count, samples = own_samples.shape[1], wp.array(own_samples, dtype=wp.int32, device=device)
+        own_faces = np.repeat(numbering.receiver_count + np.arange(own_count)[:, None], 3, axis=1)
+        own_faces = np.concatenate([receiver_faces.numpy(), own_faces])
+        receiver_faces = wp.array(own_faces, dtype=wp.vec3i, device=device)
+    elif vertices is None:
+        return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
+    vertices = of_vertices if vertices is None else vertices
+    variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
+    requires_grad = any(array.requires_grad for array in variables)
+    shape = batch_count, vertices.size + own_count
+    points, point_normals = (
+        wp.empty(shape, dtype=wp.vec3, device=device, requires_grad=requires_grad) for _ in range(2)
+    )
+    launch(
+        _gather,
+        dim=shape,
+        inputs=[
+            positions,
+            normals,
+            faces,
+            rows(sides),
+            rows(fragments.barycentrics) if has_own else None,
+            vertices,
+            samples,
+        ],
+        outputs=[points, point_normals],
+        device=device,
+    )
+    return Receivers(points, point_normals, receiver_faces, of_vertices, receiver_fragments, still)
+
+
+def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
+    """Find the vertices that have a part in an image: those of faces that samples see, and of edges at silhouettes.
+
+    Args:
+        fragments: What each sample sees, of any number of instances.
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`, whose edges have colors of their
+            own.
+        vertex_count: Number of vertices.
+
+    Returns:
+        bool of shape [1, vertex], or [2, vertex] where fragments have sides: what any instance sees, so that all have
+        as many receivers.
+    """
+    faces, edges, face_count = silhouettes.faces.numpy(), silhouettes.edges.numpy(), len(silhouettes.faces)
+    sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
+    is_seen = np.zeros(side_count * face_count + 1, bool)
+    is_seen[sides.numpy()] = True  # the last item is for samples that see none
+    takes_part = np.zeros((side_count, vertex_count), bool)
+    side_of_edge = np.zeros(edges.shape, int)
+    if side_count == 2:
+        # an edge is seen from the side that one of the pixels beside it sees, each of which has an entry for it
+        side_of_edge[:] = (sides.numpy().ravel()[silhouettes.pixels.numpy()] >= face_count)[:, None, None]
+    for side in range(side_count):
+        takes_part[side, faces[is_seen[side * face_count : (side + 1) * face_count]]] = True
+    takes_part[side_of_edge[edges >= 0], edges[edges >= 0]] = True
+    return takes_part
+
+
+def _own_samples(fragments: Fragments, wants_samples: np.ndarray) -> tuple[np.ndarray, Fragments]:
+    """Samples of each view that have receivers of their own, −1 after the last, and fragments that see those."""
+    device = fragments.face_ids.device
+    face_ids = fragments.face_ids.numpy()
+    is_own = (face_ids >= 0) & wants_samples[face_ids]
+    samples, own_counts = _ragged(is_own.reshape(len(is_own), -1))
+    own_face_ids = face_ids.copy()
+    own_face_ids[is_own] = len(wants_samples) + np.concatenate([np.arange(count) for count in own_counts])
+    weights = wp.empty(
+        fragments.barycentrics.shape,
+        dtype=wp.vec3,
+        device=device,
+        requires_grad=fragments.barycentrics.requires_grad,
+    )
+    launch(
+        _weigh_own,
+        dim=weights.size,
+        inputs=[wp.array(is_own.ravel(), dtype=wp.bool, device=device), fragments.barycentrics.flatten()],
+        outputs=[weights.flatten()],
+        device=device,
+    )
+    return samples, Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights)
+
+
+def _ragged(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns that are chosen in each row, −1 after the last: [row, most of a row], and how many."""
+    counts = chosen.sum(axis=1)
+    columns = np.full((len(chosen), counts.max()), -1)
+    row, column = np.nonzero(chosen)
+    columns[row, np.concatenate([np.arange(count) for count in counts])] = column
+    return columns, counts

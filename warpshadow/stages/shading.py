@@ -1,0 +1,230 @@
+"""Shading: the light that receivers send back as white surfaces, T · L of their transfer vectors and the light."""
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch
+from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
+from warpshadow.device.parallel import launch_slices, split_row
+from warpshadow.device.tape import record_adjoint
+from warpshadow.maths.directions import CHUNK
+
+_SLAB = 256
+"""Receivers whose gradients to light a thread sums before it adds them to the others'."""
+
+_COEFFICIENT_COST = 0.4
+"""Nanoseconds that a coefficient of a receiver takes."""
+
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@wp.kernel(enable_backward=False)
+def _split_channels(
+    # in
+    light: wp.array2d(dtype=wp.vec3),
+    # out
+    channels: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a coefficient of a channel."""
+    batch, channel, k = wp.tid()
+    channels[batch, channel, k] = light[batch, k][channel]
+
+
+@wp.kernel(enable_backward=False)
+def _join_channels(
+    # in
+    channels: wp.array3d(dtype=wp.float32),
+    # out
+    light: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a coefficient, to which it adds."""
+    batch, k = wp.tid()
+    light[batch, k] = light[batch, k] + wp.vec3(channels[batch, 0, k], channels[batch, 1, k], channels[batch, 2, k])
+
+
+@wp.func
+def _sum(values: Chunk):
+    total = float(0.0)
+    for i in range(CHUNK):
+        total += values[i]
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def _shade(
+    first_row: int,
+    worker: int,
+    # in
+    transfer: wp.array3d(dtype=wp.float32),
+    transfer_chunks: wp.array3d(dtype=Chunk),
+    light: wp.array3d(dtype=wp.float32),
+    light_chunks: wp.array3d(dtype=Chunk),
+    # out
+    shading: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
+    batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
+    seen = wp.min(batch, transfer.shape[0] - 1)
+    lit = wp.min(batch, light.shape[0] - 1)
+    red = Chunk(0.0)
+    green = Chunk(0.0)
+    blue = Chunk(0.0)
+    for chunk in range(transfer_chunks.shape[2]):
+        t = transfer_chunks[seen, vertex, chunk]
+        red += wp.cw_mul(t, light_chunks[lit, 0, chunk])
+        green += wp.cw_mul(t, light_chunks[lit, 1, chunk])
+        blue += wp.cw_mul(t, light_chunks[lit, 2, chunk])
+    total = wp.vec3(_sum(red), _sum(green), _sum(blue))
+    for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
+        total += transfer[seen, vertex, k] * wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
+    shading[batch, vertex] = total
+
+
+@wp.kernel(enable_backward=False)
+def _shade_adjoint_transfer(
+    first_row: int,
+    worker: int,
+    # in
+    light: wp.array3d(dtype=wp.float32),
+    light_chunks: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transfer: wp.array3d(dtype=wp.float32),
+    adj_transfer_chunks: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
+    seen, vertex = split_row(first_row + wp.tid(), adj_shading.shape[1])
+    begin = seen
+    end = seen + 1
+    if adj_transfer.shape[0] == 1:
+        end = adj_shading.shape[0]
+    for batch in range(begin, end):
+        lit = wp.min(batch, light.shape[0] - 1)
+        adj = adj_shading[batch, vertex]
+        for chunk in range(light_chunks.shape[2]):
+            adj_transfer_chunks[seen, vertex, chunk] = (
+                adj_transfer_chunks[seen, vertex, chunk]
+                + adj[0] * light_chunks[lit, 0, chunk]
+                + adj[1] * light_chunks[lit, 1, chunk]
+                + adj[2] * light_chunks[lit, 2, chunk]
+            )
+        for k in range(CHUNK * light_chunks.shape[2], light.shape[2]):
+            adj_transfer[seen, vertex, k] = adj_transfer[seen, vertex, k] + wp.dot(
+                adj, wp.vec3(light[lit, 0, k], light[lit, 1, k], light[lit, 2, k])
+            )
+
+
+@wp.kernel(enable_backward=False)
+def _shade_adjoint_light(
+    first_row: int,
+    worker: int,
+    # in
+    transfer: wp.array3d(dtype=wp.float32),
+    transfer_chunks: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_light: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a chunk of coefficients, the last one those left over, and a slab of receivers:  L̄ = Σ T s̄."""
+    row, batch, slab = wp.tid()
+    chunk = first_row + row
+    seen = wp.min(batch, transfer.shape[0] - 1)
+    lit = wp.min(batch, adj_light.shape[0] - 1)
+    begin = slab * _SLAB
+    end = wp.min(begin + _SLAB, transfer.shape[1])
+    first = chunk * CHUNK
+    if chunk < transfer_chunks.shape[2]:
+        red = Chunk(0.0)
+        green = Chunk(0.0)
+        blue = Chunk(0.0)
+        for vertex in range(begin, end):
+            adj = adj_shading[batch, vertex]
+            t = transfer_chunks[seen, vertex, chunk]
+            red += adj[0] * t
+            green += adj[1] * t
+            blue += adj[2] * t
+        for i in range(CHUNK):
+            wp.atomic_add(adj_light, lit, 0, first + i, red[i])
+            wp.atomic_add(adj_light, lit, 1, first + i, green[i])
+            wp.atomic_add(adj_light, lit, 2, first + i, blue[i])
+    else:
+        for k in range(first, transfer.shape[2]):
+            total = wp.vec3()
+            for vertex in range(begin, end):
+                total += transfer[seen, vertex, k] * adj_shading[batch, vertex]
+            for channel in range(3):
+                wp.atomic_add(adj_light, lit, channel, k, total[channel])
+
+
+def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -> wp.array:
+    """Light receivers: the radiance T · L of a white surface.
+
+    Args:
+        transfer: Transfer vectors, float32 of shape [batch, vertex, coefficient].
+        light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
+            Either batch may be 1 and then serves every instance of the other.
+        most: Largest magnitude of a coefficient.
+
+    Returns:
+        Shading, vec3 of shape [batch, vertex].
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: transfer, light. Exact, both being linear.
+    """
+    check.shape("light", light.shape, ("batch", transfer.shape[2]))
+    check.finite_arrays({"light": light}, most=most)
+    for name, array in (("transfer", transfer), ("light", light)):
+        if not array.is_contiguous:
+            raise ValueError(f"{name}: got a strided array, expected a contiguous one")
+    device = transfer.device
+    light_count, count = light.shape
+    instances = common_batch({"transfer": transfer, "light": light})
+    shading = wp.empty(
+        (instances, transfer.shape[1]),
+        dtype=wp.vec3,
+        device=device,
+        requires_grad=transfer.requires_grad or light.requires_grad,
+    )
+    if device.is_cpu:
+        use_vector_registers(__name__)
+    channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
+    wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
+    factors = [transfer, as_chunks(transfer), channels, as_chunks(channels)]
+    cost = _COEFFICIENT_COST * count
+    launch_slices(_shade, dim=[shading.size], cost=cost, inputs=factors, outputs=[shading], device=device)
+
+    def adjoint() -> None:
+        if transfer.requires_grad:
+            launch_slices(
+                _shade_adjoint_transfer,
+                dim=[transfer.shape[0] * transfer.shape[1]],
+                cost=cost * instances / transfer.shape[0],
+                inputs=[*factors[2:], shading.grad],
+                outputs=[transfer.grad, as_chunks(transfer.grad)],
+                device=device,
+            )
+        if light.requires_grad:
+            adj_channels = wp.zeros_like(channels)
+            slab_count = -(-transfer.shape[1] // _SLAB)
+            launch_slices(
+                _shade_adjoint_light,
+                dim=(-(-count // CHUNK), instances, slab_count),
+                cost=_COEFFICIENT_COST * CHUNK * _SLAB,
+                inputs=[*factors[:2], shading.grad],
+                outputs=[adj_channels],
+                device=device,
+            )
+            wp.launch(
+                _join_channels,
+                dim=light.shape,
+                inputs=[adj_channels],
+                outputs=[light.grad],
+                device=device,
+                record_tape=False,
+            )
+
+    record_adjoint(adjoint, [transfer, light, shading])
+    return shading

@@ -1,0 +1,126 @@
+"""Sides: whether samples see a face from the front, where its corners run counter-clockwise, or from behind.
+
+An open surface shows both, and each has a light of its own: that of normals which point to where it is seen from. So
+sides have numbers. Of F faces, face f is side f from the front, and side F + f from behind; likewise vertex v of V is
+number v, with its normal, and number V + v, with the opposite one. The corners of side F + f are those of f, plus V.
+"""
+
+from dataclasses import replace
+
+import warp as wp
+
+from warpshadow.device.batch import rows
+from warpshadow.stages.rasterize import Fragments, run_length
+
+_FACE_RUN = 1024
+"""Faces that a thread owns on a CPU, so that it finds the camera's eye once for all of them."""
+
+
+@wp.func
+def _eye(clip_matrix: wp.mat44):
+    """Where a camera is: the point whose x, y and w in clip space are zero."""
+    x = wp.vec3d(wp.vec3(clip_matrix[0, 0], clip_matrix[0, 1], clip_matrix[0, 2]))
+    y = wp.vec3d(wp.vec3(clip_matrix[1, 0], clip_matrix[1, 1], clip_matrix[1, 2]))
+    w = wp.vec3d(wp.vec3(clip_matrix[3, 0], clip_matrix[3, 1], clip_matrix[3, 2]))
+    at_origin = wp.vec3d(wp.vec3(clip_matrix[0, 3], clip_matrix[1, 3], clip_matrix[3, 3]))
+    shifted = at_origin[0] * wp.cross(y, w) + at_origin[1] * wp.cross(w, x) + at_origin[2] * wp.cross(x, y)
+    return -shifted / wp.dot(x, wp.cross(y, w))
+
+
+@wp.kernel(enable_backward=False)
+def _find_turned(
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    two_sided: wp.array(dtype=wp.int32),
+    clip_matrices: wp.array(dtype=wp.mat44),
+    run: int,
+    # out
+    is_turned: wp.array2d(dtype=wp.bool),
+    is_any: wp.array(dtype=wp.bool),
+):
+    """A thread owns a run of two-sided faces of a view: which turn their backs to the eye; false before.
+
+    In the world and in float64: in clip space a distant ground, seen at a grazing angle, would be lost in rounding.
+    """
+    view, thread = wp.tid()
+    instance = wp.min(view, positions.shape[0] - 1)
+    eye = _eye(clip_matrices[wp.min(view, clip_matrices.shape[0] - 1)])
+    for i in range(thread * run, wp.min((thread + 1) * run, two_sided.shape[0])):
+        face = two_sided[i]
+        corners = faces[face]
+        a = wp.vec3d(positions[instance, corners[0]])
+        b = wp.vec3d(positions[instance, corners[1]])
+        c = wp.vec3d(positions[instance, corners[2]])
+        if wp.dot(wp.cross(b - a, c - a), a - eye) > wp.float64(0.0):
+            is_turned[view, face] = True
+            is_any[0] = True
+
+
+@wp.kernel(enable_backward=False)
+def _see_sides(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    is_turned: wp.array2d(dtype=wp.bool),
+    run: int,
+    # out
+    sides: wp.array2d(dtype=wp.int32),
+    is_any: wp.array(dtype=wp.bool),
+):
+    """A thread owns a run of samples; ``is_any`` is false before."""
+    view, thread = wp.tid()
+    for sample in range(thread * run, (thread + 1) * run):
+        side = face_ids[view, sample]
+        if is_turned[view, wp.max(side, 0)] and side >= 0:
+            side += is_turned.shape[1]
+            is_any[0] = True
+        sides[view, sample] = side
+
+
+def find_sides(
+    fragments: Fragments, faces: wp.array, two_sided: wp.array, positions: wp.array, clip_matrices: wp.array
+) -> Fragments:
+    """Find which side of its face each sample sees.
+
+    Args:
+        fragments: What each sample sees, of shape [batch, height, width].
+        faces: Vertex indices, vec3i of shape [face].
+        two_sided: The faces of which both sides can be seen, int32 of shape [item].
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        clip_matrices: Cameras, mat44 of shape [batch].
+            Either of these batches may be 1 and then serves every instance.
+
+    Returns:
+        Fragments with sides; the same as before if no sample sees a back. (That is read back, which waits for the
+        device. While a CUDA graph is captured nothing is, and there always are sides.)
+
+    Not differentiable: which side is seen changes where a face is seen edge-on.
+    """
+    device = positions.device
+    views, height, width = fragments.face_ids.shape
+    is_turned = wp.zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
+    is_any = wp.zeros(2, dtype=wp.bool, device=device)
+    run = run_length(device, _FACE_RUN)
+    wp.launch(
+        _find_turned,
+        dim=(views, -(-two_sided.shape[0] // run)),
+        inputs=[positions, faces, two_sided, clip_matrices, run],
+        outputs=[is_turned, is_any[:1]],
+        device=device,
+        record_tape=False,
+    )
+    if not device.is_capturing and not is_any.numpy()[0]:
+        return fragments
+    sides = wp.empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
+    run = run_length(device, width)
+    wp.launch(
+        _see_sides,
+        dim=(views, height * width // run),
+        inputs=[rows(fragments.face_ids), is_turned, run],
+        outputs=[rows(sides), is_any[1:]],
+        device=device,
+        record_tape=False,
+    )
+    if not device.is_capturing and not is_any.numpy()[1]:
+        return fragments
+    return replace(fragments, sides=sides)

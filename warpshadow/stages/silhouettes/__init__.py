@@ -1,0 +1,1 @@
+"""Silhouettes: where they are, and how samples blend across them."""

@@ -1,0 +1,1 @@
+"""Textures: mip pyramids, footprints of samples, and the colors that these filter."""

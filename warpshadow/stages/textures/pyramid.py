@@ -1,0 +1,259 @@
+"""Textures: mip levels, and the reflectance that each sample of an image sees of them.
+
+A texture is an image of linear RGB reflectance with row 0 at v = 1; it repeats outside of [0, 1], and its texels have
+their centers at +0.5. Each mip level is half as large as the one before, and a texel there is the mean of those that
+it covers.
+
+A sample does not see a point of the texture but its *footprint*: to first order an ellipse, the image of the sample
+under the derivative of uv by its position. The footprint is filtered by *probes* on a line along its major axis. A
+probe is bilinear in two mip levels, blended so that their mean texel is as wide as the minor axis. So a ground seen
+at a grazing angle neither blurs nor aliases, and each texel in view gets its share of the gradient: a texture that is
+fitted has no holes. Where a texel is larger than the footprint, one probe of the finest level is left, which is
+bilinear interpolation.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, rows
+from warpshadow.device.tape import record_adjoint
+from warpshadow.stages.rasterize import run_length
+
+
+@dataclass(frozen=True, eq=False)
+class Textures:
+    """Mip levels of several textures, of any sizes, in one array.
+
+    Args:
+        texels: All levels of all textures, linear RGB, vec3 of shape [batch, texel].
+        levels: First texel, width and height of each level, the finest first, vec3i of shape [texture, level].
+        level_counts: Levels that each texture has, int32 of shape [texture].
+        sizes: Height and width of each texture.
+    """
+
+    texels: wp.array
+    levels: wp.array
+    level_counts: wp.array
+    sizes: tuple[tuple[int, int], ...]
+
+
+# ---------------------------------------------------------------------------------------------------- mip levels
+
+
+def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """Height and width of each level, rounded down, to a single texel."""
+    sizes = [(height, width)]
+    while max(sizes[-1]) > 1:
+        height, width = max(height // 2, 1), max(width // 2, 1)
+        sizes.append((height, width))
+    return sizes
+
+
+class _Layout:
+    """Where the levels of textures lie in an array of texels."""
+
+    def __init__(self, sizes: tuple[tuple[int, int], ...], device: str):
+        level_sizes = [_level_sizes(*size) for size in sizes]
+        self.level_counts = [len(part) for part in level_sizes]
+        self.levels = np.zeros((len(sizes), max(self.level_counts), 3), np.int32)
+        self.texel_count = 0
+        for texture, part in enumerate(level_sizes):
+            for level, (height, width) in enumerate(part):
+                self.levels[texture, level] = self.texel_count, width, height
+                self.texel_count += width * height
+        self.device_levels = wp.array(self.levels, dtype=wp.vec3i, device=device)
+        self.device_level_counts = wp.array(self.level_counts, dtype=wp.int32, device=device)
+
+    def steps(self, texture: int, coarsest: int | None) -> list[tuple[wp.vec3i, wp.vec3i]]:
+        """Each level of a texture with the next, coarser one, from the finest to the coarsest that is wanted."""
+        level_count = self.level_counts[texture]
+        if coarsest is not None:
+            level_count = min(level_count, coarsest + 1)
+        levels = [wp.vec3i(*level) for level in self.levels[texture, :level_count].tolist()]
+        return list(zip(levels[:-1], levels[1:], strict=True))
+
+
+@functools.lru_cache(maxsize=64)
+def _layout(sizes: tuple[tuple[int, int], ...], device: str) -> _Layout:
+    return _Layout(sizes, device)
+
+
+@wp.kernel(enable_backward=False)
+def _copy(
+    # in
+    values: wp.array(dtype=wp.vec3),
+    # out
+    copies: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a value."""
+    thread = wp.tid()
+    copies[thread] = values[thread]
+
+
+@wp.kernel(enable_backward=False)
+def _add(
+    # in
+    values: wp.array(dtype=wp.vec3),
+    # out
+    sums: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a sum."""
+    thread = wp.tid()
+    sums[thread] = sums[thread] + values[thread]
+
+
+@wp.func
+def _shares(coarse: int, fine_count: int, coarse_count: int):
+    """What part of a coarse texel each of the three fine ones from number 2 ``coarse`` on is.
+
+    An odd number of fine texels is not twice that of coarse ones, which cover 2 + 1/coarse_count each: the outer two
+    of the three are shared with their neighbors.
+    """
+    if fine_count == 1:
+        return wp.vec3(1.0, 0.0, 0.0)
+    if fine_count == 2 * coarse_count:
+        return wp.vec3(0.5, 0.5, 0.0)
+    return wp.vec3(float(coarse_count - coarse), float(coarse_count), float(coarse + 1)) / float(fine_count)
+
+
+@wp.kernel(enable_backward=False)
+def _halve(
+    # in
+    fine: wp.vec3i,
+    coarse: wp.vec3i,
+    run: int,
+    # out
+    texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of texels of the coarse level: the means of what they cover of the fine one."""
+    batch, thread = wp.tid()
+    of_instance = texels[batch]
+    for texel in range(thread * run, (thread + 1) * run):
+        row = texel // coarse[1]
+        column = texel - row * coarse[1]
+        across = _shares(column, fine[1], coarse[1])
+        down = _shares(row, fine[2], coarse[2])
+        start = fine[0] + 2 * row * fine[1] + 2 * column
+        mean = wp.vec3()
+        for i in range(3):
+            if down[i] > 0.0:
+                for j in range(3):
+                    if across[j] > 0.0:
+                        mean += (down[i] * across[j]) * of_instance[start + i * fine[1] + j]
+        of_instance[coarse[0] + texel] = mean
+
+
+@wp.kernel(enable_backward=False)
+def _halve_adjoint(
+    # in
+    fine: wp.vec3i,
+    coarse: wp.vec3i,
+    run: int,
+    # out
+    adj_texels: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of texels of the coarse level."""
+    batch, thread = wp.tid()
+    of_instance = adj_texels[batch]
+    for texel in range(thread * run, (thread + 1) * run):
+        row = texel // coarse[1]
+        column = texel - row * coarse[1]
+        across = _shares(column, fine[1], coarse[1])
+        down = _shares(row, fine[2], coarse[2])
+        start = fine[0] + 2 * row * fine[1] + 2 * column
+        adj_mean = of_instance[coarse[0] + texel]
+        for i in range(3):
+            if down[i] > 0.0:
+                for j in range(3):
+                    if across[j] > 0.0:
+                        wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * across[j]) * adj_mean)
+
+
+def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> Textures:
+    """Compute the mip levels of textures, down to a single texel.
+
+    A level has half the width and the height of the one before, rounded down; its texels have the same size and cover
+    the same square, so where a number is odd a texel is shared by its two neighbors. Each level has the image's mean.
+
+    Args:
+        images: Linear RGB, row 0 at v = 1, vec3 of shape [batch, height, width], each of its own size; a batch may be
+            1 and then serves every instance.
+        coarsest: Coarsest level that is wanted, 0 for the image itself, if footprints are known and take none beyond;
+            by default all.
+
+    Returns:
+        All levels, those beyond the coarsest unwritten or left out. One image without coarser levels is not copied.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+
+    Differentiable: images.
+    """
+    if not images:
+        raise ValueError("images: got none, expected at least one")
+    for number, image in enumerate(images):
+        check.shape(f"images[{number}]", image.shape, ("batch", "height", "width"))
+        if image.dtype != wp.vec3 or not image.size or not image.is_contiguous:
+            got = f"{'' if image.is_contiguous else 'strided '}{image.dtype.__name__} of shape {image.shape}"
+            raise ValueError(f"images[{number}]: got {got}, expected contiguous vec3 with at least one texel")
+    sizes = tuple(image.shape[1:] for image in images)
+    device = images[0].device
+    layout = _layout(sizes, str(device))
+    if len(images) == 1 and coarsest == 0:
+        return Textures(rows(images[0]), layout.device_levels, layout.device_level_counts, sizes)
+    texels = wp.empty(
+        (common_batch({f"images[{number}]": image for number, image in enumerate(images)}), layout.texel_count),
+        dtype=wp.vec3,
+        device=device,
+        requires_grad=any(image.requires_grad for image in images),
+    )
+    for number, image in enumerate(images):
+        for from_image, to_texels in _finest(image, texels, layout, number):
+            _launch(_copy, to_texels.size, [from_image], [to_texels])
+        for fine, coarse in layout.steps(number, coarsest):
+            _launch_on_level(_halve, fine, coarse, texels)
+
+    def adjoint() -> None:
+        for number, image in enumerate(images):
+            if image.requires_grad:
+                _add_to_image(image.grad, texels.grad, layout, number, coarsest)
+
+    record_adjoint(adjoint, [*images, texels])
+    return Textures(texels, layout.device_levels, layout.device_level_counts, sizes)
+
+
+def _add_to_image(
+    adj_image: wp.array, adj_texels: wp.array, layout: _Layout, number: int, coarsest: int | None
+) -> None:
+    """Gather the gradients of all levels of a texture, the coarsest first, in its image."""
+    for fine, coarse in reversed(layout.steps(number, coarsest)):
+        _launch_on_level(_halve_adjoint, fine, coarse, adj_texels)
+    for to_image, from_texels in _finest(adj_image, adj_texels, layout, number):
+        _launch(_add, to_image.size, [from_texels], [to_image])
+
+
+def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
+    """An image [height · width] and the texels of its finest level, in each instance."""
+    first, width, height = layout.levels[number, 0].tolist()
+    flat = image.reshape((image.shape[0], width * height))
+    return [
+        (flat[min(batch, image.shape[0] - 1)], texels[batch, first : first + width * height])
+        for batch in range(texels.shape[0])
+    ]
+
+
+def _launch_on_level(kernel: wp.Kernel, fine: wp.vec3i, coarse: wp.vec3i, texels: wp.array) -> None:
+    """Launch for a coarse level of every instance."""
+    run = run_length(texels.device, coarse[1])
+    _launch(kernel, (texels.shape[0], coarse[1] * coarse[2] // run), [fine, coarse, run], [texels])
+
+
+def _launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+    """Launch off the tape, on the device of the first array."""
+    device = next(value.device for value in [*inputs, *outputs] if isinstance(value, wp.array))
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)

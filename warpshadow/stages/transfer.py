@@ -1,0 +1,330 @@
+"""Transfer vectors: visibility times cosine, so that light is shaded by a dot product.
+
+    B(x) = a(x)/π ∫ L(ω) V(ω, x) max(n·ω, 0) dω
+
+is linear in the light, so a receiver has a *transfer vector* T with B = a · (T · L): its coefficients belong to the
+light's, either spherical harmonics or cells of directions. The 1/π is in T: white under L = 1, unoccluded, gives 1.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import (
+    Chunk,
+    as_chunks,
+    group_count,
+    lane_count,
+    lane_functions,
+    lane_type,
+    module_options,
+    use_vector_registers,
+)
+from warpshadow.device.parallel import Scratch, launch_slices, scratch_place, split_row
+from warpshadow.device.tape import record_adjoint
+from warpshadow.maths import sh
+from warpshadow.maths.directions import CHUNK, check_count
+from warpshadow.stages.sh_kernels import (
+    PRODUCT_COST,
+    ProductTable,
+    add_rotated_zonal,
+    multiply,
+    product_table,
+    rotated_zonal_adjoint,
+    zonal_type,
+)
+
+_CELL_COST = 0.3
+"""Nanoseconds that a cell of a receiver takes."""
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@functools.cache
+def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
+    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
+    fn = lane_functions(lanes)
+    find_group, load, load_rows, store_rows = fn.find_group, fn.load, fn.load_rows, fn.store_rows
+    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
+    COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def transfer_sh(
+        first_row: int,
+        worker: int,
+        # in
+        visibility: wp.array3d(dtype=wp.float32),
+        normals: wp.array2d(dtype=wp.vec3),
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        transfer: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers: the SH product of their visibility and clamped cosine."""
+        row = first_row + wp.tid()
+        batch, group = find_group(row, normals.shape[1])
+        place = scratch_place(worker, row)
+        cosine = scratch[place, 0]
+        for i in range(wp.static(order**2)):
+            cosine[i] = Lane(0.0)
+        x, y, z = load(normals[batch], group)
+        # there is no cosine around a zero normal
+        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
+        zonal = Zonal()
+        for band in range(order):
+            zonal[band] = COSINE[band] * is_there
+        add_rotated_zonal_(x, y, z, zonal, cosine)
+        if wp.static(is_shadowed):
+            factor = scratch[place, 1]
+            product = scratch[place, 2]
+            load_rows(visibility[batch], group, factor)
+            multiply_(factor, cosine, first, pairs, values, product)
+            store_rows(product, group, transfer[batch])
+        else:
+            store_rows(cosine, group, transfer[batch])
+
+    return transfer_sh
+
+
+@functools.cache
+def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
+    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
+    fn = lane_functions(lanes)
+    find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
+    add_rows, add_vectors = fn.add_rows, fn.add_vectors
+    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
+    rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
+    COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def transfer_sh_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        visibility: wp.array3d(dtype=wp.float32),
+        normals: wp.array2d(dtype=wp.vec3),
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        adj_transfer: wp.array3d(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        adj_visibility: wp.array3d(dtype=wp.float32),
+        adj_normals: wp.array2d(dtype=wp.vec3),
+    ):
+        """A thread owns a group of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
+        row = first_row + wp.tid()
+        batch, group = find_group(row, normals.shape[1])
+        place = scratch_place(worker, row)
+        adj_row = scratch[place, 0]
+        factor = scratch[place, 1]
+        product = scratch[place, 2]
+        x, y, z = load(normals[batch], group)
+        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
+        zonal = Zonal()
+        for band in range(order):
+            zonal[band] = COSINE[band] * is_there
+        for i in range(adj_transfer.shape[2], wp.static(order**2)):
+            adj_row[i] = Lane(0.0)
+        load_rows(adj_transfer[batch], group, adj_row)
+        if wp.static(is_shadowed):
+            if adj_visibility:
+                for i in range(wp.static(order**2)):
+                    factor[i] = Lane(0.0)
+                add_rotated_zonal_(x, y, z, zonal, factor)
+                multiply_(factor, adj_row, first, pairs, values, product)
+                add_rows(product, group, adj_visibility[batch])
+            load_rows(visibility[batch], group, factor)
+            multiply_(factor, adj_row, first, pairs, values, product)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = product[i]
+        if adj_normals:
+            adj_x, adj_y, adj_z, _adj_zonal = rotated_zonal_adjoint_(x, y, z, zonal, adj_row)
+            add_vectors(adj_x, adj_y, adj_z, group, adj_normals[batch])
+
+    return transfer_sh_adjoint
+
+
+@functools.cache
+def _first_bands(order: int, device: str, bands: int) -> ProductTable:
+    """Products of which the first bands are wanted: no pairs for the others."""
+    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
+    table = product_table(order, device, bands_of_j=lit_bands)
+    first = table.first.numpy()
+    return table._replace(first=wp.array(np.minimum(first, first[bands**2]), device=device))
+
+
+def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, bands: int | None = None) -> wp.array:
+    """Transfer vectors to light in spherical harmonics: (V * H_n)_k / π, H_n the clamped cosine around the normal.
+
+    Args:
+        visibility: SH visibility, float32 of shape [batch, vertex, order²]; None where nothing blocks.
+        normals: Unit normals, vec3 of shape [batch, vertex].
+        order: Number of SH bands, 2 to 8.
+        bands: Number of bands that the light has, all of them by default; of others no product is computed.
+
+    Returns:
+        Transfer vectors, float32 of shape [batch, vertex, bands²].
+
+    Differentiable: visibility, normals.
+    """
+    sh.check_order(order)
+    bands = order if bands is None else bands
+    check.choice("bands", bands, range(1, order + 1))
+    if visibility is None:
+        order = max(bands, 2)  # the first bands of a cosine are the same in any order
+    device = normals.device
+    lanes = lane_count(device)
+    batch_count, vertex_count = normals.shape
+    if visibility is not None:
+        check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
+    row_count = batch_count * group_count(vertex_count, lanes)
+    variables = [visibility, normals]
+    transfer = wp.empty(
+        (batch_count, vertex_count, bands**2),
+        dtype=wp.float32,
+        device=device,
+        requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
+    )
+    scratch = [Scratch((3, order**2), lane_type(lanes))]
+    cost = PRODUCT_COST * lanes * order**2 * bands**2
+    launch_slices(
+        _sh_transfer_kernel(order, visibility is not None, lanes),
+        dim=[row_count],
+        cost=cost,
+        inputs=[*variables, *_first_bands(order, str(device), bands)],
+        scratch=scratch,
+        outputs=[transfer],
+        device=device,
+    )
+
+    def adjoint() -> None:
+        table = product_table(order, str(device), bands_of_j=tuple(range(bands)))
+        launch_slices(
+            _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
+            dim=[row_count],
+            cost=2 * cost,
+            inputs=[*variables, *table, transfer.grad],
+            scratch=scratch,
+            outputs=[None if variable is None else variable.grad for variable in variables],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [*variables, transfer])
+    return transfer
+
+
+@wp.kernel(enable_backward=False)
+def _transfer_directions(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
+    # out
+    transfer: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver."""
+    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
+    n = normals[batch, vertex]
+    for chunk in range(directions.shape[1]):
+        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
+        cosine = weight * wp.max(cosine, Chunk(0.0))
+        transfer[batch, vertex, chunk] = wp.cw_mul(cosine, transmittance[batch, vertex, chunk])
+
+
+@wp.kernel(enable_backward=False)
+def _transfer_directions_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
+    adj_transfer: wp.array3d(dtype=Chunk),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+    adj_normals: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
+    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
+    n = normals[batch, vertex]
+    total = wp.vec3()
+    for chunk in range(directions.shape[1]):
+        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
+        adj = weight * adj_transfer[batch, vertex, chunk]
+        if adj_transmittance:
+            adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
+                adj, wp.max(cosine, Chunk(0.0))
+            )
+        is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+        adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), is_up)
+        total += wp.vec3(
+            wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
+        )
+    if adj_normals:
+        adj_normals[batch, vertex] = adj_normals[batch, vertex] + total
+
+
+def directional_transfer(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> wp.array:
+    """Transfer vectors to light in cells of directions: T_q max(n·ω_q, 0) · (4π/Q) / π.
+
+    Args:
+        transmittance: Float32 of shape [batch, vertex, direction].
+        normals: Unit normals, vec3 of shape [batch, vertex].
+        directions: Unit vectors ω, NumPy of shape [direction, 3].
+
+    Returns:
+        Transfer vectors, float32 of shape [batch, vertex, direction].
+
+    Differentiable: transmittance, normals.
+    """
+    count = len(directions)
+    check_count("directions", count)
+    check.shape("transmittance", transmittance.shape, (*normals.shape, count))
+    device = normals.device
+    if transmittance.requires_grad and not transmittance.is_contiguous:
+        raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
+    seen = as_chunks(transmittance.contiguous())
+    variables = [transmittance, normals]
+    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
+    transfer = wp.empty(
+        transmittance.shape,
+        dtype=wp.float32,
+        device=device,
+        requires_grad=any(variable.requires_grad for variable in variables),
+    )
+    if device.is_cpu:
+        use_vector_registers(__name__)
+    cost = _CELL_COST * count
+    launch_slices(
+        _transfer_directions,
+        dim=[normals.size],
+        cost=cost,
+        inputs=[seen, normals, towards, 4.0 / count],
+        outputs=[as_chunks(transfer)],
+        device=device,
+    )
+
+    def adjoint() -> None:
+        launch_slices(
+            _transfer_directions_adjoint,
+            dim=[normals.size],
+            cost=2 * cost,
+            inputs=[seen, normals, towards, 4.0 / count, as_chunks(transfer.grad)],
+            outputs=[as_chunks(transmittance.grad), normals.grad],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [*variables, transfer])
+    return transfer

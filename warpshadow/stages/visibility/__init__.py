@@ -1,0 +1,1 @@
+"""Visibility past spheres: directional transmittance and log-SH."""

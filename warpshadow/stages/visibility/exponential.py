@@ -1,0 +1,562 @@
+"""The exponential of log-visibility under the truncated SH product, by scaling and squaring.
+
+exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
+
+Where many spheres overlap, the truncated sum of their logs has lobes above 0, and their exponential grows without
+bound: with 10 000 spheres in one direction, beyond float64. So squarings are *held* where they are no longer those of
+a visibility. Squares of numbers from 0 to 1 are, in the mean, no more than the numbers; so with d = ⟨v²⟩ − ⟨v⟩, means
+over directions,
+
+    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
+
+is plain squaring while |f̂| d ≤ QUIET, and no squaring from LOUD on: the result is then the visibility of a part of
+f, 2^−k of it. The factor |f̂|, which is as large as spheres are deep, holds deep logs earlier: they are dark long
+before all their squarings. QUIET to LOUD are two octaves, since by that or more one squaring raises d: so v moves
+smoothly with f. The mean is the product's first coefficient, and the rule costs nothing.
+
+The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps with |f̂|, and with it would the value by
+some tenths of a percent, which the difference of two images divides by their distance. So from t = |f̂| / 2^p T = ½ on,
+where p is just enough, the base approximation q of f / 2^p passes into the square of that of f / 2^{p+1},
+
+    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
+
+which at t = 1 is what p + 1 begins with: v has a continuous derivative. It takes one product more and halves |h|.
+"""
+
+import functools
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.lanes import group_count, lane_count, lane_functions, lane_type, module_options
+from warpshadow.device.parallel import Scratch, launch_slices, scratch_place
+from warpshadow.device.tape import record_adjoint
+from warpshadow.maths import sh
+from warpshadow.stages.sh_kernels import multiply, product_table
+from warpshadow.stages.visibility.zonal_logs import zonal_eigen_log
+
+
+class Threshold(NamedTuple):
+    """The |f̂| that a base approximation of the exponential is given by default, and the most it may be given."""
+
+    default: float
+    limit: float
+
+
+THRESHOLDS = {
+    "quadratic": Threshold(1.0, 1.0),
+    "linear": Threshold(0.12, 1.0),
+    "optimal_linear": Threshold(0.12, 2.0),
+}
+"""Base approximations of the exponential. Beyond the limits, plain squaring explodes: for `quadratic` the error is
+3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
+(`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
+
+LEAST_THRESHOLD = 0.01
+"""Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
+
+MOST_SQUARINGS = 20
+"""Limit of the squarings; a log that asks for more is cut down to what they can do."""
+
+QUIET = 6.0
+"""|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
+
+LOUD = 24.0
+"""|f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared."""
+
+BLENDED = 0.7
+"""|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
+
+_SQUARING_COST = 0.5
+"""Nanoseconds that exponentiation takes for a receiver and a pair of coefficients."""
+
+_UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
+_KNOTS = 2048
+
+
+@functools.cache
+def _optimal_table(order: int, device: str) -> wp.array:
+    """The best a·1 + b·f̂ for exp(f̂) of one cap's log, over |f̂| (Ren et al. 2006, section 5): [knot] of (a, b)."""
+    log = zonal_eigen_log(order, np.cos(np.linspace(1e-3, np.pi / 2, 2000)))
+    log[:, 0] = 0
+    norm = np.linalg.norm(log, axis=1)
+    z, weight = np.polynomial.legendre.leggauss(64)
+    basis = sh.zonal_basis(order, z)
+    exponential = 2 * np.pi * np.exp(log @ basis.T) * weight @ basis
+    a = exponential[:, 0] / _UNIT
+    b = np.sum(exponential * log, axis=1) / norm**2
+    rising = np.argmax(norm)
+    knots = np.linspace(0, THRESHOLDS["optimal_linear"].limit, _KNOTS + 1)
+    table = np.stack([np.interp(knots, np.r_[0, norm[:rising]], np.r_[1, v[:rising]]) for v in (a, b)], axis=-1)
+    return wp.array(table.astype(np.float32), dtype=wp.vec2, device=device)
+
+
+@functools.cache
+def _measure_function(order: int, lanes: int) -> wp.Function:
+    """Make the kernel function that measures f.
+
+    It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; of the
+    base e^{…/2}, the share w of the square and its derivative by |f̂|.
+    """
+    Lane = lane_type(lanes)
+    sqrt = lane_functions(lanes).sqrt
+    PER_BLEND = wp.constant(1 / (BLENDED - 0.5))
+
+    @wp.func
+    def measure(log: wp.array(dtype=Lane), threshold: float):
+        norm2 = Lane(0.0)
+        for i in range(1, wp.static(order**2)):
+            norm2 += wp.cw_mul(log[i], log[i])
+        above = wp.max(log[0], Lane(0.0))
+        depth = sqrt(norm2 + wp.cw_mul(above, above))
+        count = Lane(0.0)
+        scale = Lane(1.0)
+        most = int(0)
+        root = Lane(0.0)
+        blend = Lane(0.0)
+        blend_slope = Lane(0.0)
+        for lane in range(lanes):
+            # the least p with |f̂| / 2^p ≤ threshold, of each receiver by itself
+            p = int(0)
+            s = float(1.0)
+            while s * depth[lane] > threshold:
+                s = 0.5 * s
+                p = p + 1
+            p = wp.min(p, MOST_SQUARINGS)
+            count[lane] = float(p)
+            scale[lane] = s
+            most = wp.max(most, p)
+            # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing overflows
+            root[lane] = wp.exp(0.5 * s * log[0][lane] / _UNIT)
+            t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
+            blend[lane] = t * t * (3.0 - 2.0 * t)
+            blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
+        return count, scale, sqrt(norm2), depth, most, root, blend, blend_slope
+
+    return measure
+
+
+@functools.cache
+def _factor_function(base: str, lanes: int) -> wp.Function:
+    """Make the kernel function of the base's factors: |h| → a, b of a 1 + b h, and their derivatives."""
+    Lane = lane_type(lanes)
+    STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
+    is_optimal = base == "optimal_linear"
+
+    @wp.func
+    def factors(length: Lane, optimal: wp.array(dtype=wp.vec2)):
+        constant = Lane(1.0)
+        slope = Lane(1.0)
+        constant_change = Lane(0.0)
+        slope_change = Lane(0.0)
+        if wp.static(is_optimal):
+            for lane in range(lanes):
+                position = length[lane] / STEP
+                interval = wp.min(int(position), _KNOTS - 1)
+                ab = wp.lerp(optimal[interval], optimal[interval + 1], position - float(interval))
+                change = (optimal[interval + 1] - optimal[interval]) / STEP
+                constant[lane] = ab[0]
+                slope[lane] = ab[1]
+                constant_change[lane] = change[0]
+                slope_change[lane] = change[1]
+        return constant, slope, constant_change, slope_change
+
+    return factors
+
+
+@functools.cache
+def _base_function(order: int, base: str, lanes: int) -> wp.Function:
+    """Make the kernel function of the base approximation F (a 1 + b h + q h * h), h = s f̂."""
+    Lane = lane_type(lanes)
+    factors = _factor_function(base, lanes)
+
+    @wp.func
+    def approximate(
+        residual: wp.array(dtype=Lane),
+        square: wp.array(dtype=Lane),
+        norm: Lane,
+        scale: Lane,
+        factor: Lane,
+        optimal: wp.array(dtype=wp.vec2),
+        result: wp.array(dtype=Lane),
+    ):
+        """The result may be the residual's own memory; the square, f̂ * f̂, is read for `quadratic` only."""
+        constant, slope, _c, _s = factors(wp.cw_mul(scale, norm), optimal)
+        first_power = wp.cw_mul(factor, scale)
+        linear = wp.cw_mul(first_power, slope)
+        quadratic = 0.5 * wp.cw_mul(first_power, scale)
+        for i in range(wp.static(order**2)):
+            value = wp.cw_mul(linear, residual[i])
+            if wp.static(base == "quadratic"):
+                value += wp.cw_mul(quadratic, square[i])
+            result[i] = value
+        result[0] = result[0] + _UNIT * wp.cw_mul(factor, constant)
+
+    return approximate
+
+
+@functools.cache
+def _hold_function(lanes: int) -> wp.Function:
+    """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
+    Lane = lane_type(lanes)
+    PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
+
+    @wp.func
+    def hold(loudness: Lane):
+        share = Lane(1.0)
+        slope = Lane(0.0)
+        if wp.max(loudness) > QUIET:
+            for lane in range(lanes):
+                if loudness[lane] > QUIET:
+                    t = wp.min(wp.log(loudness[lane] / QUIET) * PER_OCTAVES, 1.0)
+                    share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
+                    slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
+        return share, slope
+
+    return hold
+
+
+@functools.cache
+def _square_function(order: int, lanes: int) -> wp.Function:
+    """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
+    Lane = lane_type(lanes)
+    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+
+    @wp.func
+    def square_held(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        square: wp.array(dtype=Lane),
+    ):
+        multiply_(row, row, first, pairs, values, square)
+        share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
+        rest = Lane(1.0) - share
+        if wp.max(rest) > 0.0:
+            for i in range(wp.static(order**2)):
+                square[i] = wp.cw_mul(rest, row[i]) + wp.cw_mul(share, square[i])
+        return rest
+
+    return square_held
+
+
+@functools.cache
+def _square_adjoint_function(order: int, lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`_square_function`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
+
+    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the loudness
+    λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄ λ/|f̂|.
+    """
+    Lane = lane_type(lanes)
+    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+
+    @wp.func
+    def square_held_adjoint(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        adj_square: wp.array(dtype=Lane),
+        adj_row: wp.array(dtype=Lane),
+    ):
+        multiply_(row, adj_square, first, pairs, values, adj_row)
+        mean_square = Lane(0.0)
+        along = Lane(0.0)
+        adj_share = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            mean_square += wp.cw_mul(row[i], row[i])
+            along += wp.cw_mul(row[i], adj_square[i])
+            adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
+        growth = (mean_square / _UNIT - row[0]) / _UNIT
+        share, share_slope = hold(wp.cw_mul(depth, growth))
+        for i in range(wp.static(order**2)):
+            adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
+        adj_loudness = wp.cw_mul(adj_share, share_slope)
+        if wp.min(share_slope) < 0.0:
+            adj_growth = wp.cw_mul(adj_loudness, depth)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, row[i])
+            adj_row[0] = adj_row[0] - adj_growth / _UNIT
+        return along + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
+
+    return square_held_adjoint
+
+
+@functools.cache
+def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
+    Lane = lane_type(lanes)
+    fn = lane_functions(lanes)
+    load_rows, store_rows, multiply_ = fn.load_rows, fn.store_rows, multiply(order, lanes)
+    find_group = fn.find_group
+    measure, approximate = _measure_function(order, lanes), _base_function(order, base, lanes)
+    square_held = _square_function(order, lanes)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def exponentiate_log_sh(
+        first_row: int,
+        worker: int,
+        # in
+        log_sh: wp.array3d(dtype=wp.float32),
+        threshold: float,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        optimal: wp.array(dtype=wp.vec2),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        powers: wp.array4d(dtype=Lane),
+        visibility: wp.array3d(dtype=wp.float32),
+        faults: wp.array(dtype=wp.int32),
+    ):
+        """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
+
+        Powers are the approximation of f / 2^{p+1}, then what is squared. Faults count the receivers whose squarings
+        are held, and those whose log is too large or not finite.
+        """
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, log_sh.shape[1])
+        own = scratch[scratch_place(worker, thread)]
+        row = own[0]
+        square = own[1]
+        half = own[2]
+        if wp.static(keeps_powers):
+            half = powers[batch, group, 0]
+        load_rows(log_sh[batch], group, row)
+        count, scale, norm, depth, most, root, blend, _slope = measure(row, threshold)
+        mean = row[0]
+        row[0] = Lane(0.0)
+        if wp.static(base == "quadratic"):
+            multiply_(row, row, first, pairs, values, square)
+        approximate(row, square, norm, 0.5 * scale, root, optimal, half)
+        approximate(row, square, norm, scale, wp.cw_mul(root, root), optimal, row)
+        held = Lane(0.0)
+        if wp.max(blend) > 0.0:
+            held = wp.cw_mul(blend, square_held(half, depth, first, pairs, values, square))
+            for i in range(wp.static(order**2)):
+                row[i] = wp.cw_mul(Lane(1.0) - blend, row[i]) + wp.cw_mul(blend, square[i])
+        for step in range(most):
+            if wp.static(keeps_powers):
+                for i in range(wp.static(order**2)):
+                    powers[batch, group, step + 1, i] = row[i]
+            is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
+            held += wp.cw_mul(is_due, square_held(row, depth, first, pairs, values, square))
+            for i in range(wp.static(order**2)):
+                row[i] = wp.cw_mul(Lane(1.0) - is_due, row[i]) + wp.cw_mul(is_due, square[i])
+        for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
+            if not wp.isfinite(depth[lane] + mean[lane]):
+                wp.atomic_add(faults, 1, 1)
+            elif held[lane] > 0.0:
+                wp.atomic_add(faults, 0, 1)
+        store_rows(row, group, visibility[batch])
+
+    return exponentiate_log_sh
+
+
+@functools.cache
+def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel:
+    Lane = lane_type(lanes)
+    fn = lane_functions(lanes)
+    load_rows, add_rows, multiply_ = fn.load_rows, fn.add_rows, multiply(order, lanes)
+    find_group = fn.find_group
+    measure, factors = _measure_function(order, lanes), _factor_function(base, lanes)
+    square_held_adjoint = _square_adjoint_function(order, lanes)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def exponentiate_log_sh_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        log_sh: wp.array3d(dtype=wp.float32),
+        threshold: float,
+        first: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        values: wp.array(dtype=wp.float32),
+        optimal: wp.array(dtype=wp.vec2),
+        powers: wp.array4d(dtype=Lane),
+        adj_visibility: wp.array3d(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        adj_log_sh: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers and goes back through the squarings, then the base.
+
+        The base is v = q + w (H(u) − q) with q of h = f̂ / 2^p and u of h/2, each F (a 1 + b h + c h * h), and
+        F = exp(2^−p f0/√4π), of u its root. So q̄ = (1 − w) v̄, ū = w H̄, w̄ = Σ v̄ H(u) − Σ v̄ q, |f̂|¯ = w̄ w', and
+        f̄0 = 2^−p/√4π (Σ q̄ q + ½ Σ ū u), h̄ = F (b q̄ + 2c h * q̄) + ½ √F (b ū + 2c (h/2) * ū), and for a(|h|), b(|h|)
+        also F (√4π q̄0 a' + b' Σ q̄ h) h/|h| and the like of ū. For `quadratic` q = 4 √F u − F (3 + h).
+        """
+        thread = first_row + wp.tid()
+        batch, group = find_group(thread, log_sh.shape[1])
+        own = scratch[scratch_place(worker, thread)]
+        log = own[0]
+        adj_row = own[1]
+        product = own[2]
+        bent = own[3]
+        load_rows(log_sh[batch], group, log)
+        load_rows(adj_visibility[batch], group, adj_row)
+        count, scale, norm, depth, most, root, blend, blend_slope = measure(log, threshold)
+        adj_depth = Lane(0.0)
+        for back in range(most):
+            step = most - 1 - back
+            is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
+            _along, change = square_held_adjoint(
+                powers[batch, group, step + 1], depth, first, pairs, values, adj_row, product
+            )
+            adj_depth += wp.cw_mul(is_due, change)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])
+
+        half = powers[batch, group, 0]
+        above = wp.cw_mul(scale, wp.max(log[0], Lane(0.0)))
+        log[0] = Lane(0.0)
+        factor = wp.cw_mul(root, root)
+        length = wp.cw_mul(scale, norm)
+        constant, slope, constant_change, slope_change = factors(length, optimal)
+        _constant, half_slope, half_constant_change, half_slope_change = factors(0.5 * length, optimal)
+
+        along = Lane(0.0)  # Σ v̄ h
+        half_along = Lane(0.0)  # Σ v̄ u
+        for i in range(wp.static(order**2)):
+            log[i] = wp.cw_mul(scale, log[i])
+            along += wp.cw_mul(adj_row[i], log[i])
+            half_along += wp.cw_mul(adj_row[i], half[i])
+        whole = wp.cw_mul(factor, _UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, along))  # Σ v̄ q
+        if wp.static(base == "quadratic"):
+            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * _UNIT * adj_row[0] + along)
+        rest = Lane(1.0) - blend
+        dc = wp.cw_mul(rest, whole)
+        if wp.max(blend) > 0.0:
+            squared, change = square_held_adjoint(half, depth, first, pairs, values, adj_row, product)
+            adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared - whole)
+            for i in range(wp.static(order**2)):
+                adj_half = 0.5 * wp.cw_mul(blend, product[i])
+                dc += wp.cw_mul(adj_half, half[i])
+                product[i] = wp.cw_mul(root, adj_half)
+        else:
+            for i in range(wp.static(order**2)):
+                product[i] = Lane(0.0)
+
+        # from here on adj_row is F q̄ and product ½ √F ū
+        half_along = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            adj_row[i] = wp.cw_mul(wp.cw_mul(factor, rest), adj_row[i])
+            half_along += wp.cw_mul(product[i], log[i])
+        along = wp.cw_mul(wp.cw_mul(factor, rest), along)
+        radial = Lane(0.0)
+        if wp.static(base == "optimal_linear"):
+            radial = _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(along, slope_change)
+            radial += _UNIT * wp.cw_mul(product[0], half_constant_change)
+            radial += 0.5 * wp.cw_mul(half_along, half_slope_change)
+            radial = wp.cw_div(radial, wp.max(length, Lane(1.0e-20)))
+        for i in range(wp.static(order**2)):
+            whole_and_half = adj_row[i] + 0.5 * product[i]
+            adj_row[i] = wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial, log[i])
+            product[i] = whole_and_half
+        if wp.static(base == "quadratic"):
+            multiply_(log, product, first, pairs, values, bent)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + bent[i]
+        adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
+        for i in range(1, wp.static(order**2)):
+            adj_row[i] = wp.cw_mul(scale, adj_row[i]) + wp.cw_mul(adj_depth, log[i])
+        adj_row[0] = wp.cw_mul(scale, dc) / _UNIT + wp.cw_mul(adj_depth, above)
+        add_rows(adj_row, group, adj_log_sh[batch])
+
+    return exponentiate_log_sh_adjoint
+
+
+def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float | None = None) -> wp.array:
+    """Exponentiate log-visibility with the SH product, by scaling and squaring.
+
+        exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p},  p the least with |f̂| / 2^p ≤ threshold
+                                                     [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
+
+    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap (see the module): it is
+    then bounded, and draws a warning.
+
+    Args:
+        log_sh: Log-visibility f, float32 of shape [batch, vertex, order²], f̂ being f without its constant part.
+        base: Approximation of exp*(h) for small h: "quadratic" 1 + h + h²/2, "linear" 1 + h, or "optimal_linear"
+            a(|h|) 1 + b(|h|) h with a and b tabulated from caps of all angles.
+        threshold: Largest |h|; None for the default of THRESHOLDS[base]. Beyond its limit squaring explodes, so more
+            is refused.
+
+    Returns:
+        SH visibility, float32 of shape [batch, vertex, order²].
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf and numbers beyond 1e18.
+            (Reading the counts waits for the device. While a CUDA graph is captured that cannot be, and nothing is
+            checked.)
+
+    Differentiable: log_sh.
+    """
+    check.choice("base", base, THRESHOLDS)
+    default, limit = THRESHOLDS[base]
+    threshold = default if threshold is None else threshold
+    if not LEAST_THRESHOLD <= threshold <= limit:
+        raise ValueError(
+            f"threshold: got {threshold!r} for base {base!r}, expected {LEAST_THRESHOLD} to {limit}: beyond it "
+            "repeated squaring is unstable, below it drowns in rounding"
+        )
+    check.shape("log_sh", log_sh.shape, ("batch", "vertex", "order²"))
+    order = int(round(np.sqrt(log_sh.shape[2])))
+    sh.check_order(order)
+    check.shape("log_sh", log_sh.shape, ("batch", "vertex", order**2))
+    device = log_sh.device
+    lanes = lane_count(device)
+    batch_count, vertex_count = log_sh.shape[:2]
+    groups = group_count(vertex_count, lanes)
+    needs_gradient = log_sh.requires_grad
+    # memory that no squaring reaches is never touched
+    powers_shape = (batch_count, groups, MOST_SQUARINGS + 1, order**2)
+    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if needs_gradient else None
+    row_count = batch_count * groups
+    scratch = [Scratch((4, order**2), lane_type(lanes))]
+    visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
+    optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
+    faults = wp.zeros(2, dtype=wp.int32, device=device)
+    cost = _SQUARING_COST * lanes * order**4
+    launch_slices(
+        _exponentiate_kernel(order, base, needs_gradient, lanes),
+        dim=[row_count],
+        cost=cost,
+        inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal],
+        scratch=scratch,
+        outputs=[powers, visibility],
+        sums=[faults],
+        device=device,
+    )
+    if not device.is_capturing:
+        held, broken = faults.numpy().tolist()
+        if broken:
+            check.finite_arrays({"log_sh": log_sh})
+        if held:
+            warnings.warn(
+                f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
+                "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate",
+                stacklevel=2,
+            )
+
+    def adjoint() -> None:
+        table = product_table(order, str(device))
+        launch_slices(
+            _exponentiate_adjoint_kernel(order, base, lanes),
+            dim=[row_count],
+            cost=2 * cost,
+            inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad],
+            scratch=scratch,
+            outputs=[log_sh.grad],
+            device=device,
+        )
+
+    record_adjoint(adjoint, [log_sh, visibility])
+    return visibility

@@ -1,0 +1,261 @@
+"""Merging: four neighboring spheres, seen from so far that they fall into one cell of directions, are one sphere.
+
+Spheres that follow each other in memory make up a quad, which has a sphere of its own at their middle, as large as they
+look on average over all directions, and an extent E, about half of their diameter. A receiver at distance D sees the
+quad under a half-angle of about E/D, and takes
+
+    m = smoothstep((τ² − (E/D)²) / (τ² − τ0²)),  τ0 = 0.7 τ
+
+of the quad's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that nothing
+jumps as bodies move. What is seen is moved by τ at most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
+
+How large a quad looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
+they cover more than the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their parts of
+the volume, which is 5 √(e2(M)/3) on average, e2 being the sum of the products of two eigenvalues; overlapping spheres
+bulge out of it, which a factor of 1.08 makes up for. So r² = (S⁻⁴ + (5.4 √(e2/3))⁻⁴)^(−1/4): for four spheres at random
+the covered area within 10%, on average.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import concatenate
+from warpshadow.device.lanes import lane_functions, lane_type
+from warpshadow.device.tape import launch
+from warpshadow.stages.visibility.cones import TINY_RADIUS
+
+QUAD = 4
+"""Spheres that merge, in the order in which they are given: best near each other."""
+
+ITEMS = QUAD + 1
+"""Spheres of a quad, its own included."""
+
+MERGING = 0.75
+"""τ: half-angle in cell radii under which four spheres are seen as one."""
+
+MERGED_FROM = 512
+"""Fewer spheres do not merge: they are so large that hardly a receiver is far enough from them."""
+
+_BLEND = 0.7  # τ0 / τ
+
+_SHADOW = 5.4  # of an ellipsoid, from the moments of spheres
+
+_FARTHEST2 = 1.0e30  # (D/E)² is kept where its products are float32
+
+
+class Nodes(NamedTuple):
+    """Spheres, and after them those of their quads; of the quads there may be none."""
+
+    centers: wp.array  # [batch, node] vec3
+    radii: wp.array  # [batch, node] float32
+    extents: wp.array  # [batch, quad] float32
+
+
+@wp.kernel
+def _merge(
+    # in
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    # out
+    merged_centers: wp.array2d(dtype=wp.vec3),
+    merged_radii: wp.array2d(dtype=wp.float32),
+    extents: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a quad."""
+    batch, quad = wp.tid()
+    a = centers[batch, 4 * quad]
+    b = centers[batch, 4 * quad + 1]
+    c = centers[batch, 4 * quad + 2]
+    d = centers[batch, 4 * quad + 3]
+    radius = wp.vec4(
+        radii[batch, 4 * quad], radii[batch, 4 * quad + 1], radii[batch, 4 * quad + 2], radii[batch, 4 * quad + 3]
+    )
+    largest = wp.max(radius)
+    if largest > TINY_RADIUS:
+        share = radius / largest
+        share = wp.cw_mul(share, wp.cw_mul(share, share))
+        share = share / (share[0] + share[1] + share[2] + share[3])
+        middle = share[0] * a + share[1] * b + share[2] * c + share[3] * d
+        size = largest + wp.max(
+            wp.max(wp.max(wp.abs(a - middle)), wp.max(wp.abs(b - middle))),
+            wp.max(wp.max(wp.abs(c - middle)), wp.max(wp.abs(d - middle))),
+        )
+        a = (a - middle) / size
+        b = (b - middle) / size
+        c = (c - middle) / size
+        d = (d - middle) / size
+        square = wp.cw_mul(radius, radius) / (size * size)
+        moments = share[0] * wp.outer(a, a) + share[1] * wp.outer(b, b)
+        moments += share[2] * wp.outer(c, c) + share[3] * wp.outer(d, d)
+        moments += 0.2 * wp.dot(share, square) * wp.identity(n=3, dtype=wp.float32)
+        trace = wp.trace(moments)
+        shadow = _SHADOW * wp.sqrt(wp.max((trace * trace - wp.ddot(moments, moments)) / 6.0, 1.0e-30))
+        total = wp.max(square[0] + square[1] + square[2] + square[3], 1.0e-15)
+        less = wp.min(shadow, total)
+        ratio = less / wp.max(shadow, total)
+        ratio = ratio * ratio * ratio * ratio
+        reach = square + wp.vec4(wp.dot(a, a), wp.dot(b, b), wp.dot(c, c), wp.dot(d, d))
+        reach = wp.cw_mul(reach, reach)
+        merged_centers[batch, quad] = middle
+        merged_radii[batch, quad] = size * wp.sqrt(less / wp.sqrt(wp.sqrt(1.0 + ratio)))
+        extents[batch, quad] = size * wp.sqrt(wp.sqrt(wp.sqrt(wp.dot(reach, reach))))
+    else:
+        merged_centers[batch, quad] = a
+        merged_radii[batch, quad] = largest
+        extents[batch, quad] = largest
+
+
+def check_merging(merging: float) -> None:
+    """Raise ValueError unless ``merging`` is a half-angle in cell radii, 0 to 1."""
+    if not (check.is_number(merging) and 0 <= merging <= 1):
+        raise ValueError(f"merging: got {merging!r}, expected 0 (never) to 1 cell radius")
+
+
+def merge(centers: wp.array, radii: wp.array) -> Nodes:
+    """Merge every four spheres that follow each other; what is left over stays as it is.
+
+    Args:
+        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
+        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+
+    Differentiable: centers, radii.
+    """
+    batch_count, sphere_count = radii.shape
+    shape = batch_count, sphere_count // QUAD
+    options = {"device": radii.device, "requires_grad": centers.requires_grad or radii.requires_grad}
+    merged_centers = wp.empty(shape, dtype=wp.vec3, **options)
+    merged_radii, extents = (wp.empty(shape, dtype=wp.float32, **options) for _ in range(2))
+    launch(
+        _merge, dim=shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents], device=radii.device
+    )
+    counts = [sphere_count, shape[1]]
+    return Nodes(concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents)
+
+
+def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Nodes:
+    """Merge spheres where there are enough of them and ``merging``, in cell radii, is not 0.
+
+    Raises:
+        ValueError: for ``merging`` out of range.
+
+    Differentiable: centers, radii.
+    """
+    check_merging(merging)
+    if merging > 0 and radii.shape[1] >= MERGED_FROM:
+        return merge(centers, radii)
+    return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
+
+
+@wp.struct
+class Spheres:
+    """Spheres and their quads, as kernels see them."""
+
+    centers: wp.array2d(dtype=wp.vec3)  # [batch, node]
+    radii: wp.array2d(dtype=wp.float32)
+    extents: wp.array2d(dtype=wp.float32)  # [batch, quad]
+    bounds_of_quads: wp.array2d(dtype=wp.vec4)
+    bounds_of_runs: wp.array2d(dtype=wp.vec4)
+    count: int  # of nodes that are no quad's
+    merging_angle: float
+
+
+@functools.cache
+def _merged_function(lanes: int) -> wp.Function:
+    """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
+    Lane = lane_type(lanes)
+    BLEND2 = wp.constant(_BLEND**2)
+    FARTHEST2 = wp.constant(_FARTHEST2)
+
+    @wp.func
+    def merged(x: Lane, y: Lane, z: Lane, angle: float):
+        distance2 = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(FARTHEST2)))
+        slope = 1.0 / (angle * angle * (1.0 - BLEND2))
+        t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
+        rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
+        return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), rise
+
+    return merged
+
+
+@functools.cache
+def load_merged_function(lanes: int) -> wp.Function:
+    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
+    Lane = lane_type(lanes)
+    find_merged = _merged_function(lanes)
+
+    @wp.func
+    def load_merged(
+        x: Lane,
+        y: Lane,
+        z: Lane,
+        batch: int,
+        quad: int,
+        spheres: Spheres,
+    ):
+        merged = Lane(0.0)
+        if quad < spheres.extents.shape[1]:
+            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+            center = spheres.centers[batch, spheres.count + quad]
+            share, _slope = find_merged(
+                inverse * (Lane(center[0]) - x),
+                inverse * (Lane(center[1]) - y),
+                inverse * (Lane(center[2]) - z),
+                spheres.merging_angle,
+            )
+            merged = share
+        return merged
+
+    return load_merged
+
+
+@functools.cache
+def merged_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`load_merged_function`: m̄ → that of the offset to a quad, which is added to its own.
+
+    With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
+    """
+    Lane = lane_type(lanes)
+    find_merged = _merged_function(lanes)
+    fn = lane_functions(lanes)
+    is_any_above, add_to_sphere, total = fn.is_any_above, fn.add_to_sphere, fn.total
+
+    @wp.func
+    def adjoint(
+        x: Lane,
+        y: Lane,
+        z: Lane,
+        batch: int,
+        quad: int,
+        adj_merged: Lane,
+        spheres: Spheres,
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+        adj_extents: wp.array2d(dtype=wp.float32),
+    ):
+        adj_x = Lane(0.0)
+        adj_y = Lane(0.0)
+        adj_z = Lane(0.0)
+        if quad < spheres.extents.shape[1]:
+            node = spheres.count + quad
+            center = spheres.centers[batch, node]
+            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+            x_ = inverse * (Lane(center[0]) - x)
+            y_ = inverse * (Lane(center[1]) - y)
+            z_ = inverse * (Lane(center[2]) - z)
+            _merged, slope = find_merged(x_, y_, z_, spheres.merging_angle)
+            if is_any_above(slope, 0.0):
+                pull = (2.0 * inverse) * wp.cw_mul(adj_merged, slope)
+                adj_x = wp.cw_mul(pull, x_)
+                adj_y = wp.cw_mul(pull, y_)
+                adj_z = wp.cw_mul(pull, z_)
+                add_to_sphere(adj_x, adj_y, adj_z, Lane(0.0), batch, node, adj_centers, adj_radii)
+                if adj_extents:
+                    along = wp.cw_mul(adj_x, x_) + wp.cw_mul(adj_y, y_) + wp.cw_mul(adj_z, z_)
+                    wp.atomic_add(adj_extents, batch, quad, -total(along))
+        return adj_x, adj_y, adj_z
+
+    return adjoint

@@ -1,0 +1,1 @@
+"""Settings that reach an error in the least time."""

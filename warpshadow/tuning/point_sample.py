@@ -1,0 +1,174 @@
+"""Points that a camera sees, at which the shading of a setting is compared with that of rays through the meshes."""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.renderer import Renderer, View
+from warpshadow.scene.scene import Scene, Visibility
+from warpshadow.stages.normals import vertex_normals
+
+
+class PointReceivers(NamedTuple):
+    """Receivers from which the shading of points is interpolated."""
+
+    points: np.ndarray
+    """Positions [scene units], float32 of shape [receiver, 3]."""
+    normals: np.ndarray
+    """Unit normals, float32 of shape [receiver, 3]."""
+    corners: np.ndarray
+    """Receivers of each point, of shape [point, 3]."""
+    weights: np.ndarray
+    """What each of them counts, of shape [point, 3]."""
+
+
+class PointSample:
+    """A seeded sample of the points that the camera of a scene sees, each pixel as likely as any other.
+
+    Each is drawn from a compact patch of the image, as many pixels as any other's, since errors dwell along the edges
+    of shadows, of which each sample should have its share.
+
+    Args:
+        scene: The scene; its method is not looked at.
+        count: Number of points; fewer where the camera sees fewer.
+        direction_count: Rays of each point, drawn in proportion to light.
+        seed: Of the choice of points.
+        device: Where to compute.
+        progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        bodies: Body of each point, shape [point].
+
+    Raises:
+        ValueError: where the camera sees nothing, or no light falls on what it sees.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        count: int = 1024,
+        direction_count: int = 2048,
+        seed: int = 0,
+        device: wp.DeviceLike = "cpu",
+        progress: bool = False,
+    ):
+        self._device = wp.get_device(device)
+        self._progress = progress
+        self._direction_count = direction_count
+        stage = Renderer(replace(scene, visibility=Visibility(method="none"), supersampling=1), device=device)
+        self._view = stage.view()
+        face_ids = self._view.fragments.face_ids.numpy()[0]
+        chosen = _spread(face_ids >= 0, count, seed)
+        if not len(chosen):
+            raise ValueError("scene: the camera sees no body, expected one in the image")
+        face_ids = face_ids.ravel()
+        faces = stage.assembly.faces
+        self._positions = stage.geometry.positions.numpy()[0]
+        self._normals = vertex_normals(stage.geometry.positions, faces).numpy()[0]
+        self._vertices = faces.numpy()[face_ids[chosen]]
+        if self._view.fragments.sides is not None:  # the backs of vertices are numbered after them
+            sides = self._view.fragments.sides.numpy().ravel()
+            self._vertices = self._vertices + len(self._positions) * (sides != face_ids)[chosen, None]
+            self._positions = np.tile(self._positions, (2, 1))
+            self._normals = np.concatenate([self._normals, -self._normals])
+        self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
+        self.bodies = stage.assembly.body_of_face[face_ids[chosen]]
+        self._scene = scene
+        if not self.truth.any():
+            raise ValueError("light: none falls on what the camera sees, so nothing can be compared")
+
+    @functools.cached_property
+    def truth(self) -> np.ndarray:
+        """Shading by rays, each point a receiver, of shape [point, 3]."""
+        return self._trace("pixel")
+
+    @functools.cached_property
+    def interpolated_truth(self) -> np.ndarray:
+        """Shading by rays at the corners of faces, interpolated, of shape [point, 3]."""
+        return self._trace("vertex")
+
+    def _trace(self, receivers: str) -> np.ndarray:
+        visibility = Visibility(method="ray-traced", samples=self._direction_count)
+        bodies = tuple(replace(body, receivers=receivers) for body in self._scene.bodies)
+        return self.shading(replace(self._scene, bodies=bodies, visibility=visibility, supersampling=1))
+
+    def shading(self, scene: Scene) -> np.ndarray:
+        """Shade the points, as white surfaces, with the visibility, spheres and receivers of a variant of the scene.
+
+        Returns:
+            Linear RGB, float32 of shape [point, 3].
+        """
+        # it draws no image, so that what else a renderer prepares may be as small as can be
+        glimpse = replace(scene.camera, width=1, height=1)
+        renderer = Renderer(scene, cameras=[glimpse], device=self._device, progress=self._progress)
+        receivers = self.receivers([body.receivers for body in scene.bodies])
+        view = at_receivers(self._view, renderer, receivers.points[None], receivers.normals[None])
+        shading = renderer.shade(view=view).numpy()[0]
+        return np.einsum("pk,pkc->pc", receivers.weights, shading[receivers.corners])
+
+    def receivers(self, of_bodies: Sequence[str]) -> PointReceivers:
+        """Find where light is evaluated.
+
+        Args:
+            of_bodies: "vertex" or "pixel" for each body: whether its points are interpolated or receivers themselves.
+        """
+        is_own = np.array([receivers == "pixel" for receivers in of_bodies])[self.bodies]
+        vertices, corners = np.unique(self._vertices[~is_own], return_inverse=True)
+        points, normals = (
+            np.einsum("pk,pkc->pc", self._weights[is_own], values[self._vertices[is_own]])
+            for values in (self._positions, self._normals)
+        )
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        receivers = np.repeat(len(vertices) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
+        receivers[~is_own] = corners.reshape(-1, 3)
+        weights = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
+        return PointReceivers(
+            np.concatenate([self._positions[vertices], points]),
+            np.concatenate([self._normals[vertices], normals]),
+            receivers,
+            weights,
+        )
+
+    def error(self, shading: np.ndarray) -> float:
+        """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""
+        return float(np.linalg.norm(shading - self.truth) / np.linalg.norm(self.truth))
+
+    def interpolation_errors(self) -> np.ndarray:
+        """What interpolating between vertices adds to the error, the part of each body, of shape [body]."""
+        squares = ((self.interpolated_truth - self.truth) ** 2).sum(axis=1)
+        sums = np.bincount(self.bodies, squares, minlength=len(self._scene.bodies))
+        return np.sqrt(sums) / np.linalg.norm(self.truth)
+
+
+def at_receivers(view: View, renderer: Renderer, points: np.ndarray, normals: np.ndarray) -> View:
+    """Make a view that no renderer has kept anything of: of a renderer's spheres, with other receivers.
+
+    Args:
+        view: Of the same scene.
+        renderer: Whose spheres are to block the light.
+        points: Receivers [scene units], shape [1, receiver, 3].
+        normals: Unit normals, shape [1, receiver, 3].
+    """
+    at_points = view.receivers._replace(
+        points=wp.array(points, dtype=wp.vec3, device=renderer.device),
+        normals=wp.array(normals, dtype=wp.vec3, device=renderer.device),
+    )
+    geometry = Geometry(*renderer.geometry)
+    return view._replace(geometry=geometry, receivers=at_points, assembly=renderer.assembly)
+
+
+def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Draw pixels of a mask [height, width], one from each of as many patches along a Z-order curve: flat indices."""
+    rows, columns = np.nonzero(mask)
+    bits = np.arange(16)
+    z_order = ((rows[:, None] >> bits & 1) << 2 * bits + 1 | (columns[:, None] >> bits & 1) << 2 * bits).sum(axis=1)
+    along = np.argsort(z_order, kind="stable")
+    count = min(count, len(along))
+    positions = (np.arange(count) + np.random.default_rng(seed).random(count)) * (len(along) / max(count, 1))
+    return np.ravel_multi_index((rows, columns), mask.shape)[along[positions.astype(int)]]

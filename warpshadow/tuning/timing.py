@@ -1,0 +1,123 @@
+"""Timing: how long images take, as medians of warm calls in turns."""
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.scene.scene import Scene
+from warpshadow.tuning.point_sample import at_receivers
+
+TIMED_RECEIVERS = 2048
+"""Receivers on which visibility and shading are timed, in neighborhoods, which are culled together."""
+
+NEIGHBORS = 64
+"""Receivers of a neighborhood."""
+
+
+def image_times(
+    scenes: Sequence[Scene], *, runs: int = 5, device: wp.DeviceLike = "cpu", progress: bool = False
+) -> list[float]:
+    """Estimate how long images take once kernels are compiled and renderers made.
+
+    The whole image is timed without shadows, once for each choice of receivers. What shadows add to that is timed on
+    TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them.
+
+    Args:
+        scenes: Variants of a scene, which differ in visibility, spheres and receivers.
+        runs: Timed calls of each, in turns.
+        device: Where to render.
+        progress: Show progress.
+
+    Returns:
+        Milliseconds of each scene's image, forward.
+    """
+    keys = [tuple(body.receivers for body in scene.bodies) for scene in scenes]
+    firsts = dict(zip(reversed(keys), reversed(scenes), strict=True))
+    stages = {key: _Stage(scene, device) for key, scene in firsts.items()}
+    functions = [stages[key].sampled_shading(scene) for key, scene in zip(keys, scenes, strict=True)]
+    of_stages = [function for stage in stages.values() for function in (stage.draw, stage.sampled_shading(stage.scene))]
+    times = median_times([*functions, *of_stages], runs, progress=progress)
+    unshadowed = dict(zip(stages, zip(times[len(scenes) :: 2], times[len(scenes) + 1 :: 2], strict=True), strict=True))
+    estimates = []
+    for key, milliseconds in zip(keys, times, strict=False):
+        whole, sampled = unshadowed[key]
+        estimates.append(whole + stages[key].extrapolation * max(milliseconds - sampled, 0.0))
+    return estimates
+
+
+def median_times(functions: Sequence[Callable[[], object]], runs: int, *, progress: bool = False) -> list[float]:
+    """Median milliseconds of functions that take turns, so that a slow moment of the machine strikes all alike.
+
+    Each is called twice and timed the second time: the first pays for compilation and cold memory.
+    """
+    from tqdm import tqdm
+
+    times: list[list[float]] = [[] for _ in functions]
+    turns = range(runs * len(functions))
+    bar = tqdm(turns, desc="timing", unit="call", delay=1, leave=False, disable=not progress)
+    for turn in bar:
+        function = functions[turn % len(functions)]
+        function()
+        wp.synchronize()
+        start = time.perf_counter()
+        function()
+        wp.synchronize()
+        times[turn % len(functions)].append(1e3 * (time.perf_counter() - start))
+    return [statistics.median(each) for each in times]
+
+
+class _Stage:
+    """What all scenes with the same receivers share: the image without shadows, and a sample of its receivers.
+
+    Attributes:
+        scene: Any of them, without shadows.
+        draw: Draws the image.
+        extrapolation: Receivers of the image over those of the sample.
+    """
+
+    def __init__(self, scene: Scene, device: wp.DeviceLike):
+        self.scene = replace(scene, visibility=replace(scene.visibility, method="none"))
+        self._renderer = Renderer(self.scene, device=device)
+        self._view = self._renderer.view()
+        self.draw = whole_image(self._renderer)
+        points, normals, *_ = self._view.receivers
+        chosen = _neighborhoods(points.numpy()[0])
+        self._sample = points.numpy()[:, chosen], normals.numpy()[:, chosen]
+        self.extrapolation = points.shape[1] / len(chosen)
+
+    def sampled_shading(self, scene: Scene) -> Callable[[], object]:
+        """Make the function that shades the sample as a scene does."""
+        glimpse = replace(scene.camera, width=1, height=1)  # no image is drawn
+        renderer = Renderer(scene, cameras=[glimpse], device=self._renderer.device)
+        return lambda: renderer.shade(view=at_receivers(self._view, renderer, *self._sample))
+
+
+def _neighborhoods(points: np.ndarray) -> np.ndarray:
+    """Draw TIMED_RECEIVERS of points [point, 3], those nearest to a few of them: what is near is culled together."""
+    size = min(NEIGHBORS, len(points))
+    middles = np.random.default_rng(0).choice(points, min(TIMED_RECEIVERS, len(points)) // size, replace=False)
+    nearest = [np.argpartition(((points - middle) ** 2).sum(axis=1), size - 1)[:size] for middle in middles]
+    return np.sort(nearest, axis=1).ravel()  # in the order of receivers
+
+
+def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
+    """Make the function that draws a whole image, of which nothing is kept from the call before.
+
+    Each call has the bodies in another of two places, a hair's breadth from where the scene has them.
+    """
+    poses = renderer.assembly.poses
+    extent = np.abs(renderer.geometry.positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
+    places = itertools.cycle(
+        replace(
+            poses,
+            translations=wp.array(poses.translations.numpy() + shift * extent, dtype=wp.vec3, device=renderer.device),
+        )
+        for shift in (1e-5, 2e-5)
+    )
+    return lambda: renderer.draw(view=renderer.view(renderer.assembly.placed(next(places))))

@@ -1,0 +1,350 @@
+"""Tuning: what each setting of a scene costs and how wrong it is, and the cheapest that is good enough.
+
+Errors are those of shading at points that the camera sees, against rays through the meshes: see
+:mod:`warpshadow.tuning.point_sample`. They are the same each time. Times are measured: see
+:mod:`warpshadow.tuning.timing`.
+"""
+
+import contextlib
+import itertools
+import warnings
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.scene import toml_tables
+from warpshadow.scene.blockers import fitted_counts
+from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.spheres import Spheres, is_fitted
+from warpshadow.stages.visibility.zonal_logs import LOGS
+from warpshadow.tuning.point_sample import PointSample
+from warpshadow.tuning.timing import image_times
+
+DIRECTION_COUNTS = (32, 64, 128, 256, 512)
+ORDERS = (4, 6, 8)
+SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
+
+EQUAL = 0.1
+"""Settings whose times differ by less than this share count as equally fast; then the more accurate is better.
+
+Where none is accurate enough, the same holds of their errors; then the faster is better.
+"""
+
+ERROR_STEP = 0.003
+"""Errors that differ by less than this count as equal, too: nobody sees it."""
+
+COARSE = 0.005
+"""Error of interpolation between a body's vertices from which on its pixels are tried as receivers."""
+
+
+class Trial(NamedTuple):
+    """A setting that was tried."""
+
+    scene: Scene
+    """The scene with it."""
+    error: float
+    """‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading."""
+    milliseconds: float
+    """Time of an image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """The settings that were chosen for a scene, among those that were tried.
+
+    Args:
+        given: The scene as it was.
+        chosen: The best setting. Where none reaches what was wanted, the nearest: the fastest of those about as
+            accurate as can be, or the most accurate of those about as fast.
+        is_reached: Whether it reaches it.
+        trials: All that was tried, the fastest first.
+    """
+
+    given: Scene
+    chosen: Trial
+    is_reached: bool
+    trials: tuple[Trial, ...]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with the settings."""
+        return self.chosen.scene
+
+    @property
+    def error(self) -> float:
+        """Relative error of the shading."""
+        return self.chosen.error
+
+    @property
+    def milliseconds(self) -> float:
+        """Time of an image."""
+        return self.chosen.milliseconds
+
+    @property
+    def untried_counts(self) -> tuple[int, ...]:
+        """Numbers of spheres that were not tried, since no fit of them is kept: ``fits=True`` makes them."""
+        own = fitted_counts(self.given)
+        tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in own}
+        return tuple(count for count in SPHERE_COUNTS if own and count not in tried)
+
+    def table(self) -> str:
+        """What was tried, a line each: "*" marks the Pareto front, ">" what was chosen."""
+        front = pareto_front([(trial.milliseconds, trial.error) for trial in self.trials])
+        fitted = fitted_counts(self.given)
+        lines = [f"  {'method':18}{'spheres':>12}  {'receivers':16}{'error':>8}{'image':>12}"]
+        for number, (scene, error, milliseconds) in enumerate(self.trials):
+            mark = (">" if scene is self.scene else " ") + ("*" if number in front else " ")
+            columns = f"{_method(scene.visibility):18}{_spheres(scene, fitted):>12}  {_listed(_receivers(scene)):16}"
+            lines.append(f"{mark}{columns}{error:8.2%}{milliseconds:9.2f} ms")
+        return "\n".join(lines)
+
+    def toml(self) -> str:
+        """The settings as lines of a scene file: [visibility], and what is to be changed of the bodies."""
+        visibility = self.scene.visibility
+        keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
+        chosen = {key: getattr(visibility, key) for key in keys.get(visibility.method, ("method",))}
+        blocks = [toml_tables.block("[visibility]", chosen)]
+        for number, (before, after) in enumerate(zip(self.given.bodies, self.scene.bodies, strict=True), start=1):
+            pairs = {key: (getattr(before, key), getattr(after, key)) for key in ("blockers", "receivers")}
+            changes = {key: new for key, (old, new) in pairs.items() if new != old}
+            if changes:
+                blocks.append(toml_tables.block(f"[[body]]  # number {number}, {before.mesh.name}", changes))
+        return "\n".join(blocks)
+
+
+def describe(scene: Scene) -> str:
+    """Name the settings of a scene in a few words."""
+    spheres = f", {_spheres(scene, fitted_counts(scene))} spheres" if scene.visibility.method in SPHERE_METHODS else ""
+    return f"{_method(scene.visibility)}{spheres}, receivers {_listed(_receivers(scene))}"
+
+
+def _method(visibility: Visibility) -> str:
+    details = {
+        "directional": f" {visibility.directions}",
+        "log-sh": f" {visibility.log} {visibility.order}",
+    }
+    return visibility.method + details.get(visibility.method, "")
+
+
+def _spheres(scene: Scene, fitted: Iterable[int]) -> str:
+    """How many spheres are fitted to each of some bodies, and how many others are given."""
+    if scene.visibility.method not in SPHERE_METHODS:
+        return "–"
+    counts = [scene.bodies[number].blockers for number in fitted]
+    counts += [len(body.blockers) for body in scene.bodies if isinstance(body.blockers, Spheres)]
+    return _listed([str(count) for count in counts or [0]])
+
+
+def _receivers(scene: Scene) -> tuple[str, ...]:
+    return tuple(body.receivers for body in scene.bodies)
+
+
+def _listed(words: Sequence[str]) -> str:
+    """Words, once where all are the same."""
+    return words[0] if len(set(words)) == 1 else ", ".join(words)
+
+
+@one_at_a_time
+def tune(
+    scene: Scene,
+    *,
+    error: float | None = None,
+    milliseconds: float | None = None,
+    fits: bool = False,
+    device: wp.DeviceLike = "cpu",
+    progress: bool = False,
+) -> Tuning:
+    """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
+
+    Tried are all methods but rays; 32 to 512 directions; orders 4, 6 and 8; 16 to 512 spheres for bodies that say how
+    many; and every pixel as a receiver for bodies whose vertices miss shadows.
+
+    Args:
+        scene: The scene; its "auto" is not looked at.
+        error: Largest relative error of the shading, such as 0.03.
+        milliseconds: In place of an error the longest time of an image.
+        fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
+            number is, and others where fits are kept already.
+        device: Where to render.
+        progress: Show progress.
+
+    Returns:
+        What was chosen, and all that was tried. Where none reaches what was wanted it is the nearest.
+
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts; so where the camera sees nothing.
+    """
+    from tqdm import tqdm
+
+    check.instance("scene", scene, Scene, SCENE)
+    device = check.device("device", device)
+    given = {"error": error, "milliseconds": milliseconds}
+    wanted = next((value for value in given.values() if value is not None), None)
+    if wanted is None or None not in given.values():
+        raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
+    if not (check.is_number(wanted) and wanted > 0):
+        name = "error" if milliseconds is None else "milliseconds"
+        raise ValueError(f"{name}: got {wanted!r}, expected a positive number")
+    sample = PointSample(scene, device=device, progress=progress)
+    is_coarse = sample.interpolation_errors() > COARSE
+    settings = list(_settings(scene, is_coarse, fits, device))
+    bar = tqdm(settings, desc="measuring errors", unit="setting", delay=1, leave=False, disable=not progress)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
+        errors = [sample.error(sample.shading(setting)) for setting in bar]
+        times = image_times(settings, device=device, progress=progress)
+    trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
+    if milliseconds is None:
+        reaching = [trial for trial in trials if trial.error <= wanted]
+        chosen = _cheapest(reaching) if reaching else _nearest(trials)
+    else:
+        reaching = [trial for trial in trials if trial.milliseconds <= wanted]
+        chosen = min(reaching, key=lambda trial: trial.error) if reaching else _cheapest(trials)
+    return Tuning(scene, chosen, bool(reaching), tuple(trials))
+
+
+def _cheapest(trials: Sequence[Trial]) -> Trial:
+    """The fastest trial, or the most accurate of those that are about as fast."""
+    longest = (1 + EQUAL) * min(trial.milliseconds for trial in trials)
+    return min((trial for trial in trials if trial.milliseconds <= longest), key=lambda trial: trial.error)
+
+
+def _nearest(trials: Sequence[Trial]) -> Trial:
+    """The most accurate trial, or the fastest of those that are about as accurate."""
+    least = min(trial.error for trial in trials)
+    most = least + max(EQUAL * least, ERROR_STEP)
+    return min((trial for trial in trials if trial.error <= most), key=lambda trial: trial.milliseconds)
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Find the points (time, error) that no other beats in both, or equals in one and beats in the other.
+
+    Returns:
+        Their numbers, by time.
+    """
+    front: list[int] = []
+    for number in sorted(range(len(points)), key=lambda number: points[number]):
+        if not front or points[number][1] < points[front[-1]][1]:
+            front.append(number)
+    return front
+
+
+# ---------------------------------------------------------------------------------------------- "auto"
+
+_resolved: weakref.WeakKeyDictionary[Scene, Scene] = weakref.WeakKeyDictionary()
+
+
+@one_at_a_time
+def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Scene:
+    """Put settings in place of "auto": the first that reach the error of the scene's :class:`Visibility`.
+
+    They are tried in a fixed order, so that the choice, and with it the image, does not depend on how busy a machine
+    is: no shadows; then 32, 64, 128, 256, 512 directions with as many spheres as the bodies ask for; then the same
+    with twice as many spheres, up to 512 a body, where more spheres can help. Receivers stay as they are. If nothing
+    reaches the error the nearest comes with a warning.
+
+    Args:
+        scene: The scene. One with another method is returned as it is.
+        device: Where to render.
+        progress: Show progress.
+
+    Returns:
+        The scene, "auto" replaced. It is the same object each time, so that the choice is made once for a scene.
+    """
+    if scene.visibility.method != AUTO:
+        return scene
+    if scene not in _resolved:
+        _resolved[scene] = _resolve(scene, check.device("device", device), progress)
+    return _resolved[scene]
+
+
+def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
+    wanted = scene.visibility.error
+    sample = PointSample(scene, device=device, progress=progress)
+    tried: list[tuple[float, Scene]] = []
+    for setting in _by_work(scene, sample):
+        tried.append((sample.error(sample.shading(setting)), setting))
+        if tried[-1][0] <= wanted:
+            return setting
+    error, nearest = min(tried, key=lambda each: each[0])
+    least = _interpolation_error(scene, sample)
+    reason = "" if least < wanted else f"; interpolation between vertices alone has {least:.3f}: receivers = 'pixel'"
+    warnings.warn(
+        f"visibility: no setting of method = 'auto' reaches error = {wanted:g}; {describe(nearest)} "
+        f"comes nearest, with {error:.3f}{reason}",
+        stacklevel=3,
+    )
+    return nearest
+
+
+def _interpolation_error(scene: Scene, sample: PointSample) -> float:
+    """Error that is left however visibility is computed: of the bodies whose vertices are receivers."""
+    is_interpolated = [body.receivers == "vertex" for body in scene.bodies]
+    return float(np.linalg.norm(sample.interpolation_errors()[is_interpolated]))
+
+
+def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
+    """What "auto" chooses from, the least work first."""
+    yield replace(scene, visibility=replace(scene.visibility, method="none"))
+    yield from _all_directions(scene)
+    own = fitted_counts(scene)
+    factor, most = 2, max(own.values(), default=SPHERE_COUNTS[-1])
+    while factor * most <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
+        yield from _all_directions(_with_spheres(scene, {number: factor * count for number, count in own.items()}))
+        factor *= 2
+
+
+def _all_directions(scene: Scene) -> Iterator[Scene]:
+    return (replace(scene, visibility=visibility) for visibility in _directional(scene.visibility))
+
+
+# ---------------------------------------------------------------------------------------------- settings
+
+
+def _settings(scene: Scene, is_coarse: np.ndarray, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
+    """What is tried, a variant of the scene each."""
+    own = tuple(body.receivers for body in scene.bodies)
+    fine = tuple("pixel" if coarse else "vertex" for coarse in is_coarse)
+    for receivers in dict.fromkeys((own, fine)):
+        bodies = tuple(replace(body, receivers=each) for body, each in zip(scene.bodies, receivers, strict=True))
+        placed = replace(scene, bodies=bodies)
+        yield replace(placed, visibility=replace(scene.visibility, method="none"))
+        for more in _sphere_variants(placed, fits, device):
+            for visibility in (*_directional(scene.visibility), *_harmonic(scene.visibility)):
+                yield replace(more, visibility=visibility)
+
+
+def _sphere_variants(scene: Scene, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
+    """The scene with its own spheres, and with other numbers of them for all bodies."""
+    yield scene
+    own = fitted_counts(scene)
+    for count in SPHERE_COUNTS if own else ():
+        is_at_hand = fits or all(is_fitted(scene.bodies[number].mesh, count, device=device) for number in own)
+        if is_at_hand and set(own.values()) != {count}:
+            yield _with_spheres(scene, dict.fromkeys(own, count))
+
+
+def _with_spheres(scene: Scene, counts: Mapping[int, int]) -> Scene:
+    """Other numbers of spheres for some bodies."""
+    bodies = (
+        replace(body, blockers=counts[number]) if number in counts else body for number, body in enumerate(scene.bodies)
+    )
+    return replace(scene, bodies=tuple(bodies))
+
+
+def _directional(visibility: Visibility) -> Iterator[Visibility]:
+    """Numbers of directions that the softness allows."""
+    for count in DIRECTION_COUNTS:
+        with contextlib.suppress(ValueError):
+            yield replace(visibility, method="directional", directions=count)
+
+
+def _harmonic(visibility: Visibility) -> Iterator[Visibility]:
+    for log, order in itertools.product(LOGS, ORDERS):
+        yield replace(visibility, method="log-sh", log=log, order=order)
