@@ -60,10 +60,10 @@ FACES = np.int32([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 @pytest.mark.slow
 def test_the_build_has_the_digits_of_float64(double, device):
     points, _, centers, radii = (values.astype(np.float64) for values in twins.random_scene(0))
-    directions = double("directions").fibonacci(32)
+    directions = double("maths.directions").fibonacci(32)
     scene = [put(points[None], wp.vec3d, device), None]
     scene += [put(centers[None], wp.vec3d, device), put(radii[None], wp.float64, device)]
-    got = double("visibility.directional").transmittance(*scene, directions).numpy()[0]
+    got = double("stages.visibility.directional").transmittance(*scene, directions).numpy()[0]
     np.testing.assert_allclose(got, twins.transmittance(points, centers, radii, directions), rtol=0, atol=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device):
     expected = warpshadow.stages.rasterize.rasterize(
         put(clip_positions, wp.vec4, device), faces, 40, 30
     ).face_ids.numpy()
-    got = double("raster").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
+    got = double("stages.rasterize").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
     assert len(np.unique(expected)) > 10
     np.testing.assert_array_equal(got, expected)
 
@@ -85,17 +85,21 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device):
 
 def test_vertex_normals(double, device, check):
     faces = put(FACES, wp.vec3i, device)
-    check(lambda p: double("mesh").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
+    check(lambda p: double("stages.normals").vertex_normals(p, faces), (wp.vec3d, random(0, 2, 4, 3)))
 
 
 @pytest.mark.parametrize("kind", ["quaternion", "axis-angle", "columns", "matrix"])
 def test_rotation_matrices(kind, double, device, check):
-    deform = double("deform")
-    dtype = {"quaternion": wp.vec4d, "axis-angle": wp.vec3d, "columns": deform.Vec6, "matrix": wp.mat33d}[kind]
+    dtype = {
+        "quaternion": wp.vec4d,
+        "axis-angle": wp.vec3d,
+        "columns": double("stages.rotations").Vec6,
+        "matrix": wp.mat33d,
+    }[kind]
     parameters = random(0, 2, 3, *dtype._shape_)
     if kind == "axis-angle":
         parameters[0] *= [[0], [1e-3], [0.3]]  # where the series is
-    check(deform.rotation_matrices, (dtype, parameters))
+    check(double("stages.rotations").rotation_matrices, (dtype, parameters))
 
 
 @pytest.fixture
@@ -107,7 +111,7 @@ def poses():
 
 def test_poses_of_points(double, device, check, poses):
     bodies = put(np.int32([0, 2, 1, 2]), wp.int32, device)
-    check(lambda r, *p: double("deform").Poses(*p).points(r, bodies), (wp.vec3d, random(3, 1, 4, 3)), *poses)
+    check(lambda r, *p: double("stages.poses").Poses(*p).points(r, bodies), (wp.vec3d, random(3, 1, 4, 3)), *poses)
 
 
 def test_poses_of_radii(double, device, check, poses):
@@ -116,14 +120,14 @@ def test_poses_of_radii(double, device, check, poses):
 
     def radii(rest, scales):
         fixed = [put(values, dtype, device) for dtype, values in (rotations, translations)]
-        return double("deform").Poses(*fixed, scales).radii(rest, bodies)
+        return double("stages.poses").Poses(*fixed, scales).radii(rest, bodies)
 
     check(radii, (wp.float64, random(3, 1, 4)), scales)
 
 
 @pytest.mark.parametrize("quantity", ["points", "centers", "rigidity", "shear"])
 def test_deformation_graphs(quantity, double, device, check):
-    graph = double("deform").DeformationGraph.bind(random(0, 5, 3), random(1, 4, 3), count=2, device=device)
+    graph = double("stages.deform").DeformationGraph.bind(random(0, 5, 3), random(1, 4, 3), count=2, device=device)
     matrices, translations = (wp.mat33d, random(2, 2, 4, 3, 3)), (wp.vec3d, random(3, 2, 4, 3))
     arguments = {"centers": [translations], "shear": [matrices]}.get(quantity, [matrices, translations])
     check(getattr(graph, quantity), *arguments)
@@ -154,8 +158,8 @@ def spheres():
 
 @pytest.mark.parametrize("count, softness", [(16, 1.2), (64, 0.35)])
 def test_transmittance(count, softness, double, device, check, spheres):
-    directions = double("directions").fibonacci(count)
-    transmittance = double("visibility.directional").transmittance
+    directions = double("maths.directions").fibonacci(count)
+    transmittance = double("stages.visibility.directional").transmittance
     points, (_, normals), *rest = spheres
     up = put(normals, wp.vec3d, device)
     check(lambda p, c, r: transmittance(p, up, c, r, directions, softness=softness), points, *rest)
@@ -164,19 +168,19 @@ def test_transmittance(count, softness, double, device, check, spheres):
 @pytest.mark.slow
 @pytest.mark.parametrize("log", ["cap", "eigen"])
 def test_log_visibility(log, double, device, check, spheres):
-    accumulate = double("visibility.log_sh").accumulate
+    accumulate = double("stages.visibility.log_sh").accumulate
     check(lambda *scene: accumulate(*scene, order=3, log=log), *spheres)
 
 
 def test_log_visibility_without_a_horizon(double, device, check, spheres):
-    accumulate = double("visibility.log_sh").accumulate
+    accumulate = double("stages.visibility.log_sh").accumulate
     check(lambda p, c, r: accumulate(p, None, c, r, order=3), spheres[0], *spheres[2:])
 
 
 @pytest.fixture
 def quad(double, monkeypatch):
     """Receivers, normals, centers and radii, as arguments: five spheres, of which four merge while they are seen so."""
-    monkeypatch.setattr(double("visibility.merging"), "MERGED_FROM", 4)
+    monkeypatch.setattr(double("stages.visibility.merging"), "MERGED_FROM", 4)
     centers, radii = 4 * random(7, 5, 3), 3 + random(8, 5) ** 2
     middle, _, extents = twins.merged_quads(centers, radii)
     away = unit(random(9, 6, 3))
@@ -188,13 +192,13 @@ def quad(double, monkeypatch):
 
 
 def test_transmittance_of_spheres_that_merge(double, device, check, quad):
-    directions = double("directions").fibonacci(16)
-    transmittance = double("visibility.directional").transmittance
+    directions = double("maths.directions").fibonacci(16)
+    transmittance = double("stages.visibility.directional").transmittance
     check(lambda p, c, r: transmittance(p, None, c, r, directions, merging=1.0), quad[0], *quad[2:])
 
 
 def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
-    accumulate = double("visibility.log_sh").accumulate
+    accumulate = double("stages.visibility.log_sh").accumulate
     check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *quad)
 
 
@@ -206,13 +210,13 @@ def logs(*sizes):
 
 @pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
 def test_the_exponential(base, double, check):
-    exponentiate = double("visibility.exponential").exponentiate
+    exponentiate = double("stages.visibility.exponential").exponentiate
     check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(0.05, 0.3, 1.7, 2.4, 4)))
 
 
 @pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
 def test_the_exponential_where_squarings_are_held(base, double, check):
-    exponentiate = double("visibility.exponential").exponentiate
+    exponentiate = double("stages.visibility.exponential").exponentiate
     with pytest.warns(UserWarning, match="held back"):
         check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(5.3, 9, 6)))
 
@@ -222,27 +226,27 @@ def test_the_exponential_where_squarings_are_held(base, double, check):
 
 def test_harmonic_transfer(double, device, check):
     visibility, normals = (wp.float64, random(0, 1, 3, 9)), (wp.vec3d, unit(random(1, 1, 3, 3)))
-    sh_transfer = double("transfer").sh_transfer
+    sh_transfer = double("stages.transfer").sh_transfer
     check(lambda v, n: sh_transfer(v, n, order=3), visibility, normals)
     check(lambda n: sh_transfer(None, n, order=3), normals)
 
 
 def test_directional_transfer(double, device, check):
-    directions = double("directions").fibonacci(16)
+    directions = double("maths.directions").fibonacci(16)
     transmittance, normals = random(0, 1, 3, 16) ** 2, unit(random(1, 1, 3, 3))
     check(
-        lambda t, n: double("transfer").directional_transfer(t, n, directions),
+        lambda t, n: double("stages.transfer").directional_transfer(t, n, directions),
         (wp.float64, transmittance),
         (wp.vec3d, normals),
     )
 
 
 def test_shading(double, device, check):
-    check(double("shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 2, 4, 3)))
+    check(double("stages.shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 2, 4, 3)))
 
 
 def test_shading_under_the_same_light(double, device, check):
-    check(double("shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 1, 4, 3)))
+    check(double("stages.shading").shade, (wp.float64, random(0, 2, 3, 4)), (wp.vec3d, random(1, 1, 4, 3)))
 
 
 # ---------------------------------------------------------------------------------------------- images
@@ -253,7 +257,7 @@ SIZE = (8, 6)  # of a picture [pixels]
 @pytest.fixture
 def view(double):
     """A tetrahedron before a camera, as arguments: its vertices and the matrix to clip space."""
-    camera = double("camera").Camera.look_at((0.4, 0.9, 3), (0.1, 0, 0), size=SIZE)
+    camera = double("assets.camera").Camera.look_at((0.4, 0.9, 3), (0.1, 0, 0), size=SIZE)
     return (wp.vec3d, VERTICES[None]), (wp.mat44d, camera.clip_matrix()[None])
 
 
@@ -265,13 +269,13 @@ def clip(view):
 
 
 def test_projection(double, check, view):
-    check(double("camera").to_clip, *view)
+    check(double("stages.project").to_clip, *view)
 
 
 def test_cameras(double, check):
     rotations = np.stack([twins.random_rotation(0), twins.random_rotation(1)])
     check(
-        lambda *camera: double("camera").compose_clip_matrices(*camera, size=SIZE),
+        lambda *camera: double("stages.project").compose_clip_matrices(*camera, size=SIZE),
         (wp.mat33d, random(0, 1, 3, 3)),
         (wp.mat33d, rotations),
         (wp.vec3d, random(1, 2, 3)),
@@ -279,14 +283,15 @@ def test_cameras(double, check):
 
 
 def test_interpolation(double, device, check, clip):
-    raster = double("raster")
     faces = put(FACES, wp.vec3i, device)
-    face_ids = raster.rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
     assert len(np.unique(face_ids.numpy())) == 3  # two sides and the background
 
     def draw(clip_positions, attributes):
-        weights = raster.barycentrics(face_ids, faces, clip_positions)
-        return raster.interpolate(raster.Fragments(face_ids, weights), faces, attributes)
+        weights = double("stages.rasterize").barycentrics(face_ids, faces, clip_positions)
+        return double("stages.rasterize").interpolate(
+            double("stages.rasterize").Fragments(face_ids, weights), faces, attributes
+        )
 
     check(draw, clip, (wp.vec2d, random(0, 1, 4, 2)))
 
@@ -294,15 +299,16 @@ def test_interpolation(double, device, check, clip):
 @pytest.mark.slow
 def test_textures(double, device, check, clip):
     """Two faces have a texture that repeats and is finer than the picture; two have colors at their vertices."""
-    raster, texture = double("raster"), double("texture")
     faces = put(FACES, wp.vec3i, device)
     texture_of_face = put([0, -1, -1, 0], wp.int32, device)
 
     def reflect(clip_positions, uvs, vertex_albedo, image):
-        fragments = raster.rasterize(clip_positions, faces, *SIZE)
-        textures = texture.mip_pyramids([image])
-        footprints = texture.find_footprints(fragments, faces, clip_positions, uvs, faces, texture_of_face, textures)
-        return texture.sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
+        fragments = double("stages.rasterize").rasterize(clip_positions, faces, *SIZE)
+        textures = double("stages.textures.pyramid").mip_pyramids([image])
+        footprints = double("stages.textures.footprint").find_footprints(
+            fragments, faces, clip_positions, uvs, faces, texture_of_face, textures
+        )
+        return double("stages.textures.sample").sample_albedo(fragments, faces, vertex_albedo, textures, footprints)
 
     uvs, vertex_albedo, image = 2 * random(0, 1, 4, 2), random(1, 1, 4, 3), random(2, 1, 7, 5, 3)
     check(reflect, clip, (wp.vec2d, uvs), (wp.vec3d, vertex_albedo), (wp.vec3d, image))
@@ -311,30 +317,33 @@ def test_textures(double, device, check, clip):
 @pytest.mark.slow
 def test_upright_silhouettes(double, device, check):
     """Of edges that lean, how the lean changes is left out of the gradient."""
-    mesh, raster, silhouette = double("mesh"), double("raster"), double("silhouette")
     corners = np.array([[2.3, 1.2], [5.6, 1.2], [5.6, 4.4], [2.3, 4.4]])  # [pixels]
     depths = np.array([[1.0], [1.5], [2.0], [1.2]])
     clip_positions = np.hstack([depths * (2 * corners / SIZE - 1), np.full((4, 1), 0.1), depths])[None]
     sides = np.int32([[0, 1, 2], [0, 2, 3]])
     faces = put(sides, wp.vec3i, device)
-    neighbors = put(mesh.edge_neighbors(sides), wp.vec3i, device)
+    neighbors = put(double("assets.topology").edge_neighbors(sides), wp.vec3i, device)
 
     def smooth(image, clip_positions):
-        fragments = raster.rasterize(clip_positions, faces, *SIZE)
-        silhouettes = silhouette.find_silhouettes(fragments, faces, neighbors, clip_positions)
-        return silhouette.smooth_silhouettes(image, silhouettes, clip_positions)
+        fragments = double("stages.rasterize").rasterize(clip_positions, faces, *SIZE)
+        silhouettes = double("stages.silhouettes.find").find_silhouettes(fragments, faces, neighbors, clip_positions)
+        return double("stages.silhouettes.smooth").smooth_silhouettes(image, silhouettes, clip_positions)
 
     check(smooth, (wp.vec3d, random(0, 1, SIZE[1], SIZE[0], 3)), (wp.vec4d, clip_positions))
 
 
 def test_exposure(double, device, check, clip):
-    film, raster = double("film"), double("raster")
     faces = put(FACES, wp.vec3i, device)
-    face_ids = raster.rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 
     def expose(clip_positions, shading, albedo):
-        weights = raster.barycentrics(face_ids, faces, clip_positions)
-        return film.average(film.expose(raster.Fragments(face_ids, weights), faces, shading, albedo), 2)
+        weights = double("stages.rasterize").barycentrics(face_ids, faces, clip_positions)
+        return double("stages.film").average(
+            double("stages.film").expose(
+                double("stages.rasterize").Fragments(face_ids, weights), faces, shading, albedo
+            ),
+            2,
+        )
 
     albedo = random(1, 1, SIZE[1], SIZE[0], 3)
     check(expose, clip, (wp.vec3d, random(0, 2, 4, 3)), (wp.vec3d, albedo))
@@ -350,20 +359,21 @@ LIGHT = random(0, 4, 3) + 5 * np.eye(4, 1)
 @pytest.fixture
 def make_renderer(double, device):
     """Make what torch sees of a scene: a ground that fills the picture, and beside that a body that shadows it."""
-    mesh, scene = double("mesh"), double("scene")
-    ground = mesh.plane(size=5, segments=2)
-    body = mesh.Mesh(VERTICES, FACES)
+    ground = double("assets.primitives").plane(size=5, segments=2)
+    body = double("assets.mesh").Mesh(VERTICES, FACES)
     spheres = double("spheres").Spheres([[0, 0.2, 0], [0.2, 0.5, 0.1]], [0.6, 0.5])
-    camera = double("camera").Camera.look_at((0.3, 3, 0.5), (0.1, 0, 0), fov_y=30, size=SIZE)
+    camera = double("assets.camera").Camera.look_at((0.3, 3, 0.5), (0.1, 0, 0), fov_y=30, size=SIZE)
 
     def make(method, receivers):
         bodies = [
-            scene.Body(ground, blockers=0, receivers=receivers),
-            scene.Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
+            double("scene.scene").Body(ground, blockers=0, receivers=receivers),
+            double("scene.scene").Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
         ]
-        visibility = scene.Visibility(method=method, directions=16, order=3)
-        whole = scene.Scene(bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1)
-        place, basis = wp.device_to_torch(device), double("basis").HarmonicBasis(2)
+        visibility = double("scene.scene").Visibility(method=method, directions=16, order=3)
+        whole = double("scene.scene").Scene(
+            bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1
+        )
+        place, basis = wp.device_to_torch(device), double("assets.basis").HarmonicBasis(2)
         return double("torch").TorchRenderer(whole, device=place, basis=basis)
 
     return make
@@ -383,9 +393,9 @@ def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, mo
 
     Surfaces pull by the faces at the points of samples, of which images are made: mean slopes are no derivatives.
     """
-    expose = double("film").expose
-    monkeypatch.setattr(double("film"), "expose", lambda *arguments, **_: expose(*arguments))
-    monkeypatch.setattr(double("renderer"), "pull_surfaces", lambda *arguments: None)
+    expose = double("stages.film").expose
+    monkeypatch.setattr(double("stages.film"), "expose", lambda *arguments, **_: expose(*arguments))
+    monkeypatch.setattr(double("pipeline.renderer"), "pull_surfaces", lambda *arguments: None)
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
     camera = renderer.renderer.scene.camera
     towards, offset, intrinsics = variables(renderer, camera.rotation, camera.translation, camera.intrinsics)

@@ -25,6 +25,7 @@ from warpshadow.inverse import (
     fit,
 )
 from warpshadow.inverse.model import Model
+from warpshadow.maths import sh
 
 # Sums of some hundred float32 products in another order.
 FLOAT32 = 3e-6
@@ -86,7 +87,7 @@ def soft_scene(scene) -> ws.Scene:
 @pytest.fixture(scope="module")
 def dim_scene(scene) -> ws.Scene:
     """As a map, of about the same light, which is nowhere dark."""
-    sky = ws.EnvironmentMap(np.maximum(ws.sh.reconstruct_map(scene.light, 32), 0.05))
+    sky = ws.EnvironmentMap(np.maximum(sh.reconstruct_map(scene.light, 32), 0.05))
     return dataclasses.replace(scene, light=sky)
 
 
