@@ -243,7 +243,7 @@ def test_the_environment_says_how_many_threads_run(monkeypatch):
 def test_a_forked_process_has_threads_of_its_own():
     program = """
 import os, sys
-sys.path.insert(0, "tests/device")
+sys.path[:0] = ["tests", "tests/device"]
 import numpy as np
 import test_parallel as test
 test.parallel.set_thread_count(2)
