@@ -7,10 +7,10 @@ from functools import partial
 from pathlib import Path
 
 import warp as wp
-from warp._src.context import user_modules  # Warp has no public way to list them
 
 import warpshadow
 from warpshadow.device import batch, lanes
+from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.stages import rasterize, transfer
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
@@ -76,7 +76,9 @@ def import_package() -> None:
 def file_modules() -> dict[str, wp.Module]:
     """Warp modules that hold the kernels of a file of the package, by its name: those that no factory makes."""
     import_package()
-    return {name: module for name, module in user_modules.items() if name.startswith("warpshadow") and module.kernels}
+    return {
+        name: module for name, module in kernel_modules().items() if name.startswith("warpshadow") and module.kernels
+    }
 
 
 def compile_ptx(module: wp.Module, architectures: list[int], folder: Path) -> list[Path]:

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warpshadow
+from warpshadow.device.warp_internals import scalar_type
 
 warpshadow.quiet()
 
@@ -76,7 +77,7 @@ def poisoned_outputs(monkeypatch):
 
     def poisoned(*args, **kwargs):
         array = empty(*args, **kwargs)
-        is_real = getattr(array.dtype, "_wp_scalar_type_", array.dtype) in (wp.float32, wp.float64)
+        is_real = scalar_type(array.dtype) in (wp.float32, wp.float64)
         array.fill_(float("nan") if is_real else -1)
         return array
 

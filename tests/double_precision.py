@@ -26,6 +26,7 @@ from types import ModuleType
 import warp as wp
 
 import warpshadow
+from warpshadow.device.warp_internals import scalar_type
 
 NAME = "double_warpshadow"
 
@@ -77,7 +78,7 @@ class _Doubled(ast.NodeTransformer):
         value = getattr(wp, node.attr, None) if ast.unparse(node.value) == "wp" else None
         if node.attr == "float32":  # of Warp, NumPy or torch
             node.attr = "float64"
-        elif getattr(value, "_wp_scalar_type_", None) is wp.float32:  # vec3 and vec3f, mat44, quat, …
+        elif scalar_type(value) is wp.float32:  # vec3 and vec3f, mat44, quat, …
             node.attr = node.attr.removesuffix("f") + "d"
         elif self.in_kernel and isinstance(value, float):
             return _call("wp.float64", node)

@@ -10,6 +10,7 @@ import twins
 import warp as wp
 
 import warpshadow.stages.rasterize
+from warpshadow.device.warp_internals import item_shape
 
 # Of every entry of a Jacobian. What differs is due to the differences, rounding of 1e-16/1e-6 and third derivatives:
 # measured is a relative L2 of 5e-11 (shading) to 7e-9 (held squarings).
@@ -96,7 +97,7 @@ def test_rotation_matrices(kind, double, device, check):
         "columns": double("stages.rotations").Vec6,
         "matrix": wp.mat33d,
     }[kind]
-    parameters = random(0, 2, 3, *dtype._shape_)
+    parameters = random(0, 2, 3, *item_shape(dtype))
     if kind == "axis-angle":
         parameters[0] *= [[0], [1e-3], [0.3]]  # where the series is
     check(double("stages.rotations").rotation_matrices, (dtype, parameters))

@@ -291,7 +291,7 @@ def _scalars(array: wp.array) -> wp.array:
     array = array.contiguous()
     count = array.size * wp.types.type_size(array.dtype)
     values = wp.array(ptr=array.ptr, dtype=wp.float32, shape=count, device=array.device)
-    values._ref = array  # the memory stays while the view does
+    values.viewed = array  # the memory stays while the view does
     return values
 
 

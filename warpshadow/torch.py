@@ -22,6 +22,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import common_batch
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_at_a_time, one_call
+from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.assembly import Geometry, as_geometry
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene
@@ -294,7 +295,7 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     _check_float32("parameters", parameters)
     check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
-    rows = parameters.reshape(1, -1, *dtype._shape_)
+    rows = parameters.reshape(1, -1, *item_shape(dtype))
     matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
     return matrices.reshape(*parameters.shape[:-1], 3, 3)
 
@@ -314,7 +315,7 @@ class _Arguments:
         self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...], meaning: str = ""
     ) -> None:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
-        shape = (*shape, *getattr(dtype, "_shape_", ()))
+        shape = (*shape, *item_shape(dtype))
         _check_tensor(name, tensor, self.device, shape, meaning)
         has_batch = tensor.ndim > len(shape)
         self._has_batch |= has_batch

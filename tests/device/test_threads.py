@@ -20,6 +20,7 @@ from test_torch import small_scene
 import warpshadow as ws
 from warpshadow.device import tape
 from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.warp_internals import current_tape
 from warpshadow.torch import TorchRenderer, apply
 from warpshadow.tuning import tune
 
@@ -197,7 +198,7 @@ def test_fits_of_spheres_are_beside_the_tape():
     with wp.Tape() as recording:
         ws.fit_spheres(ws.icosphere(1.0, 1), 2, steps=1, cache=False, progress=False)
         assert not recording.launches
-        assert wp._src.context.runtime.tape is recording
+        assert current_tape() is recording
 
 
 # ---------------------------------------------------------------------------------------------- images

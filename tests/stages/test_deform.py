@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from warpshadow.device.warp_internals import item_shape
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.rotations import Vec6, rotation_matrices
@@ -64,7 +65,7 @@ def test_rotations_and_their_gradients_are_those_of_the_twin(kind, device, verif
     if kind == "axis-angle":
         parameters[0] *= [[1e-9], [1e-3], [0.3], [2.0]]  # both sides of the series, and near zero
     weights = rng.normal(size=(3, 4, 3, 3))
-    array = put(parameters.reshape(3, 4, *dtype._shape_), dtype, device)
+    array = put(parameters.reshape(3, 4, *item_shape(dtype)), dtype, device)
     with wp.Tape() as tape:
         rotations = rotation_matrices(array)
     np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)
@@ -105,7 +106,7 @@ def test_rotations_and_their_gradients_do_not_depend_on_the_length_of_parameters
     dtype, size, twin = TWINS[kind]
     rng = np.random.default_rng(5)
     parameters, weights = rng.normal(size=(1, 6, size)), rng.normal(size=(1, 6, 3, 3))
-    array = put(length * parameters.reshape(1, 6, *dtype._shape_), dtype, device)
+    array = put(length * parameters.reshape(1, 6, *item_shape(dtype)), dtype, device)
     with wp.Tape() as tape:
         rotations = rotation_matrices(array)
     np.testing.assert_allclose(rotations.numpy(), twin(parameters), atol=FLOAT32)

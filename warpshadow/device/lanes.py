@@ -339,5 +339,5 @@ def as_chunks(rows: wp.array | None) -> wp.array | None:
         strides=(*rows.strides[:2], CHUNK * rows.strides[2]),
         device=rows.device,
     )
-    chunks._ref = rows  # the memory stays while the view does
+    chunks.viewed = rows  # the memory stays while the view does
     return chunks

@@ -12,7 +12,6 @@ So results are the same to the bit whatever the number of threads. A GPU gets th
 """
 
 import collections
-import copy
 import functools
 import itertools
 import math
@@ -22,6 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import warp as wp
+
+from warpshadow.device.warp_internals import resized_launch
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
@@ -160,9 +161,7 @@ def _launch(
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
     slices: list[wp.Launch] = []
     for number, (first, end) in enumerate(itertools.pairwise(starts)):
-        piece = copy.copy(command)
-        piece.params, piece.fwd_args = list(command.params), list(command.fwd_args)
-        piece.set_dim([end - first, *dim[1:]])
+        piece = resized_launch(command, [end - first, *dim[1:]])
         piece.set_param_at_index(0, first)
         for place, parts in own.items():
             piece.set_param_at_index(place, parts[number])

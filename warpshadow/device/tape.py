@@ -6,58 +6,27 @@ the process's, as they were.
 """
 
 import contextlib
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
 
-
-class _TapeOfThread(threading.local):
-    """Warp's ``runtime.tape`` as each thread sees it; Warp asks and sets it by this attribute alone."""
-
-    def __init__(self) -> None:
-        self.own: list[wp.Tape | None] = []  # the thread's, the last of which is in use; without any the process's is
-
-    def __get__(self, runtime: Any, owner: type | None = None) -> Any:
-        if runtime is None:
-            return self
-        return self.own[-1] if self.own else vars(runtime).get("tape")
-
-    def __set__(self, runtime: Any, tape: wp.Tape | None) -> None:
-        if self.own:
-            self.own[-1] = tape
-        else:
-            vars(runtime)["tape"] = tape
-
-
-_Runtime = wp._src.context.Runtime  # Warp has no public way
-if "tape" not in vars(_Runtime):
-    _Runtime.tape = _TapeOfThread()
+from warpshadow.device.warp_internals import current_tape, own_tape
 
 
 @contextlib.contextmanager
 def recorded() -> Iterator[wp.Tape]:
     """Record what this thread launches on a tape of its own, whatever tape is open around it or in other threads."""
-    with _own_tape(wp.Tape()) as tape:
+    tape = wp.Tape()
+    with own_tape(tape):
         yield tape
 
 
 @contextlib.contextmanager
 def unrecorded() -> Iterator[None]:
     """Record nothing that this thread launches."""
-    with _own_tape(None):
+    with own_tape(None):
         yield
-
-
-@contextlib.contextmanager
-def _own_tape(tape: wp.Tape | None) -> Iterator[Any]:
-    own = _Runtime.tape.own
-    own.append(tape)
-    try:
-        yield tape
-    finally:
-        own.pop()
 
 
 def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None]) -> None:
@@ -67,7 +36,7 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
         adjoint: Launches that add to the gradients of the inputs, called when the tape plays back.
         arrays: What it reads and writes the gradients of; the tape zeroes them; None is passed over.
     """
-    tape = wp._src.context.runtime.tape  # Warp has no public way to ask
+    tape = current_tape()
     wanted = [array for array in arrays if array is not None and array.requires_grad]
     if tape is not None and wanted:
         tape.record_func(adjoint, wanted)

@@ -18,6 +18,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
 from warpshadow.pipeline.lighting import Light, Lighting
 from warpshadow.pipeline.plan import ALBEDO, LIGHT, TEXTURES, Explanation, Ledger, ViewFacts, exposes_albedo, plan_image
@@ -416,7 +417,7 @@ def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
     if given is None or isinstance(given, wp.array):
         return given
     tensor = given.detach()
-    while tensor.ndim < ndim + len(getattr(dtype, "_shape_", ())):
+    while tensor.ndim < ndim + len(item_shape(dtype)):
         tensor = tensor[None]
     return wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
 

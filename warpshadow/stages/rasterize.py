@@ -17,6 +17,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, rows
 from warpshadow.device.parallel import launch_slices, split_row
 from warpshadow.device.tape import record_adjoint
+from warpshadow.device.warp_internals import scalar_type
 
 MAX_SIZE = 1 << 15
 """Largest image width or height [pixels]: beyond, fixed-point edge functions could overflow."""
@@ -665,7 +666,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
     face_ids = fragments.face_ids
     check.shape("attributes", attributes.shape, ("batch", "attribute"))
     instances = common_batch({"fragments": face_ids, "attributes": attributes})
-    if getattr(attributes.dtype, "_wp_scalar_type_", attributes.dtype) is not wp.float32:
+    if scalar_type(attributes.dtype) is not wp.float32:
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     image = wp.zeros(
         (instances, *face_ids.shape[1:]),

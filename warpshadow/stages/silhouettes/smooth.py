@@ -7,6 +7,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate
 from warpshadow.device.tape import record_adjoint
+from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.silhouettes.find import (
     NOTHING,
     Silhouettes,
@@ -314,7 +315,7 @@ def smooth_silhouettes(
     batch_count, height, width = fragments.face_ids.shape
     check.shape("image", image.shape, ("batch" if batch_count == 1 else batch_count, height, width))
     check.shape("clip_positions", clip_positions.shape, (batch_count, "vertex"))
-    if getattr(image.dtype, "_wp_scalar_type_", image.dtype) is not wp.float32:
+    if scalar_type(image.dtype) is not wp.float32:
         raise ValueError(f"image: got dtype {image.dtype.__name__}, expected float32 or a vector of them")
     device, pixels, shares = image.device, silhouettes.pixels, silhouettes.shares
     smoothed = wp.clone(image, requires_grad=False)

@@ -1,0 +1,112 @@
+"""What Warp does not call public works as it did, all that we use of it, and no other file uses any."""
+
+import re
+import threading
+from pathlib import Path
+
+import pytest
+import warp as wp
+from packaging.requirements import Requirement
+
+from warpshadow.device import warp_internals
+
+ROOT = Path(__file__).resolve().parents[2]
+
+INTERNAL = re.compile(r"\b(wp|warp)\._[a-z]\w*|\b_(wp_scalar_type|shape)_\b|\bfwd_args\b|\buser_modules\b|\._ref\b")
+"""Names of Warp's that are not public, of those that have been used."""
+
+
+@wp.kernel(enable_backward=False)
+def _count_up(first: int, values: wp.array(dtype=wp.int32)):
+    values[first + wp.tid()] = first
+
+
+def a_thread_has_a_tape_of_its_own():
+    outer, inner, seen = wp.Tape(), wp.Tape(), []
+    with outer:
+        with warp_internals.own_tape(inner):
+            other = threading.Thread(target=lambda: seen.append(warp_internals.current_tape()))
+            other.start()
+            other.join()
+            wp.launch(_count_up, dim=1, inputs=[0], outputs=[wp.zeros(1, dtype=wp.int32, device="cpu")], device="cpu")
+            assert warp_internals.current_tape() is inner
+        assert warp_internals.current_tape() is outer and seen == [outer]
+    assert warp_internals.current_tape() is None
+    assert len(inner.launches) == 1 and not outer.launches
+
+
+def a_recorded_launch_can_be_copied_with_other_arguments():
+    values, other = (wp.full(4, -1, dtype=wp.int32, device="cpu") for _ in range(2))
+    command = wp.launch(_count_up, dim=4, inputs=[0], outputs=[values], device="cpu", record_cmd=True)
+    piece = warp_internals.resized_launch(command, [2])
+    piece.set_param_at_index(0, 1)
+    piece.set_param_at_index(1, other)
+    piece.launch()
+    assert other.numpy().tolist() == [-1, 1, 1, -1] and values.numpy().tolist() == [-1] * 4
+    command.launch()
+    assert values.numpy().tolist() == [0] * 4
+
+
+def a_dtype_says_of_what_its_items_are():
+    shapes = {wp.float32: (), wp.vec3: (3,), wp.mat44: (4, 4), wp.types.vector(length=6, dtype=wp.float32): (6,)}
+    for dtype, shape in shapes.items():
+        assert warp_internals.item_shape(dtype) == shape and warp_internals.scalar_type(dtype) is wp.float32
+    assert warp_internals.scalar_type(wp.vec3i) is wp.int32
+
+
+def modules_list_their_kernels():
+    module = warp_internals.kernel_modules()[__name__]
+    assert any("_count_up" in str(key) for key in module.kernels)
+
+
+def check(works):
+    """Run a check; that it fails is a fault of the Warp that is installed."""
+    try:
+        works()
+    except Exception as error:
+        what = works.__name__.replace("_", " ")
+        pytest.fail(f"Warp {wp.__version__} breaks device/warp_internals.py, where {what}: {error!r}")
+
+
+@pytest.mark.parametrize(
+    "works",
+    [
+        a_thread_has_a_tape_of_its_own,
+        a_recorded_launch_can_be_copied_with_other_arguments,
+        a_dtype_says_of_what_its_items_are,
+        modules_list_their_kernels,
+    ],
+)
+def test_the_installed_warp_works_as_those_before(works):
+    check(works)
+
+
+def test_a_warp_that_does_not_is_named(monkeypatch):
+    monkeypatch.delattr(warp_internals, "item_shape")
+    with pytest.raises(pytest.fail.Exception, match=f"Warp {re.escape(wp.__version__)} breaks .* of what its items"):
+        check(a_dtype_says_of_what_its_items_are)
+
+
+def test_no_other_file_uses_internals_of_warp():
+    own = {Path(warp_internals.__file__).resolve(), Path(__file__).resolve()}
+    files = [path for folder in ("warpshadow", "demos", "tests") for path in (ROOT / folder).rglob("*.py")]
+    found = [
+        f"{path.relative_to(ROOT)}: {match.group()}"
+        for path in files
+        if path.resolve() not in own
+        for match in INTERNAL.finditer(path.read_text(encoding="utf-8"))
+    ]
+    assert len(files) > 100 and not found
+
+
+def test_no_release_of_warp_is_accepted_that_was_not_tested():
+    """The pinned release is the last that pyproject.toml accepts; it goes up with it."""
+    pattern = r'"?(warp-lang[^"\n;]+)'
+    accepted, pinned = (
+        Requirement(re.search(pattern, (ROOT / name).read_text(encoding="utf-8")).group(1)).specifier
+        for name in ("pyproject.toml", "constraints.txt")
+    )
+    (version,) = (each.version for each in pinned)
+    major, minor, _ = map(int, version.split("."))
+    assert accepted.contains(version) and accepted.contains(wp.__version__)
+    assert not accepted.contains(f"{major}.{minor + 1}.0")

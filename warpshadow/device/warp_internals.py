@@ -1,0 +1,75 @@
+"""What we use of Warp that Warp does not call public, all of it: a release of Warp may change it without notice.
+
+``tests/device/test_warp_internals.py`` tells which of these a release breaks. pyproject.toml accepts the releases that
+have passed it.
+"""
+
+import contextlib
+import copy
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import warp as wp
+
+
+class _TapeOfThread(threading.local):
+    """Warp's ``runtime.tape`` as each thread sees it; Warp asks and sets it by this attribute alone."""
+
+    def __init__(self) -> None:
+        self.own: list[wp.Tape | None] = []  # the thread's, the last of which is in use; without any the process's is
+
+    def __get__(self, runtime: Any, owner: type | None = None) -> Any:
+        if runtime is None:
+            return self
+        return self.own[-1] if self.own else vars(runtime).get("tape")
+
+    def __set__(self, runtime: Any, tape: wp.Tape | None) -> None:
+        if self.own:
+            self.own[-1] = tape
+        else:
+            vars(runtime)["tape"] = tape
+
+
+_Runtime = wp._src.context.Runtime
+if "tape" not in vars(_Runtime):
+    _Runtime.tape = _TapeOfThread()
+
+
+def current_tape() -> wp.Tape | None:
+    """The tape that records what this thread launches."""
+    return wp._src.context.runtime.tape
+
+
+@contextlib.contextmanager
+def own_tape(tape: wp.Tape | None) -> Iterator[None]:
+    """Record what this thread launches on a tape that other threads do not see; None for not at all."""
+    own = _Runtime.tape.own
+    own.append(tape)
+    try:
+        yield
+    finally:
+        own.pop()
+
+
+def resized_launch(command: wp.Launch, dim: Sequence[int]) -> wp.Launch:
+    """Copy a recorded launch, with other dimensions and arguments of its own."""
+    copied = copy.copy(command)
+    copied.params, copied.fwd_args = list(command.params), list(command.fwd_args)
+    copied.set_dim(list(dim))
+    return copied
+
+
+def item_shape(dtype: type) -> tuple[int, ...]:
+    """Shape of an item of a dtype: (3,) of vec3, () of float32."""
+    return getattr(dtype, "_shape_", ())
+
+
+def scalar_type(dtype: type) -> type:
+    """Type of the numbers in an item of a dtype: float32 of vec3, and of float32 itself."""
+    return getattr(dtype, "_wp_scalar_type_", dtype)
+
+
+def kernel_modules() -> dict[str, wp.Module]:
+    """Warp's modules by the names of the Python modules whose kernels they hold."""
+    return wp._src.context.user_modules
