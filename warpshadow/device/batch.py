@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.tape import launch
+from warpshadow.device.launch import launch
 
 
 def common_batch(arrays: Mapping[str, Any]) -> int:
@@ -29,6 +29,12 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
     return count
 
 
+@wp.func
+def instance_in(batch: int, count: int):
+    """Index of an instance in an array that has ``count`` of them: its own, or that of the one that serves all."""
+    return wp.min(batch, count - 1)
+
+
 @functools.cache
 def _copy_kernel(dtype: type) -> wp.Kernel:
     @wp.kernel(module="unique")
@@ -41,7 +47,7 @@ def _copy_kernel(dtype: type) -> wp.Kernel:
     ):
         """A thread owns an item of an instance."""
         batch, item = wp.tid()
-        whole[batch, first + item] = part[wp.min(batch, part.shape[0] - 1), wp.min(item, part.shape[1] - 1)]
+        whole[batch, first + item] = part[instance_in(batch, part.shape[0]), instance_in(item, part.shape[1])]
 
     return copy
 
@@ -58,16 +64,10 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     """
     if instances is None:
         instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
-    whole = wp.empty(
-        (instances, sum(counts)),
-        dtype=parts[0].dtype,
-        device=parts[0].device,
-        requires_grad=any(part.requires_grad for part in parts),
-    )
+    whole = wp.empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
     first = 0
     for part, count in zip(parts, counts, strict=True):
-        dim = instances, count
-        launch(_copy_kernel(part.dtype), dim=dim, inputs=[part, first], outputs=[whole], device=part.device)
+        launch(_copy_kernel(part.dtype), (instances, count), inputs=[part, first], outputs=[whole])
         first += count
     return whole
 
@@ -101,12 +101,13 @@ def _add_kernel(dtype: type) -> wp.Kernel:
 
 
 def accumulate(values: wp.array, totals: wp.array) -> None:
-    """Add values [batch, item] to totals, off the tape; on a CPU NumPy does, twice as fast as a kernel."""
+    """Add values [item] or [batch, item] to totals, off the tape; on a CPU NumPy does, twice as fast as a kernel."""
     if is_readable(totals.device):
         totals.numpy()[...] += values.numpy()
         return
-    kernel = _add_kernel(totals.dtype)
-    wp.launch(kernel, dim=totals.shape, inputs=[values], outputs=[totals], device=totals.device, record_tape=False)
+    if totals.ndim == 1:
+        values, totals = values.reshape((1, -1)), totals.reshape((1, -1))
+    launch(_add_kernel(totals.dtype), totals.shape, inputs=[values], outputs=[totals])
 
 
 def rows(images: Any) -> Any:

@@ -16,7 +16,7 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -100,9 +100,19 @@ class Scratch(NamedTuple):
     dtype: type
 
 
+def run_length(device: wp.Device, width: int) -> int:
+    """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
+    return 1 if device.is_cuda else width
+
+
+def strip_count(device: wp.Device) -> int:
+    """Threads that share a face or an edge: on CUDA several, so that none follows a huge one alone."""
+    return 16 if device.is_cuda else 1
+
+
 def launch_slices(
     kernel: wp.Kernel,
-    dim: Sequence[int],
+    dim: int | Sequence[int],
     *,
     cost: float,
     inputs: Sequence[Any],
@@ -111,53 +121,26 @@ def launch_slices(
     sums: Sequence[wp.array | None] = (),
     device: wp.Device,
 ) -> None:
-    """Launch a kernel off the tape, on a CPU in slices that threads share.
-
-    Args:
-        kernel: Its arguments are ``first_row`` and ``worker``, then inputs, scratch memory, outputs and sums.
-        dim: Threads in Warp's sense; the first dimension is that of rows, which write to different places.
-        cost: Roughly how long one of these threads takes [ns], which decides whether slices are worth it.
-        inputs, outputs: Arguments.
-        scratch: Memory for the launch: a row for each worker on a CPU, and for each thread on a GPU.
-        sums: Arrays that all rows add to; None for those that are not wanted.
-        device: Where to launch.
-    """
+    """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`warpshadow.device.launch`."""
+    dim = (dim,) if isinstance(dim, int) else dim
     workers = thread_count()
     rows = workers if device.is_cpu else math.prod(dim)
-    places = [wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch]
-    arguments = {"inputs": [0, _worker(device), *inputs, *places], "outputs": [*outputs, *sums]}
-    first_sum = 2 + len(inputs) + len(places) + len(outputs)
-    sums_at = {first_sum + k: array for k, array in enumerate(sums)}
-    _launch(kernel, dim, cost, arguments, sums_at, device, workers)
-
-
-def _worker(device: wp.Device) -> int:
-    return 0 if device.is_cpu else -1
-
-
-def _launch(
-    kernel: wp.Kernel,
-    dim: Sequence[int],
-    cost: float,
-    arguments: Mapping[str, Sequence[Any]],
-    sums: Mapping[int, wp.array | None],
-    device: wp.Device,
-    workers: int,
-) -> None:
-    """Launch a kernel; sums by their places among the arguments."""
-    options = {"device": device, "record_tape": False}
+    before = [0, 0 if device.is_cpu else -1, *inputs]
+    before += [wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch]
+    before += outputs
+    summed = {place: array for place, array in enumerate(sums, len(before)) if array is not None}
+    options = {"inputs": [*before, *sums], "device": device, "record_tape": False}
     total = math.prod(dim)
-    summed = {place: array for place, array in sums.items() if array is not None}
     most = _SLICES_PER_THREAD * workers
     if summed:  # as many for any number of threads
         most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
     if slice_count <= 1 or (not summed and workers == 1):
-        wp.launch(kernel, dim=dim, **arguments, **options)
+        wp.launch(kernel, dim=dim, **options)
         return
     own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
-    command = wp.launch(kernel, dim=dim, **arguments, **options, record_cmd=True)
+    command = wp.launch(kernel, dim=dim, **options, record_cmd=True)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
     slices: list[wp.Launch] = []
     for number, (first, end) in enumerate(itertools.pairwise(starts)):

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, rows
-from warpshadow.device.parallel import launch_slices, split_row
+from warpshadow.device.parallel import launch_slices, run_length, split_row
 from warpshadow.device.tape import record_adjoint
 from warpshadow.device.warp_internals import scalar_type
 
@@ -62,11 +62,6 @@ class Fragments:
     def rows(self) -> list[wp.array]:
         """The arrays as [batch, pixel]."""
         return [rows(self.face_ids), rows(self.barycentrics)]
-
-
-def run_length(device: wp.Device, width: int) -> int:
-    """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
-    return 1 if device.is_cuda else width
 
 
 @wp.kernel(enable_backward=False)

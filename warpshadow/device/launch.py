@@ -1,0 +1,90 @@
+"""Launching: kernels run here, and get on the tape what their gradients need.
+
+A kernel has either Warp's own adjoint, which Warp's tape plays back, or one written by hand as another kernel
+(``enable_backward=False``), which :func:`differentiable` pairs with it. Either way a result requires a gradient if an
+array that it depends on does, and nothing is recorded if none does.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import warp as wp
+
+from warpshadow.device.parallel import Scratch, launch_slices
+from warpshadow.device.tape import record_adjoint
+
+
+def launch(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    *,
+    inputs: Sequence[Any],
+    outputs: Sequence[wp.array | None] = (),
+    sums: Sequence[wp.array | None] = (),
+    scratch: Sequence[Scratch] = (),
+    cost: float | None = None,
+) -> None:
+    """Launch a kernel on the device of its arrays.
+
+    Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded.
+
+    Args:
+        kernel: Its arguments are inputs, scratch memory, outputs and sums; before them ``first_row`` and ``worker`` if
+            it has a cost.
+        dim: Threads in Warp's sense; if the kernel has a cost, the first dimension is that of rows, which write to
+            different places.
+        inputs, outputs: Arguments. An output that is to require a gradient must not be a view made before it does.
+        sums: Outputs that all rows add to; None for those that are not wanted.
+        scratch: Memory for a kernel that has a cost: a row for each worker on a CPU, and for each thread on a GPU.
+        cost: Roughly how long a thread takes [ns]: on a CPU the launch is cut into slices if they are worth it, which
+            run on all cores (:mod:`warpshadow.device.parallel`). None runs it on one.
+    """
+    device = next(value.device for value in (*outputs, *sums, *inputs) if isinstance(value, wp.array))
+    if cost is not None:
+        launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
+        return
+    is_wanted = kernel.options.get("enable_backward") is not False and varies(inputs)
+    if is_wanted:
+        for output in outputs:
+            if output is not None:
+                _require_gradient(output, kernel)
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[*outputs, *sums], device=device, record_tape=is_wanted)
+
+
+def differentiable(
+    forward: Callable[[wp.array], None],
+    adjoint: Callable[[wp.array], None],
+    result: wp.array,
+    variables: Sequence[wp.array | None],
+) -> wp.array:
+    """Compute a result by launches whose adjoint is written by hand, and put that on the tape.
+
+    Args:
+        forward: Launches that write the result, which they get.
+        adjoint: Launches that add to the gradients of the variables, those that have one; they get the result's. It is
+            called whenever the tape plays back, and not at all where no variable requires a gradient.
+        result: Memory for the result. It requires a gradient if a variable does.
+        variables: What the result depends on differentiably; None is passed over.
+
+    Returns:
+        The result.
+    """
+    if varies(variables):
+        result.requires_grad = True
+    forward(result)
+    record_adjoint(lambda: adjoint(result.grad), [*variables, result])
+    return result
+
+
+def varies(values: Iterable[Any]) -> bool:
+    """Whether one of some values is an array that requires a gradient."""
+    return any(isinstance(value, wp.array) and value.requires_grad for value in values)
+
+
+def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
+    is_real = getattr(output.dtype, "_wp_scalar_type_", output.dtype) in (wp.float32, wp.float64)
+    if output.requires_grad or not is_real:
+        return
+    if getattr(output, "_ref", None) is not None:
+        raise RuntimeError(f"{kernel.key}: got an output that is a view, whose gradient nobody else would have")
+    output.requires_grad = True
