@@ -54,6 +54,12 @@ def a_dtype_says_of_what_its_items_are():
     assert warp_internals.scalar_type(wp.vec3i) is wp.int32
 
 
+def views_know_that_they_are_views():
+    whole = wp.zeros((4, 2), dtype=wp.float32, device="cpu")
+    assert not warp_internals.is_view(whole)
+    assert warp_internals.is_view(whole[1:]) and warp_internals.is_view(whole.reshape((8,)))
+
+
 def modules_list_their_kernels():
     module = warp_internals.kernel_modules()[__name__]
     assert any("_count_up" in str(key) for key in module.kernels)
@@ -74,6 +80,7 @@ def check(works):
         a_thread_has_a_tape_of_its_own,
         a_recorded_launch_can_be_copied_with_other_arguments,
         a_dtype_says_of_what_its_items_are,
+        views_know_that_they_are_views,
         modules_list_their_kernels,
     ],
 )

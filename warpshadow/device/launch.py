@@ -12,6 +12,7 @@ import warp as wp
 
 from warpshadow.device.parallel import Scratch, launch_slices
 from warpshadow.device.tape import record_adjoint
+from warpshadow.device.warp_internals import is_view, scalar_type
 
 
 def launch(
@@ -82,9 +83,9 @@ def varies(values: Iterable[Any]) -> bool:
 
 
 def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
-    is_real = getattr(output.dtype, "_wp_scalar_type_", output.dtype) in (wp.float32, wp.float64)
+    is_real = scalar_type(output.dtype) in (wp.float32, wp.float64)
     if output.requires_grad or not is_real:
         return
-    if getattr(output, "_ref", None) is not None:
+    if is_view(output):
         raise RuntimeError(f"{kernel.key}: got an output that is a view, whose gradient nobody else would have")
     output.requires_grad = True

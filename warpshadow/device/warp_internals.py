@@ -70,6 +70,11 @@ def scalar_type(dtype: type) -> type:
     return getattr(dtype, "_wp_scalar_type_", dtype)
 
 
+def is_view(array: wp.array) -> bool:
+    """Whether an array is a part of another, or another of its shapes."""
+    return getattr(array, "_ref", None) is not None
+
+
 def kernel_modules() -> dict[str, wp.Module]:
     """Warp's modules by the names of the Python modules whose kernels they hold."""
     return wp._src.context.user_modules
