@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.tape import launch, launch_new, varies
+from warpshadow.device.launch import launch
 from warpshadow.device.threads import one_at_a_time
 
 _SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
@@ -164,14 +164,18 @@ class DeformationGraph:
         """
         self._check(matrices, translations)
         inputs = [self.rest, self.nodes, self.weights, self.node_positions, matrices, translations]
-        return launch_new(_deform_points, (matrices.shape[0], self.rest.shape[0]), wp.vec3, inputs)
+        deformed = wp.empty((matrices.shape[0], self.rest.shape[0]), dtype=wp.vec3, device=matrices.device)
+        launch(_deform_points, deformed.shape, inputs=inputs, outputs=[deformed])
+        return deformed
 
     @one_at_a_time
     def centers(self, translations: wp.array) -> wp.array:
         """Where the nodes themselves go: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
         check.finite_arrays({"translations": translations})
-        return launch_new(_move_nodes, translations.shape, wp.vec3, [self.node_positions, translations])
+        moved = wp.empty_like(translations, requires_grad=False)
+        launch(_move_nodes, moved.shape, inputs=[self.node_positions, translations], outputs=[moved])
+        return moved
 
     @one_at_a_time
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
@@ -204,8 +208,8 @@ class DeformationGraph:
 
 def _energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:
     """Launch a kernel whose threads add to the energy of their instance; ValueError where that is no float32."""
-    energy = wp.zeros(dim[0], dtype=wp.float32, device=inputs[0].device, requires_grad=varies(inputs))
-    launch(kernel, dim=dim, inputs=inputs, outputs=[energy], device=energy.device)
+    energy = wp.zeros(dim[0], dtype=wp.float32, device=inputs[0].device)
+    launch(kernel, dim, inputs=inputs, outputs=[energy])
     if not energy.device.is_capturing and not np.isfinite(energy.numpy()).all():
         raise ValueError(f"{names}: got an energy beyond float32's range, expected smaller numbers")
     return energy

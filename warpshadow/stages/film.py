@@ -3,10 +3,10 @@
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, rows
-from warpshadow.device.parallel import launch_slices, split_row
-from warpshadow.device.tape import launch, record_adjoint
-from warpshadow.stages.rasterize import Fragments, run_length
+from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import run_length, split_row
+from warpshadow.stages.rasterize import Fragments
 
 _SAMPLE_COST = 5.0
 """Nanoseconds that a sample takes."""
@@ -37,9 +37,9 @@ def _expose(
 ):
     """A thread owns a run of samples; they are zero before."""
     batch, thread = split_row(first_row + wp.tid(), samples.shape[1] // run)
-    view = wp.min(batch, face_ids.shape[0] - 1)
-    lit = wp.min(batch, shading.shape[0] - 1)
-    reflected = wp.min(batch, albedo.shape[0] - 1)
+    view = instance_in(batch, face_ids.shape[0])
+    lit = instance_in(batch, shading.shape[0])
+    reflected = instance_in(batch, albedo.shape[0])
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         if face >= 0:
@@ -71,9 +71,9 @@ def _expose_adjoint(
     """
     thread = first_row + wp.tid()
     for batch in range(adj_samples.shape[0]):
-        view = wp.min(batch, face_ids.shape[0] - 1)
-        lit = wp.min(batch, shading.shape[0] - 1)
-        reflected = wp.min(batch, albedo.shape[0] - 1)
+        view = instance_in(batch, face_ids.shape[0])
+        lit = instance_in(batch, shading.shape[0])
+        reflected = instance_in(batch, albedo.shape[0])
         for sample in range(thread * run, (thread + 1) * run):
             face = face_ids[view, sample]
             if face >= 0:
@@ -122,39 +122,23 @@ def expose(
     arrays = {"fragments": fragments.face_ids, "shading": shading, "albedo": albedo}
     _, height, width = fragments.face_ids.shape
     check.shape("albedo", albedo.shape, ("batch", height, width))
-    samples = wp.zeros(
-        (common_batch(arrays), height, width),
-        dtype=wp.vec4,
-        device=shading.device,
-        requires_grad=shading.requires_grad or albedo.requires_grad or fragments.barycentrics.requires_grad,
-    )
-    run = run_length(shading.device, width)
-    run_count = height * width // run
-    factors = [rows(fragments.face_ids), rows(fragments.barycentrics), faces, shading, rows(albedo), run]
-    cost = _SAMPLE_COST * run
-    launch_slices(
-        _expose,
-        dim=[samples.shape[0] * run_count],
-        cost=cost,
-        inputs=factors,
-        outputs=[rows(samples)],
-        device=shading.device,
-    )
-    variables = [fragments.barycentrics, shading, albedo]
-
-    def adjoint() -> None:
-        launch_slices(
+    instances, device = common_batch(arrays), shading.device
+    run = run_length(device, width)
+    run_count, cost = height * width // run, _SAMPLE_COST * run
+    factors = [*fragments.rows, faces, shading, rows(albedo), run]
+    return differentiable(
+        lambda samples: launch(_expose, instances * run_count, inputs=factors, outputs=[rows(samples)], cost=cost),
+        lambda adj_samples: launch(
             _expose_adjoint,
-            dim=[run_count],
-            cost=2 * cost * samples.shape[0],
-            inputs=[*factors, rows(samples.grad)],
+            run_count,
+            inputs=[*factors, rows(adj_samples)],
             outputs=[rows(fragments.barycentrics.grad) if at_points else None, rows(albedo.grad)],
             sums=[shading.grad],
-            device=shading.device,
-        )
-
-    record_adjoint(adjoint, [*variables, samples])
-    return samples
+            cost=2 * cost * instances,
+        ),
+        result=wp.zeros((instances, height, width), dtype=wp.vec4, device=device),
+        variables=[fragments.barycentrics, shading, albedo],
+    )
 
 
 @wp.kernel
@@ -189,14 +173,7 @@ def average(samples: wp.array, across: int) -> wp.array:
     if across == 1:
         return samples
     batch_count, height, width = samples.shape[0], samples.shape[1] // across, samples.shape[2] // across
-    pixels = wp.empty(
-        (batch_count, height, width), dtype=wp.vec4, device=samples.device, requires_grad=samples.requires_grad
-    )
-    launch(
-        _average,
-        dim=(batch_count * height, width),
-        inputs=[samples.reshape((batch_count * height, across, width, across)), across],
-        outputs=[pixels.reshape((batch_count * height, width))],
-        device=samples.device,
-    )
-    return pixels
+    rows_of_pixels = samples.reshape((batch_count * height, across, width, across))
+    pixels = wp.empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
+    launch(_average, pixels.shape, inputs=[rows_of_pixels, across], outputs=[pixels])
+    return pixels.reshape((batch_count, height, width))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.launch import differentiable, launch
 
 
 class KeptRows(NamedTuple):
@@ -73,32 +73,20 @@ def light_cells(transmittance: wp.array, kept: KeptRows) -> wp.array:
 
     Differentiable: transmittance.
     """
-    device, requires_grad = transmittance.device, transmittance.requires_grad
+    device = transmittance.device
     if device.is_cpu:
         use_vector_registers(__name__)
-    shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device, requires_grad=requires_grad)
     factors = [kept.index, as_chunks(kept.rows)]
-    wp.launch(
-        _light_cells,
-        dim=shading.shape,
-        inputs=[as_chunks(transmittance), *factors],
-        outputs=[shading],
-        device=device,
-        record_tape=False,
-    )
 
-    def adjoint() -> None:
-        wp.launch(
-            _light_cells_adjoint,
-            dim=shading.shape,
-            inputs=[*factors, shading.grad],
-            outputs=[as_chunks(transmittance.grad)],
-            device=device,
-            record_tape=False,
-        )
+    def forward(shading: wp.array) -> None:
+        launch(_light_cells, shading.shape, inputs=[as_chunks(transmittance), *factors], outputs=[shading])
 
-    record_adjoint(adjoint, [transmittance, shading])
-    return shading
+    def adjoint(adj_shading: wp.array) -> None:
+        outputs = [as_chunks(transmittance.grad)]
+        launch(_light_cells_adjoint, adj_shading.shape, inputs=[*factors, adj_shading], outputs=outputs)
+
+    shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
+    return differentiable(forward, adjoint, shading, variables=[transmittance])
 
 
 @wp.kernel(enable_backward=False)
@@ -131,25 +119,21 @@ def cell_transfer(transmittance: wp.array, kept: KeptRows) -> wp.array:
 
     Differentiable: transmittance.
     """
-    device, requires_grad = transmittance.device, transmittance.requires_grad
+    device = transmittance.device
     if device.is_cpu:
         use_vector_registers(__name__)
-    transfer = wp.zeros(transmittance.shape, dtype=wp.float32, device=device, requires_grad=requires_grad)
     factors = [kept.index, as_chunks(kept.rows)]
 
     def multiply(values: wp.array, products: wp.array) -> None:
-        wp.launch(
-            _multiply_cells,
-            dim=transmittance.shape[:2],
-            inputs=[as_chunks(values), *factors],
-            outputs=[as_chunks(products)],
-            device=device,
-            record_tape=False,
-        )
+        inputs = [as_chunks(values), *factors]
+        launch(_multiply_cells, values.shape[:2], inputs=inputs, outputs=[as_chunks(products)])
 
-    multiply(transmittance, transfer)
-    record_adjoint(lambda: multiply(transfer.grad, transmittance.grad), [transmittance, transfer])
-    return transfer
+    return differentiable(
+        lambda transfer: multiply(transmittance, transfer),
+        lambda adj_transfer: multiply(adj_transfer, transmittance.grad),
+        result=wp.zeros(transmittance.shape, dtype=wp.float32, device=device),
+        variables=[transmittance],
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -176,11 +160,4 @@ def add_rows(kept: KeptRows, sums: wp.array) -> None:
         kept: Of shape [row, 1, item].
         sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
     """
-    wp.launch(
-        _add_rows,
-        dim=sums.shape[:2],
-        inputs=[kept.index, kept.rows],
-        outputs=[sums],
-        device=sums.device,
-        record_tape=False,
-    )
+    launch(_add_rows, sums.shape[:2], inputs=[kept.index, kept.rows], outputs=[sums])

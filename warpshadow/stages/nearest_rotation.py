@@ -5,7 +5,7 @@ It is a file, and so a module of Warp's, of its own: the singular value decompos
 
 import warp as wp
 
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.launch import differentiable, launch
 
 
 @wp.kernel(enable_backward=False)
@@ -14,6 +14,7 @@ def _nearest_rotations(
     matrices: wp.array2d(dtype=wp.mat33),
     # out
     rotations: wp.array2d(dtype=wp.mat33),
+    kept: wp.array2d(dtype=wp.mat33),
 ):
     """A thread owns a rotation, U diag(1, 1, det UVᵀ) Vᵀ of the singular value decomposition M = U Σ Vᵀ."""
     batch, body = wp.tid()
@@ -21,7 +22,9 @@ def _nearest_rotations(
     u, _s, v = wp.svd3(m / wp.sqrt(wp.ddot(m, m)))
     one = wp.float64(1.0)
     middle = wp.diag(wp.vec3d(one, one, wp.sign(wp.determinant(u) * wp.determinant(v))))
-    rotations[batch, body] = wp.mat33(u * middle * wp.transpose(v))
+    rotation = wp.mat33(u * middle * wp.transpose(v))
+    rotations[batch, body] = rotation
+    kept[batch, body] = rotation
 
 
 @wp.kernel(enable_backward=False)
@@ -58,15 +61,13 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
 
     Differentiable: matrices.
     """
-    rotations = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device, requires_grad=matrices.requires_grad)
-    kept = wp.empty_like(rotations, requires_grad=False)  # the caller may change those that it gets
-    options = {"dim": matrices.shape, "device": matrices.device, "record_tape": False}
-    wp.launch(_nearest_rotations, inputs=[matrices], outputs=[rotations], **options)
-    wp.copy(kept, rotations)
+    kept = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device)  # the caller may change those that it gets
 
-    def adjoint() -> None:
-        inputs = [matrices, kept, rotations.grad]
-        wp.launch(_nearest_rotations_adjoint, inputs=inputs, outputs=[matrices.grad], **options)
+    def forward(rotations: wp.array) -> None:
+        launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, kept])
 
-    record_adjoint(adjoint, [matrices, rotations])
-    return rotations
+    def adjoint(adj_rotations: wp.array) -> None:
+        inputs = [matrices, kept, adj_rotations]
+        launch(_nearest_rotations_adjoint, matrices.shape, inputs=inputs, outputs=[matrices.grad])
+
+    return differentiable(forward, adjoint, result=wp.empty_like(kept), variables=[matrices])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.tape import launch
+from warpshadow.device.launch import launch
 
 # ---------------------------------------------------------------------------------------------------- normals
 
@@ -69,15 +69,8 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
     check.finite_arrays({"positions": positions})
-    device, requires_grad = positions.device, positions.requires_grad
-    sums = wp.zeros(positions.shape, dtype=wp.vec3d, device=device, requires_grad=requires_grad)
-    normals = wp.empty(positions.shape, dtype=wp.vec3, device=device, requires_grad=requires_grad)
-    launch(
-        _sum_face_normals,
-        dim=(positions.shape[0], faces.shape[0]),
-        inputs=[positions, faces],
-        outputs=[sums],
-        device=device,
-    )
-    launch(_normalize, dim=positions.shape, inputs=[sums], outputs=[normals], device=device)
+    device, shape = positions.device, positions.shape
+    sums, normals = wp.zeros(shape, dtype=wp.vec3d, device=device), wp.empty(shape, dtype=wp.vec3, device=device)
+    launch(_sum_face_normals, (shape[0], faces.shape[0]), inputs=[positions, faces], outputs=[sums])
+    launch(_normalize, shape, inputs=[sums], outputs=[normals])
     return normals

@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch
-from warpshadow.device.tape import launch_new
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
 from warpshadow.stages.rotations import _check_orthonormal
 
 # ---------------------------------------------------------------------------------------------- rigid bodies
@@ -27,8 +27,8 @@ def _pose_points(
     """A thread owns a point of an instance."""
     batch, point = wp.tid()
     body = bodies[point]
-    pose = wp.min(batch, scales.shape[0] - 1)
-    at_rest = rest[wp.min(batch, rest.shape[0] - 1), point]
+    pose = instance_in(batch, scales.shape[0])
+    at_rest = rest[instance_in(batch, rest.shape[0]), point]
     posed[batch, point] = scales[pose, body] * (rotations[pose, body] * at_rest) + translations[pose, body]
 
 
@@ -43,8 +43,8 @@ def _pose_radii(
 ):
     """A thread owns a sphere of an instance."""
     batch, sphere = wp.tid()
-    scale = scales[wp.min(batch, scales.shape[0] - 1), bodies[sphere]]
-    posed[batch, sphere] = scale * rest[wp.min(batch, rest.shape[0] - 1), sphere]
+    scale = scales[instance_in(batch, scales.shape[0]), bodies[sphere]]
+    posed[batch, sphere] = scale * rest[instance_in(batch, rest.shape[0]), sphere]
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,16 @@ class Poses:
 
         Differentiable: rest, rotations, translations, scales.
         """
+        posed = wp.empty(self._shape(rest, bodies), dtype=wp.vec3, device=rest.device)
         inputs = [rest, bodies, self.rotations, self.translations, self.scales]
-        return launch_new(_pose_points, self._shape(rest, bodies), wp.vec3, inputs)
+        launch(_pose_points, posed.shape, inputs=inputs, outputs=[posed])
+        return posed
 
     def radii(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Scale radii, float32 of shape [batch, sphere], with their bodies. Differentiable: rest, scales."""
-        return launch_new(_pose_radii, self._shape(rest, bodies), wp.float32, [rest, bodies, self.scales])
+        posed = wp.empty(self._shape(rest, bodies), dtype=wp.float32, device=rest.device)
+        launch(_pose_radii, posed.shape, inputs=[rest, bodies, self.scales], outputs=[posed])
+        return posed
 
     def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
         """Shape of what moves."""

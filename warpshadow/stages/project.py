@@ -5,8 +5,8 @@ from __future__ import annotations
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch
-from warpshadow.device.tape import launch
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
 from warpshadow.device.threads import one_at_a_time
 
 
@@ -23,9 +23,9 @@ def _compose_clip_matrices(
 ):
     """One thread owns one camera: the rows of [K R | K t] in clip space, the depth row apart."""
     camera = wp.tid()
-    rotation = rotations[wp.min(camera, rotations.shape[0] - 1)]
-    translation = translations[wp.min(camera, translations.shape[0] - 1)]
-    project = to_ndc * intrinsics[wp.min(camera, intrinsics.shape[0] - 1)]
+    rotation = rotations[instance_in(camera, rotations.shape[0])]
+    translation = translations[instance_in(camera, translations.shape[0])]
+    project = to_ndc * intrinsics[instance_in(camera, intrinsics.shape[0])]
     r = project * rotation
     t = project * translation
     clip_matrices[camera] = wp.mat44(
@@ -60,19 +60,9 @@ def compose_clip_matrices(
     variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
     check.finite_arrays(variables)
     to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
-    clip_matrices = wp.empty(
-        common_batch(variables),
-        dtype=wp.mat44,
-        device=intrinsics.device,
-        requires_grad=any(array.requires_grad for array in variables.values()),
-    )
-    launch(
-        _compose_clip_matrices,
-        dim=clip_matrices.shape,
-        inputs=[*variables.values(), to_ndc, check.positive("near", near)],
-        outputs=[clip_matrices],
-        device=intrinsics.device,
-    )
+    clip_matrices = wp.empty(common_batch(variables), dtype=wp.mat44, device=intrinsics.device)
+    inputs = [*variables.values(), to_ndc, check.positive("near", near)]
+    launch(_compose_clip_matrices, clip_matrices.shape, inputs=inputs, outputs=[clip_matrices])
     return clip_matrices
 
 
@@ -86,8 +76,8 @@ def _to_clip(
 ):
     """One thread owns one vertex of one instance."""
     instance, vertex = wp.tid()
-    p = positions[wp.min(instance, positions.shape[0] - 1), vertex]
-    matrix = clip_matrices[wp.min(instance, clip_matrices.shape[0] - 1)]
+    p = positions[instance_in(instance, positions.shape[0]), vertex]
+    matrix = clip_matrices[instance_in(instance, clip_matrices.shape[0])]
     clip_positions[instance, vertex] = matrix * wp.vec4(p[0], p[1], p[2], 1.0)
 
 
@@ -106,17 +96,6 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
     """
     check.finite_arrays({"clip_matrices": clip_matrices})
     batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
-    clip_positions = wp.empty(
-        (batch_count, positions.shape[1]),
-        dtype=wp.vec4,
-        device=positions.device,
-        requires_grad=positions.requires_grad or clip_matrices.requires_grad,
-    )
-    launch(
-        _to_clip,
-        dim=clip_positions.shape,
-        inputs=[positions, clip_matrices],
-        outputs=[clip_positions],
-        device=positions.device,
-    )
+    clip_positions = wp.empty((batch_count, positions.shape[1]), dtype=wp.vec4, device=positions.device)
+    launch(_to_clip, clip_positions.shape, inputs=[positions, clip_matrices], outputs=[clip_positions])
     return clip_positions

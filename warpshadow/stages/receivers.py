@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import common_batch, rows
+from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.constants import constant
-from warpshadow.device.tape import launch
+from warpshadow.device.launch import launch
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -49,7 +49,7 @@ def _gather(
 ):
     """A thread owns a receiver: a vertex, or a sample's point, −1 for none."""
     batch, receiver = wp.tid()
-    instance = wp.min(batch, positions.shape[0] - 1)
+    instance = instance_in(batch, positions.shape[0])
     own = receiver - vertices.shape[0]
     if own < 0:
         vertex = vertices[receiver] % positions.shape[1]
@@ -58,7 +58,7 @@ def _gather(
     else:
         side = int(0)
         weights = wp.vec3(1.0, 0.0, 0.0)
-        view = wp.min(batch, sides.shape[0] - 1)
+        view = instance_in(batch, sides.shape[0])
         sample = samples[view, own]
         if sample >= 0:
             side = sides[view, sample]
@@ -186,26 +186,15 @@ def find_receivers(
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
     vertices = of_vertices if vertices is None else vertices
-    variables = [positions, normals, fragments.barycentrics][: 3 if has_own else 2]
-    requires_grad = any(array.requires_grad for array in variables)
-    shape = batch_count, vertices.size + own_count
     points, point_normals = (
-        wp.empty(shape, dtype=wp.vec3, device=device, requires_grad=requires_grad) for _ in range(2)
+        wp.empty((batch_count, vertices.size + own_count), dtype=wp.vec3, device=device) for _ in range(2)
     )
+    weights = rows(fragments.barycentrics) if has_own else None
     launch(
         _gather,
-        dim=shape,
-        inputs=[
-            positions,
-            normals,
-            faces,
-            rows(sides),
-            rows(fragments.barycentrics) if has_own else None,
-            vertices,
-            samples,
-        ],
+        points.shape,
+        inputs=[positions, normals, faces, rows(sides), weights, vertices, samples],
         outputs=[points, point_normals],
-        device=device,
     )
     return Receivers(points, point_normals, receiver_faces, of_vertices, receiver_fragments, still)
 
@@ -246,20 +235,10 @@ def _own_samples(fragments: Fragments, wants_samples: np.ndarray) -> tuple[np.nd
     samples, own_counts = _ragged(is_own.reshape(len(is_own), -1))
     own_face_ids = face_ids.copy()
     own_face_ids[is_own] = len(wants_samples) + np.concatenate([np.arange(count) for count in own_counts])
-    weights = wp.empty(
-        fragments.barycentrics.shape,
-        dtype=wp.vec3,
-        device=device,
-        requires_grad=fragments.barycentrics.requires_grad,
-    )
-    launch(
-        _weigh_own,
-        dim=weights.size,
-        inputs=[wp.array(is_own.ravel(), dtype=wp.bool, device=device), fragments.barycentrics.flatten()],
-        outputs=[weights.flatten()],
-        device=device,
-    )
-    return samples, Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights)
+    weights = wp.empty(face_ids.size, dtype=wp.vec3, device=device)
+    own = wp.array(is_own.ravel(), dtype=wp.bool, device=device)
+    launch(_weigh_own, weights.shape, inputs=[own, fragments.barycentrics.flatten()], outputs=[weights])
+    return samples, Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights.reshape(face_ids.shape))
 
 
 def _ragged(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.tape import launch
+from warpshadow.device.launch import launch
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.stages.nearest_rotation import nearest_rotations
 
@@ -121,16 +121,8 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
     _check_rotations(parameters)
     if parameters.dtype is wp.mat33:
         return nearest_rotations(parameters)
-    rotations = wp.empty(
-        parameters.shape, dtype=wp.mat33, device=parameters.device, requires_grad=parameters.requires_grad
-    )
-    launch(
-        _ROTATION_KERNELS[parameters.dtype],
-        dim=parameters.shape,
-        inputs=[parameters],
-        outputs=[rotations],
-        device=parameters.device,
-    )
+    rotations = wp.empty(parameters.shape, dtype=wp.mat33, device=parameters.device)
+    launch(_ROTATION_KERNELS[parameters.dtype], parameters.shape, inputs=[parameters], outputs=[rotations])
     return rotations
 
 

@@ -3,10 +3,10 @@
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch
+from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
-from warpshadow.device.parallel import launch_slices, split_row
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 
 _SLAB = 256
@@ -65,8 +65,8 @@ def _shade(
 ):
     """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
     batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
-    seen = wp.min(batch, transfer.shape[0] - 1)
-    lit = wp.min(batch, light.shape[0] - 1)
+    seen = instance_in(batch, transfer.shape[0])
+    lit = instance_in(batch, light.shape[0])
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
@@ -100,7 +100,7 @@ def _shade_adjoint_transfer(
     if adj_transfer.shape[0] == 1:
         end = adj_shading.shape[0]
     for batch in range(begin, end):
-        lit = wp.min(batch, light.shape[0] - 1)
+        lit = instance_in(batch, light.shape[0])
         adj = adj_shading[batch, vertex]
         for chunk in range(light_chunks.shape[2]):
             adj_transfer_chunks[seen, vertex, chunk] = (
@@ -129,8 +129,8 @@ def _shade_adjoint_light(
     """A thread owns a chunk of coefficients, the last one those left over, and a slab of receivers:  L̄ = Σ T s̄."""
     row, batch, slab = wp.tid()
     chunk = first_row + row
-    seen = wp.min(batch, transfer.shape[0] - 1)
-    lit = wp.min(batch, adj_light.shape[0] - 1)
+    seen = instance_in(batch, transfer.shape[0])
+    lit = instance_in(batch, adj_light.shape[0])
     begin = slab * _SLAB
     end = wp.min(begin + _SLAB, transfer.shape[1])
     first = chunk * CHUNK
@@ -182,49 +182,36 @@ def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -
     device = transfer.device
     light_count, count = light.shape
     instances = common_batch({"transfer": transfer, "light": light})
-    shading = wp.empty(
-        (instances, transfer.shape[1]),
-        dtype=wp.vec3,
-        device=device,
-        requires_grad=transfer.requires_grad or light.requires_grad,
-    )
     if device.is_cpu:
         use_vector_registers(__name__)
     channels = wp.empty((light_count, 3, count), dtype=wp.float32, device=device)
-    wp.launch(_split_channels, dim=channels.shape, inputs=[light], outputs=[channels], device=device, record_tape=False)
-    factors = [transfer, as_chunks(transfer), channels, as_chunks(channels)]
+    launch(_split_channels, channels.shape, inputs=[light], outputs=[channels])
+    seen, lit = [transfer, as_chunks(transfer)], [channels, as_chunks(channels)]
     cost = _COEFFICIENT_COST * count
-    launch_slices(_shade, dim=[shading.size], cost=cost, inputs=factors, outputs=[shading], device=device)
 
-    def adjoint() -> None:
+    def adjoint(adj_shading: wp.array) -> None:
         if transfer.requires_grad:
-            launch_slices(
+            launch(
                 _shade_adjoint_transfer,
-                dim=[transfer.shape[0] * transfer.shape[1]],
-                cost=cost * instances / transfer.shape[0],
-                inputs=[*factors[2:], shading.grad],
+                transfer.shape[0] * transfer.shape[1],
+                inputs=[*lit, adj_shading],
                 outputs=[transfer.grad, as_chunks(transfer.grad)],
-                device=device,
+                cost=cost * instances / transfer.shape[0],
             )
         if light.requires_grad:
             adj_channels = wp.zeros_like(channels)
-            slab_count = -(-transfer.shape[1] // _SLAB)
-            launch_slices(
+            launch(
                 _shade_adjoint_light,
-                dim=(-(-count // CHUNK), instances, slab_count),
-                cost=_COEFFICIENT_COST * CHUNK * _SLAB,
-                inputs=[*factors[:2], shading.grad],
+                (-(-count // CHUNK), instances, -(-transfer.shape[1] // _SLAB)),
+                inputs=[*seen, adj_shading],
                 outputs=[adj_channels],
-                device=device,
+                cost=_COEFFICIENT_COST * CHUNK * _SLAB,
             )
-            wp.launch(
-                _join_channels,
-                dim=light.shape,
-                inputs=[adj_channels],
-                outputs=[light.grad],
-                device=device,
-                record_tape=False,
-            )
+            launch(_join_channels, light.shape, inputs=[adj_channels], outputs=[light.grad])
 
-    record_adjoint(adjoint, [transfer, light, shading])
-    return shading
+    return differentiable(
+        lambda shading: launch(_shade, shading.size, inputs=[*seen, *lit], outputs=[shading], cost=cost),
+        adjoint,
+        result=wp.empty((instances, transfer.shape[1]), dtype=wp.vec3, device=device),
+        variables=[transfer, light],
+    )

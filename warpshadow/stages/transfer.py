@@ -23,8 +23,8 @@ from warpshadow.device.lanes import (
     module_options,
     use_vector_registers,
 )
-from warpshadow.device.parallel import Scratch, launch_slices, scratch_place, split_row
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, check_count
 from warpshadow.stages.sh_kernels import (
@@ -187,38 +187,29 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
     row_count = batch_count * group_count(vertex_count, lanes)
     variables = [visibility, normals]
-    transfer = wp.empty(
-        (batch_count, vertex_count, bands**2),
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
-    )
     scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = PRODUCT_COST * lanes * order**2 * bands**2
-    launch_slices(
-        _sh_transfer_kernel(order, visibility is not None, lanes),
-        dim=[row_count],
-        cost=cost,
-        inputs=[*variables, *_first_bands(order, str(device), bands)],
-        scratch=scratch,
-        outputs=[transfer],
-        device=device,
-    )
-
-    def adjoint() -> None:
-        table = product_table(order, str(device), bands_of_j=tuple(range(bands)))
-        launch_slices(
-            _sh_transfer_adjoint_kernel(order, visibility is not None, lanes),
-            dim=[row_count],
-            cost=2 * cost,
-            inputs=[*variables, *table, transfer.grad],
+    is_shadowed = visibility is not None
+    return differentiable(
+        lambda transfer: launch(
+            _sh_transfer_kernel(order, is_shadowed, lanes),
+            row_count,
+            inputs=[*variables, *_first_bands(order, str(device), bands)],
+            scratch=scratch,
+            outputs=[transfer],
+            cost=cost,
+        ),
+        lambda adj_transfer: launch(
+            _sh_transfer_adjoint_kernel(order, is_shadowed, lanes),
+            row_count,
+            inputs=[*variables, *product_table(order, str(device), bands_of_j=tuple(range(bands))), adj_transfer],
             scratch=scratch,
             outputs=[None if variable is None else variable.grad for variable in variables],
-            device=device,
-        )
-
-    record_adjoint(adjoint, [*variables, transfer])
-    return transfer
+            cost=2 * cost,
+        ),
+        result=wp.empty((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        variables=variables,
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -295,36 +286,22 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
     device = normals.device
     if transmittance.requires_grad and not transmittance.is_contiguous:
         raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
-    seen = as_chunks(transmittance.contiguous())
-    variables = [transmittance, normals]
-    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
-    transfer = wp.empty(
-        transmittance.shape,
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable.requires_grad for variable in variables),
-    )
     if device.is_cpu:
         use_vector_registers(__name__)
+    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
+    inputs = [as_chunks(transmittance.contiguous()), normals, towards, 4.0 / count]
     cost = _CELL_COST * count
-    launch_slices(
-        _transfer_directions,
-        dim=[normals.size],
-        cost=cost,
-        inputs=[seen, normals, towards, 4.0 / count],
-        outputs=[as_chunks(transfer)],
-        device=device,
-    )
-
-    def adjoint() -> None:
-        launch_slices(
+    return differentiable(
+        lambda transfer: launch(
+            _transfer_directions, normals.size, inputs=inputs, outputs=[as_chunks(transfer)], cost=cost
+        ),
+        lambda adj_transfer: launch(
             _transfer_directions_adjoint,
-            dim=[normals.size],
-            cost=2 * cost,
-            inputs=[seen, normals, towards, 4.0 / count, as_chunks(transfer.grad)],
+            normals.size,
+            inputs=[*inputs, as_chunks(adj_transfer)],
             outputs=[as_chunks(transmittance.grad), normals.grad],
-            device=device,
-        )
-
-    record_adjoint(adjoint, [*variables, transfer])
-    return transfer
+            cost=2 * cost,
+        ),
+        result=wp.empty(transmittance.shape, dtype=wp.float32, device=device),
+        variables=[transmittance, normals],
+    )
