@@ -237,7 +237,7 @@ def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.nda
     if light is None:
         truth = trace_shading(mesh, points, normals, sample_map(renderer.scene.light.radiance, directions)).numpy()
     else:
-        truth = trace_transfer(mesh, points, normals, renderer.basis, directions).numpy() @ light.numpy()[0]
+        truth = trace_transfer(mesh, points, normals, renderer.basis.functions, directions).numpy() @ light.numpy()[0]
     return [shading, truth]
 
 

@@ -322,7 +322,7 @@ def test_transfer_times_light_is_the_shading_of_that_light(device, basis):
     """The same rays' question asked twice, once of evenly spread rays: light of order 3 for harmonics, one value for
     each cell for cells."""
     mesh, points, normals, expected = ball_over_points(device)
-    transfer = trace_transfer(mesh, points, normals, basis, 8192).numpy()
+    transfer = trace_transfer(mesh, points, normals, basis.functions, 8192).numpy()
     assert transfer.shape == (33, basis.size)
     ones = np.sqrt(4 * np.pi) * np.eye(1, basis.size)[0] if isinstance(basis, HarmonicBasis) else np.ones(basis.size)
     assert np.abs(transfer @ ones - expected).max() < 5e-3
@@ -340,10 +340,10 @@ def test_transfer_times_light_is_the_shading_of_that_light(device, basis):
 def test_receivers_in_several_launches_get_what_they_get_in_one(device, monkeypatch):
     mesh, points, normals, expected = ball_over_points(device)
     basis, samples = HarmonicBasis(3), sample_map(np.ones((16, 32, 3), np.float32), 256)
-    transfer = trace_transfer(mesh, points, normals, basis, 256).numpy()
+    transfer = trace_transfer(mesh, points, normals, basis.functions, 256).numpy()
     parts = ray_tracing._parts
     monkeypatch.setattr(ray_tracing, "_parts", lambda total, size, progress: parts(total, 5, progress))
-    assert np.abs(trace_transfer(mesh, points, normals, basis, 256).numpy() - transfer).max() < 1e-6
+    assert np.abs(trace_transfer(mesh, points, normals, basis.functions, 256).numpy() - transfer).max() < 1e-6
     shading = trace_shading(mesh, points, normals, samples).numpy()
     assert np.abs(shading - expected[:, None]).max() < 0.06  # 256 rays: 4% measured
 
@@ -353,7 +353,7 @@ def test_no_receivers_are_no_work(device):
     samples = sample_map(np.ones((8, 16, 3), np.float32), 16)
     none = wp.empty(0, dtype=wp.vec3, device=device)
     assert trace_shading(mesh, none, none, samples).shape == (0,)
-    assert trace_transfer(mesh, none, none, HarmonicBasis(2), 16).shape == (0, 4)
+    assert trace_transfer(mesh, none, none, HarmonicBasis(2).functions, 16).shape == (0, 4)
 
 
 @pytest.mark.usefixtures("poisoned_outputs")
@@ -391,7 +391,7 @@ def test_cells_of_unit_light_are_transfer_to_them(device):
     samples = cell_samples(even_samples(512), directions, device=device)
     numbers = wp.zeros(30, dtype=wp.int32, device=device)
     light = trace_cells(mesh, points, normals, numbers, samples).numpy()[:, 0]
-    expected = trace_transfer(mesh, points, normals, CellBasis(directions), 512).numpy()
+    expected = trace_transfer(mesh, points, normals, CellBasis(directions).functions, 512).numpy()
     assert np.abs(light - expected).max() < 1e-6
 
 
@@ -399,7 +399,7 @@ def test_past_no_mesh_nothing_is_traced(device):
     mesh, points, normals, _ = ball_over_points(device)
     samples, basis = sample_map(np.ones((16, 32, 3), np.float32), 2048), HarmonicBasis(2)
     assert np.abs(trace_shading(None, points, normals, samples).numpy() - 1).max() < ROUGH
-    transfer = trace_transfer(None, points, normals, basis, 4096).numpy()
+    transfer = trace_transfer(None, points, normals, basis.functions, 4096).numpy()
     assert np.abs(transfer @ [np.sqrt(4 * np.pi), 0, 0, 0] - 1).max() < 5e-3
     everything = trace(None, np.zeros((1, 1, 3)), np.array([[[0.0, 1, 0]]]), fibonacci(64), device)[0, 0]
     np.testing.assert_array_equal(everything, fibonacci(64)[:, 1] > 0)

@@ -359,7 +359,7 @@ class Lighting:
                     mesh,
                     points[instance],
                     normals[instance],
-                    self.basis,
+                    self.basis.functions,
                     self._scene.visibility.samples,
                     progress=self._progress,
                 )

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
-from warpshadow.device.parallel import launch_slices
+from warpshadow.device.launch import launch
 from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
@@ -172,14 +172,13 @@ def cover_energy(
     volumes = wp.empty(shape, dtype=wp.float32, device=device)
     by_volume = wp.empty(shape, dtype=wp.vec4, device=device)
     inputs = [mesh.mesh.id, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
-    outputs = [volumes, by_volume]
-    launch_slices(_outside_volume, dim=shape, cost=_QUERY_COST, inputs=inputs, outputs=outputs, device=device)
+    launch(_outside_volume, shape, inputs=inputs, outputs=[volumes, by_volume], cost=_QUERY_COST)
 
     gaps = wp.empty(len(points), dtype=wp.float32, device=device)
     nearest = wp.empty(len(points), dtype=wp.int32, device=device)
     by_gap = wp.empty(len(points), dtype=wp.vec4, device=device)
     inputs = [wp.array(points.astype(np.float32), dtype=wp.vec3, device=device), balls]
-    wp.launch(_bare_gaps, dim=len(points), inputs=inputs, outputs=[gaps, nearest, by_gap], device=device)
+    launch(_bare_gaps, len(points), inputs=inputs, outputs=[gaps, nearest, by_gap])
 
     bare = BARE * mesh.area / len(points)
     energy = volumes.numpy().sum(dtype=np.float64) + bare * gaps.numpy().sum(dtype=np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warpshadow.device.launch import launch
 from warpshadow.stages.normals import vertex_normals
 
 
@@ -83,5 +84,5 @@ class NormalizedMesh:
         distances = wp.empty(len(points), dtype=wp.float32, device=self.device)
         slopes = wp.empty(len(points), dtype=wp.vec3, device=self.device)
         inputs = [self.mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device=self.device)]
-        wp.launch(_signed_distances, len(points), inputs=inputs, outputs=[distances, slopes], device=self.device)
+        launch(_signed_distances, len(points), inputs=inputs, outputs=[distances, slopes])
         return distances.numpy().astype(np.float64), slopes.numpy().astype(np.float64)

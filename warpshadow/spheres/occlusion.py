@@ -4,6 +4,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.lanes import lane_type
+from warpshadow.device.launch import launch
 from warpshadow.stages.visibility.cones import BLEND, cone_function
 
 _cone = cone_function(1)
@@ -68,5 +69,5 @@ def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, r
     check.shape("radii", radii.shape, centers.shape)
     occlusion = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     inputs = [points, directions, centers, radii]
-    wp.launch(_exact_occlusion, dim=occlusion.shape, inputs=inputs, outputs=[occlusion], device=points.device)
+    launch(_exact_occlusion, occlusion.shape, inputs=inputs, outputs=[occlusion])
     return occlusion

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.lanes import lane_type
-from warpshadow.device.parallel import launch_slices
+from warpshadow.device.launch import launch
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.stages.visibility.cones import cone_function
@@ -265,14 +265,8 @@ class Refinement:
         self.directions = array(lanes, dtype=_Lane)
         visibility = wp.empty((len(points), self.DIRECTIONS), dtype=wp.uint8, device=self.device)
         rays = array(directions.astype(np.float32), dtype=wp.vec3)
-        launch_slices(
-            _trace_frames,
-            dim=visibility.shape,
-            cost=_RAY_COST,
-            inputs=[mesh.mesh.id, self.points, self.frames, rays],
-            outputs=[visibility],
-            device=self.device,
-        )
+        inputs = [mesh.mesh.id, self.points, self.frames, rays]
+        launch(_trace_frames, visibility.shape, inputs=inputs, outputs=[visibility], cost=_RAY_COST)
         self.visibility = visibility.numpy().astype(np.float32)
         self.metric = _light_metric(directions)
         # a camera in the open sees a receiver along the rays that escape, so its error counts as often
@@ -317,20 +311,17 @@ class Refinement:
             wp.empty(balls.shape[:2], dtype=wp.vec3, device=self.device),
         )
         inputs = [self.points, self.frames, view.chosen, view.balls, width]
-        outputs = [view.axes, view.edges]
-        wp.launch(_project_spheres, dim=balls.shape[:2], inputs=inputs, outputs=outputs, device=self.device)
+        launch(_project_spheres, balls.shape[:2], inputs=inputs, outputs=[view.axes, view.edges])
         return view
 
     def _see_through(self, view: _View) -> np.ndarray:
         transmittance = wp.empty((len(view.chosen), self.directions.shape[1]), dtype=_Lane, device=self.device)
-        inputs = [view.axes, view.edges, self.directions]
-        launch_slices(
+        launch(
             _transmit,
-            dim=transmittance.shape,
-            cost=_PAIR_COST * LANES * view.axes.shape[1],
-            inputs=inputs,
+            transmittance.shape,
+            inputs=[view.axes, view.edges, self.directions],
             outputs=[transmittance],
-            device=self.device,
+            cost=_PAIR_COST * LANES * view.axes.shape[1],
         )
         return transmittance.numpy().reshape(len(view.chosen), -1)
 
@@ -352,14 +343,8 @@ class Refinement:
         upstream = (by_transmittance * transmittance).astype(np.float32).reshape(len(chosen), -1, LANES)
         inputs = [view.axes, view.edges, self.directions, wp.array(upstream, dtype=_Lane, device=self.device)]
         by_view = [wp.empty_like(view.axes), wp.empty_like(view.edges)]
-        launch_slices(
-            _transmit_backward,
-            dim=view.axes.shape,
-            cost=_PAIR_COST * self.DIRECTIONS,
-            inputs=inputs,
-            outputs=by_view,
-            device=self.device,
-        )
+        cost = _PAIR_COST * self.DIRECTIONS
+        launch(_transmit_backward, view.axes.shape, inputs=inputs, outputs=by_view, cost=cost)
         # every receiver has its own copy of the spheres: sums in a fixed order give the same bits on every run
         by_balls = wp.zeros_like(view.balls)
         wp.launch(

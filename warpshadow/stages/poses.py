@@ -8,7 +8,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.stages.rotations import _check_orthonormal
+from warpshadow.stages.rotations import check_orthonormal
 
 # ---------------------------------------------------------------------------------------------- rigid bodies
 
@@ -71,7 +71,7 @@ class Poses:
         check.shape("translations", self.translations.shape, self.rotations.shape)
         check.shape("scales", self.scales.shape, self.rotations.shape)
         if not self.rotations.device.is_capturing:
-            _check_orthonormal(self.rotations.numpy().astype(np.float64))
+            check_orthonormal(self.rotations.numpy().astype(np.float64))
 
     def points(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Move points with their bodies.

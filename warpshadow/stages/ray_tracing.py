@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.basis import Basis
-from warpshadow.device.parallel import launch_slices, split_row
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.light_samples import CellSamples, LightSamples
 
@@ -127,14 +127,8 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
-    launch_slices(
-        _trace_visibility,
-        dim=(points.size, *directions.shape),
-        cost=_RAY_COST,
-        inputs=[_id(mesh), points, normals, directions],
-        outputs=[visibility],
-        device=points.device,
-    )
+    inputs = [_id(mesh), points, normals, directions]
+    launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=_RAY_COST)
     return visibility
 
 
@@ -191,27 +185,33 @@ def trace_shading(
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
     shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
-        launch_slices(
+        launch(
             _trace_shading,
-            dim=[part.stop - part.start],
-            cost=_RAY_COST * directions.shape[1],
+            part.stop - part.start,
             inputs=[_id(mesh), points[part], normals[part], directions, radiance],
             outputs=[shading[part]],
-            device=device,
+            cost=_RAY_COST * directions.shape[1],
         )
     return shading
 
 
 def trace_transfer(
-    mesh: wp.Mesh | None, points: wp.array, normals: wp.array, basis: Basis, count: int, *, progress: bool = False
+    mesh: wp.Mesh | None,
+    points: wp.array,
+    normals: wp.array,
+    functions: Callable[[np.ndarray], np.ndarray],
+    count: int,
+    *,
+    progress: bool = False,
 ) -> wp.array:
-    """Trace transfer vectors: light of the basis is then shadowed by the mesh itself, exactly but for sampling.
+    """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
 
     Args:
         mesh: What blocks the light, None for nothing.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
-        basis: What the light is expressed in.
+        functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
+            coefficient].
         count: Number of directions, evenly over the sphere.
         progress: Show a progress bar where it takes longer than a second.
 
@@ -222,17 +222,12 @@ def trace_transfer(
     """
     directions = fibonacci(-(-count // CHUNK) * CHUNK)
     towards = wp.array(directions, dtype=wp.vec3, device=points.device)
-    functions = (4 / len(directions) * basis.functions(directions)).astype(np.float32)
-    transfer = np.empty((points.shape[0], basis.size), np.float32)
+    values = (4 / len(directions) * functions(directions)).astype(np.float32)
+    transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
     for part in _parts(points.shape[0], 2**22 // len(directions), progress):
-        visibility = trace_visibility(
-            mesh,
-            points[part].reshape((1, -1)),
-            normals[part].reshape((1, -1)),
-            towards,
-        )
+        visibility = trace_visibility(mesh, points[part].reshape((1, -1)), normals[part].reshape((1, -1)), towards)
         cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
-        transfer[part] = (visibility.numpy()[0] * cosine) @ functions
+        transfer[part] = (visibility.numpy()[0] * cosine) @ values
     return wp.array(transfer, device=points.device)
 
 
@@ -294,13 +289,12 @@ def trace_cells(
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
     light = wp.zeros(shape, dtype=wp.float32, device=points.device)
     for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
-        launch_slices(
+        launch(
             _trace_cells,
-            dim=[part.stop - part.start],
-            cost=_RAY_COST * samples.directions.shape[1],
+            part.stop - part.start,
             inputs=[_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
             outputs=[light[part]],
-            device=points.device,
+            cost=_RAY_COST * samples.directions.shape[1],
         )
     return light
 

@@ -157,7 +157,7 @@ def _refuse(faults: np.ndarray, what: str) -> None:
         raise ValueError(f"parameters: got {int(faults.sum())} {what} (first at index {place}), expected rotations")
 
 
-def _check_orthonormal(matrices: np.ndarray) -> None:
+def check_orthonormal(matrices: np.ndarray) -> None:
     """Raise ValueError for matrices [batch, body, 3, 3] that scale, shear or mirror."""
     check.finite("rotations", matrices)
     products = np.swapaxes(matrices, -1, -2) @ matrices
