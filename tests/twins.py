@@ -382,3 +382,14 @@ def random_rotation(seed):
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
+
+
+def central_differences(function, values, step=1e-6):
+    """Gradient of a function of one array by each of its numbers."""
+    gradient = np.zeros_like(values)
+    for index in np.ndindex(values.shape):
+        ahead, behind = values.copy(), values.copy()
+        ahead[index] += step
+        behind[index] -= step
+        gradient[index] = (function(ahead) - function(behind)) / (2 * step)
+    return gradient

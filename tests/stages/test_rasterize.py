@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from twins import central_differences
 
 from warpshadow.assets.camera import Camera
 from warpshadow.stages import rasterize as raster
@@ -512,13 +513,3 @@ def test_gradients_flow_through_the_whole_pipeline_into_positions(device, verifi
     tape.backward(grads={image: wp.ones_like(image)})
     slide = positions.grad.numpy()[0, :, 0].sum()
     assert slide == pytest.approx(-3.0 * 64, rel=1e-4)
-
-
-def central_differences(function, values, step=1e-6):
-    gradient = np.zeros_like(values)
-    for index in np.ndindex(values.shape):
-        ahead, behind = values.copy(), values.copy()
-        ahead[index] += step
-        behind[index] -= step
-        gradient[index] = (function(ahead) - function(behind)) / (2 * step)
-    return gradient
