@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/installed
 .PHONY: demo test quick lint types install-check bench gpu clean
 
 demo: $(INSTALLED)
-	$(BIN)/python demos/bunny.py
+	$(BIN)/python demos/examples/bunny.py
 
 # a process a core; those of a file share its kernels
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile
@@ -20,11 +20,11 @@ quick: $(INSTALLED)
 	$(PYTEST) -m "not slow" --exitfirst
 
 bench: $(INSTALLED)
-	$(BIN)/python demos/benchmark.py
+	$(BIN)/python demos/benchmarks/benchmark.py
 
 # on a machine with an NVIDIA GPU: correctness, speed and floors beside the CPU's, in out/gpu
 gpu: $(INSTALLED)
-	$(BIN)/python demos/gpu_report.py
+	$(BIN)/python demos/benchmarks/gpu_report.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

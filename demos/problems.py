@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scenes import on_ground
 
 import warpshadow as ws
+from demos.scenes import on_ground
 from warpshadow import inverse
 
 SIZE = 128  # pixels across and down

@@ -4,9 +4,9 @@ import ast
 from pathlib import Path
 
 import pytest
-from cuda_kernels import FACTORIES, compile_ptx, file_modules, import_package
 
 import warpshadow
+from demos.tools.cuda_kernels import FACTORIES, compile_ptx, file_modules, import_package
 
 ARCHITECTURES = [75, 90]
 

@@ -1,6 +1,6 @@
 """Numerical stability: finite in, finite out, values and gradients; the twins' values in hard cases; clear refusals.
 
-The cases and their measurement are those of demos/stability.py, which prints the figures that these tests bound.
+Cases and measurement are those of demos/benchmarks/stability.py, which prints the figures that these tests bound.
 """
 
 import dataclasses
@@ -8,7 +8,6 @@ import warnings
 
 import numpy as np
 import pytest
-import stability
 import twins
 import warp as wp
 from hypothesis import given, settings
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import warpshadow as ws
+from demos.benchmarks import stability
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses

@@ -1,19 +1,24 @@
-"""The demos that are short loops of their own, at a size at which they take no time."""
+"""Every demo says what it does; those that are short loops of their own run, at a size at which they take no time."""
 
 import dataclasses
+import runpy
+import subprocess
+import sys
+from pathlib import Path
 
-import gradients
 import numpy as np
 import pytest
-import shadow_gradient
 import torch
 import warp as wp
-import warp_loop
-from benchmark import bunny_scene
-from scenes import on_ground
 
 import warpshadow as ws
+from demos.benchmarks import gradients
+from demos.benchmarks.benchmark import bunny_scene
+from demos.examples import shadow_gradient, warp_loop
+from demos.scenes import on_ground
 
+DEMOS = Path(__file__).parents[2] / "demos"
+SCRIPTS = [path for path in sorted(DEMOS.glob("*/*.py")) if 'if __name__ == "__main__"' in path.read_text()]
 SPHERES = ws.Spheres([(0.2, 0, 0), (-0.2, 0.1, 0), (0, 0.2, 0.2)], [0.3, 0.25, 0.2])
 
 
@@ -66,3 +71,20 @@ def test_the_pictures_of_the_demos_are_drawn(tmp_path):
     shadow_gradient.plot(image.numpy()[0], derivatives, 0.9 * derivatives, tmp_path / "gradient.png")
     for name in ("loop.png", "gradient.png"):
         assert np.ptp(ws.read_image(tmp_path / name)[..., :3]) > 0.1
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_every_demo_says_what_it_does_and_takes(script, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [str(script), "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"demos/{script.parent.name}/{script.name}" in printed  # the docstring, which has the command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["examples", "benchmarks", "tools"])
+def test_a_demo_starts_by_its_path_from_any_folder(folder, tmp_path):
+    script = next(path for path in SCRIPTS if path.parent.name == folder)
+    subprocess.run([sys.executable, script, "--help"], check=True, cwd=tmp_path, stdout=subprocess.DEVNULL)

@@ -3,13 +3,13 @@
 import dataclasses
 import json
 
-import error_vs_time
 import numpy as np
 import pytest
-from error_vs_time import Measured, time_at_error
-from scenes import image_error
 
 import warpshadow as ws
+from demos.benchmarks import error_vs_time
+from demos.benchmarks.error_vs_time import Measured, time_at_error
+from demos.scenes import image_error
 
 # Of shading by 4096 rays against that by the methods' integrals over light.
 RAY_NOISE = 0.01

@@ -2,10 +2,11 @@
 
 import json
 
-import gpu_report
 import numpy as np
 import pytest
 import warp as wp
+
+from demos.benchmarks import gpu_report
 
 REPORT = {
     "device": "a device",

@@ -1,13 +1,13 @@
 """The floor under an iteration's time: its arithmetic, what visibility needs, and that no launch is forgotten."""
 
-import kernel_floor
 import numpy as np
 import pytest
 import warp as wp
-import warp_loop
-from kernel_floor import Size, Work
 
 import warpshadow as ws
+from demos.examples import warp_loop
+from demos.tools import kernel_floor
+from demos.tools.kernel_floor import Size, Work
 from warpshadow.device.cuda_graph import with_gradients
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import views

@@ -1,9 +1,10 @@
 """The kernel report: what it reads of ptxas, and how many threads fit."""
 
-import kernel_report
 import pytest
 import warp as wp
-from kernel_report import Resources
+
+from demos.tools import kernel_report
+from demos.tools.kernel_report import Resources
 
 REPORT = """\
 ptxas info    : 154 bytes gmem

@@ -2,37 +2,19 @@
 
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import warpshadow as ws
+from demos import problems
+from demos.benchmarks import paper_tables as tables
 from warpshadow import inverse
 
-DEMOS = Path(__file__).parents[2] / "demos"
-
 
 @pytest.fixture
-def demos(monkeypatch):
-    """The modules problems and paper_tables; what they do to torch's threads is undone."""
-    monkeypatch.syspath_prepend(str(DEMOS))
-    threads = torch.get_num_threads()
-    import paper_tables
-    import problems
-
-    yield problems, paper_tables
-    torch.set_num_threads(threads)
-    for name in ("problems", "paper_tables", "scenes"):
-        sys.modules.pop(name, None)
-
-
-@pytest.fixture
-def ball_case(demos):
+def ball_case():
     """A ball with known spheres on a ground, from its side by a fifth of its size, and what measures it."""
-    problems, _ = demos
     ball = ws.Body(ws.icosphere(0.5, 2), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 0.5, 0))
     camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(16, 16))
     truth = ws.Scene((ball, ws.Body(ws.plane(4, 8))), ws.synthetic_sky(height=32), camera)
@@ -42,8 +24,7 @@ def ball_case(demos):
     return problems.Case(problem, truth, stages, lambda s: problems.pose_errors(s.bodies[0], truth.bodies[0]))
 
 
-def test_a_displaced_body_is_turned_about_its_middle_and_shifted_as_far_as_it_says(demos):
-    problems, _ = demos
+def test_a_displaced_body_is_turned_about_its_middle_and_shifted_as_far_as_it_says():
     body = ws.Body(ws.icosphere(1.0, 1), rotation=(0, 50, 0), translation=(3, 1, -2), scale=2.0)
     diagonal = np.linalg.norm(np.subtract(*body.world_mesh().bounds))
     for seed in range(20):
@@ -55,8 +36,7 @@ def test_a_displaced_body_is_turned_about_its_middle_and_shifted_as_far_as_it_sa
         assert 0.05 - 0.02 < shift < 0.25 + 0.02  # the box turns, too
 
 
-def test_errors_of_a_body_where_it_belongs_are_none_and_a_shift_is_its_part_of_the_diagonal(demos):
-    problems, _ = demos
+def test_errors_of_a_body_where_it_belongs_are_none_and_a_shift_is_its_part_of_the_diagonal():
     body = ws.Body(ws.icosphere(1.0, 2), rotation=(10, 20, 30))
     low, high = body.world_mesh().bounds
     shifted = dataclasses.replace(body, translation=(0, 0.1 * np.linalg.norm(high - low), 0))
@@ -66,8 +46,7 @@ def test_errors_of_a_body_where_it_belongs_are_none_and_a_shift_is_its_part_of_t
     assert errors["TE"] == pytest.approx(np.sum(np.square(shifted.translation)))
 
 
-def test_bending_moves_the_top_far_and_the_foot_little(demos):
-    problems, _ = demos
+def test_bending_moves_the_top_far_and_the_foot_little():
     mesh = ws.icosphere(1.0, 3)
     for seed in range(5):
         bent = problems.bent(mesh, seed)
@@ -78,8 +57,7 @@ def test_bending_moves_the_top_far_and_the_foot_little(demos):
 
 
 @pytest.mark.slow
-def test_a_fit_is_measured_and_one_that_fails_is_listed(demos, ball_case):
-    problems, tables = demos
+def test_a_fit_is_measured_and_one_that_fails_is_listed(ball_case):
     figures = tables.solve(ball_case, "directional", None)
     assert figures["iterations"] == 30 and figures["reason"] == "finished" and figures["ms"] > 0
     assert figures["TE"] < 0.1 * ball_case.measure(ball_case.problem.scene)["TE"]  # how a ball is turned, none can tell
@@ -93,8 +71,7 @@ def test_a_fit_is_measured_and_one_that_fails_is_listed(demos, ball_case):
     assert "stages[0]" in tables.solve(broken, "directional", None)["error"]
 
 
-def test_results_are_kept_at_once_and_with_those_of_other_processes(demos, tmp_path):
-    _, tables = demos
+def test_results_are_kept_at_once_and_with_those_of_other_processes(tmp_path):
     path = tmp_path / "results.json"
     first, second = tables.Results(path), tables.Results(path)
     first.add("a", {"x": 1.0})
@@ -104,8 +81,7 @@ def test_results_are_kept_at_once_and_with_those_of_other_processes(demos, tmp_p
     assert [file.name for file in tmp_path.iterdir()] == ["results.json"]
 
 
-def test_a_case_by_another_method_traces_no_rays(demos, ball_case):
-    problems, _ = demos
+def test_a_case_by_another_method_traces_no_rays(ball_case):
     direct = ball_case.by(problems.DIRECT)
     assert direct.still is None and direct.scene.visibility.method == "none"
     assert ball_case.by(None) is ball_case.problem

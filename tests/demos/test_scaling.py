@@ -4,10 +4,10 @@ import sys
 
 import numpy as np
 import pytest
-import scaling
 import torch
 
 import warpshadow as ws
+from demos.benchmarks import scaling
 
 
 def test_exponents_are_those_of_a_power_law_and_the_last_one_of_the_last_two_points():

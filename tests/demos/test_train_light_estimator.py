@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import train_light_estimator as demo
 
 import warpshadow as ws
+from demos.examples import train_light_estimator as demo
 from warpshadow.inverse import checkpoint
 from warpshadow.maths import sh
 from warpshadow.scene.random_scenes import RandomScenes
@@ -178,7 +178,7 @@ demo.part(team)
 def test_two_processes_learn_the_same_as_one_and_resume_together(lessons, tmp_path):
     """A batch of all scenes has the same gradient wherever its halves are computed, up to rounding."""
     program = tmp_path / "program.py"
-    program.write_text(TWO_PROCESSES.format(paths=[str(Path(demo.__file__).parent), str(Path(__file__).parents[1])]))
+    program.write_text(TWO_PROCESSES.format(paths=[str(Path(__file__).parents[2]), str(Path(__file__).parent)]))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", program, tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-import warp_loop
 
 import warpshadow as ws
+from demos.examples import warp_loop
 from warpshadow.assets.basis import CellBasis
 from warpshadow.device import cuda_graph
 from warpshadow.device.cuda_graph import Captured, with_gradients

@@ -6,7 +6,7 @@ vector register has floats on a CPU, 1 on a GPU, where threads play that part. A
 only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
 
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmark.py --lanes`` times what else could be chosen.
+are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times what else could be chosen.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """The main job, on meshes that ship with Warp: soft shadows by every method, then the light recovered from an image.
 
-    make demo        or        python demos/bunny.py --output out
+    make demo        or        python demos/examples/bunny.py --output out
 
 A bunny stands on a textured ground under an HDR sky with a sun. It is rendered without shadows, with each method,
 and ray traced. Then the light is forgotten and recovered from the ray-traced image, once by a renderer with shadows
@@ -9,15 +9,17 @@ and once by one without (direct illumination), and both estimates relight a bear
 
 import argparse
 import dataclasses
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from scenes import image_error, on_ground, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.assets.image import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 

@@ -1,7 +1,7 @@
 """What a GPU has for each kernel of the package: registers, spills, shared memory, and how many threads fit at once.
 
     pip install nvidia-cuda-nvcc
-    python demos/kernel_report.py [--architecture 90] [--block 256]
+    python demos/tools/kernel_report.py [--architecture 90] [--block 256]
 
 It takes no GPU: Warp compiles each kernel to PTX, and ptxas, the assembler of that package, says what it takes. The
 *occupancy* is the part of the threads that a streaming multiprocessor can hold which it holds of this kernel alone:
@@ -14,15 +14,17 @@ import importlib.metadata
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import warp as wp
-from cuda_kernels import FACTORIES, compile_ptx, file_modules
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.tools.cuda_kernels import FACTORIES, compile_ptx, file_modules
 
 WARP = 32
 

@@ -1,7 +1,8 @@
 """The paper's tables on open scenes: texture, light, pose and geometry from one image, by each method.
 
-    python demos/paper_tables.py [--data FOLDER] [--scenes 10] [--iterations N] [--problems texture light pose geometry]
-    python demos/paper_tables.py --ablation
+    python demos/benchmarks/paper_tables.py [--data FOLDER] [--scenes 10] [--iterations N]
+                                            [--problems texture light pose geometry]
+    python demos/benchmarks/paper_tables.py --ablation
 
 Ten scenes: a body of 2 units on a ground of 6, 128 × 128 pixels (texture: 256 × 256), targets ray traced with 2048
 directions. With ``--data`` the meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder take part,
@@ -16,7 +17,7 @@ pose       MDE, mean distance of vertices to where they belong [% of the boundin
 geometry   MDE of a body that was bent, twisted and stretched
 
 Where geometry stands still, "ray traced" is what a fit does by default. ``--ablation`` repeats the pose for 50 to 200
-spheres and 16 to 64 coefficients of log-SH. Mitsuba 3 takes part where it is installed (demos/mitsuba_fits.py).
+spheres and 16 to 64 coefficients of log-SH. Mitsuba 3 takes part where it is installed (mitsuba_fits.py).
 """
 
 import argparse
@@ -25,6 +26,7 @@ import importlib.util
 import itertools
 import json
 import os
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -32,12 +34,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import problems
 import torch
-from problems import Case
-from scenes import shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos import problems
+from demos.problems import Case
+from demos.scenes import shipped_mesh
 from warpshadow import inverse
 
 COLUMNS: dict[str, ws.Visibility | None] = {
@@ -118,7 +121,7 @@ def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         if column == MITSUBA:
-            from mitsuba_fits import fit_by_mitsuba
+            from demos.benchmarks.mitsuba_fits import fit_by_mitsuba
 
             scene, seconds, count, reason = fit_by_mitsuba(case, iterations)
         else:

@@ -1,6 +1,6 @@
 """A shadow seen alone moves what casts it: derivatives of each pixel by the adjoint against finite differences.
 
-    python demos/shadow_gradient.py [--output out] [--size 48]
+    python demos/examples/shadow_gradient.py [--output out] [--size 48]
 
 The camera sees nothing but a patch of ground, and on it the shadow of a bunny that is out of view, under a sun. Every
 pixel's derivatives with respect to the bunny's x, z and scale come from one backward pass for each pixel, and are laid
@@ -10,14 +10,16 @@ its edge; so the bunny is turned until its shadow is about as wide as long.)
 """
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
-from scenes import shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import shipped_mesh
 from warpshadow.assets.image import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 

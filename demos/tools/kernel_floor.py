@@ -1,6 +1,6 @@
 """The least time that an iteration of the bunny scene can take on an H200: operations and bytes of each stage.
 
-    python demos/kernel_floor.py [--batch 1 100]
+    python demos/tools/kernel_floor.py [--batch 1 100]
 
 No GPU is asked: this is arithmetic. A stage takes no less than its operations at the card's peak, its bytes at the
 bandwidth of its memory, whichever is longer, and its launches within a graph:
@@ -17,12 +17,15 @@ but not the search for them. Log-SH of order 8 is shown beside it.
 """
 
 import argparse
+import sys
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scenes import bunny_scene
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import bunny_scene
 from warpshadow.maths.directions import edge_width, fibonacci
 from warpshadow.stages.normals import vertex_normals
 

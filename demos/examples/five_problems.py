@@ -1,6 +1,6 @@
 """The five inverse problems of the paper on meshes that ship with Warp, each with a picture.
 
-    python demos/five_problems.py [texture] [light] [pose] [deformation] [shadow] [--output out]
+    python demos/examples/five_problems.py [texture] [light] [pose] [deformation] [shadow] [--output out]
 
 texture      of the ground under a bunny; and in the shadow of a bunny that the camera does not see
 light        on a bunny, which then lights a bear
@@ -13,18 +13,20 @@ Each is solved with shadows and without (direct illumination), and its figures a
 
 import argparse
 import dataclasses
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import problems
 import torch
-from bunny import contact_sheet
-from problems import Case
-from scenes import shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos import problems
+from demos.examples.bunny import contact_sheet
+from demos.problems import Case
+from demos.scenes import shipped_mesh
 from warpshadow import inverse
 
 PIXELS = 256  # of a picture, across and down

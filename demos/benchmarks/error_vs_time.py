@@ -1,6 +1,6 @@
 """What each millisecond buys: error against the time of an image, for all settings and for a path tracer.
 
-    python demos/error_vs_time.py [--data FOLDER] [--output FOLDER] [--quick]
+    python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--quick]
 
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
@@ -22,6 +22,7 @@ import dataclasses
 import importlib.util
 import itertools
 import json
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,9 +30,10 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
-from scenes import image_error, on_ground, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.spheres import exact_occlusion
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.ray_tracing import trace_visibility
@@ -313,7 +315,8 @@ def time_again(measured: list[Measured], draws: Sequence[Callable[[], object]], 
 def paths_of(scene: ws.Scene) -> Callable[..., np.ndarray]:
     """Make the function that renders an image of direct light in Mitsuba, [height, width, 3]."""
     import mitsuba as mi
-    from mitsuba_fits import RayTracer
+
+    from demos.benchmarks.mitsuba_fits import RayTracer
 
     tracer = RayTracer(scene, {"type": "direct"})
     return lambda samples, seed: np.array(mi.render(tracer.scene, spp=samples, seed=seed))
@@ -463,7 +466,7 @@ def plot(results: dict[str, dict], path: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
-    parser.add_argument("--output", type=Path, default=Path("demos"), help="folder for the JSON and the picture")
+    parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the JSON and the picture")
     parser.add_argument("--runs", type=int, default=5, help="timed calls of each setting")
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
     arguments = parser.parse_args()

@@ -1,8 +1,7 @@
 """Time the stages of rendering the bunny scene, and how long their kernels take to compile.
 
-    make bench       or        python demos/benchmark.py [--compile]
-    python demos/benchmark.py --lanes    other numbers of lanes, and widths of registers, than those that are chosen
-    python demos/benchmark.py --busy     README's loop in torch beside processes that compute
+    make bench       or        python demos/benchmarks/benchmark.py [--compile]
+    python demos/benchmarks/benchmark.py --busy     README's loop in torch beside processes that compute
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
@@ -20,13 +19,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import torch
 import warp as wp
-from lane_choice import compare, cpu_text
-from scenes import bunny_scene
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.benchmarks.lane_choice import cpu_text
+from demos.scenes import bunny_scene
 from warpshadow import inverse
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths.directions import fibonacci
@@ -291,11 +292,8 @@ if __name__ == "__main__":
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
     parser.add_argument("--runs", type=int, default=15, help="timed runs of each row")
     parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
-    parser.add_argument("--lanes", action="store_true", help="compare lanes; exit 1 if the choice is 15%% too slow")
     parser.add_argument("--busy", action="store_true", help="time README's loop in torch beside other processes")
     arguments = parser.parse_args()
-    if arguments.lanes:
-        sys.exit(0 if compare() else 1)
     if arguments.busy:
         time_busy(arguments.runs)
         sys.exit()

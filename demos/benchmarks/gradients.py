@@ -1,6 +1,6 @@
 """Compare gradients of the bunny scene's image with central differences of it, for images of several sizes.
 
-    python demos/gradients.py [--sizes 32 64 128 256] [--methods directional log-sh none] [--losses 5]
+    python demos/benchmarks/gradients.py [--sizes 32 64 128 256] [--methods directional log-sh none] [--losses 5]
 
 The losses are sums of the image weighted with a few random waves; the parameters the pose of the bunny (turn, shift)
 and that of the camera. The error is the relative L2 of the gradient over all losses and parameters, against differences
@@ -12,13 +12,16 @@ the ground with the bunny out of view.
 
 import argparse
 import dataclasses
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
-from scenes import bunny_scene
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import bunny_scene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 FINE = 1280

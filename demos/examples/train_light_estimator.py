@@ -1,7 +1,7 @@
 """A small network that tells the light from one image, taught by the renderer alone, with shadows and without.
 
-    python demos/train_light_estimator.py [--scenes 1024] [--epochs 40] [--resume]
-    torchrun --nproc_per_node=2 demos/train_light_estimator.py
+    python demos/examples/train_light_estimator.py [--scenes 1024] [--epochs 40] [--resume]
+    torchrun --nproc_per_node=2 demos/examples/train_light_estimator.py
 
 The network sees a ray-traced image of a random scene, its known reflectance divided out, and predicts the light in
 spherical harmonics. Nobody tells it the light: the scene, whose geometry is known, too, is drawn again in the predicted
@@ -18,6 +18,7 @@ import functools
 import itertools
 import math
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,13 +26,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from bunny import contact_sheet
-from scenes import image_error, on_ground, shipped_mesh
 from torch import distributed, nn
 from torch.utils.data.distributed import DistributedSampler
 from tqdm import tqdm
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.examples.bunny import contact_sheet
+from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.inverse import checkpoint
 from warpshadow.maths import sh
 from warpshadow.scene.random_scenes import RandomScenes, primitives

@@ -1,6 +1,6 @@
 """From a photograph: pose, exposure and reflectance, found by two fit files and nothing else.
 
-    python demos/photograph.py --output out
+    python demos/examples/photograph.py --output out
 
 No photograph ships with the package, so one is taken of a ray-traced scene, as cameras take them: a bunny on a tiled
 ground under a sky with a sun, and a gray card; at an exposure that nobody notes, through a lens that blurs, with the
@@ -17,19 +17,21 @@ illumination, which tells what shadows are worth. Each has a folder, with the fi
 
 import argparse
 import dataclasses
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from bunny import checkers, contact_sheet
 from PIL import Image
-from problems import DIRECT, changed, displaced, placement, pose_errors, ray_traced
-from scenes import image_error, on_ground, shipped_mesh
 from scipy import ndimage
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.examples.bunny import checkers, contact_sheet
+from demos.problems import DIRECT, changed, displaced, placement, pose_errors, ray_traced
+from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow import inverse
 from warpshadow.assets.image import linear_to_srgb, srgb_to_linear
 from warpshadow.inverse.fit_file import load_fit

@@ -1,6 +1,6 @@
 """How wrong each method is: images of several meshes under several skies, against the ray-traced reference.
 
-    python demos/accuracy.py [--data FOLDER] [--spheres 64]
+    python demos/benchmarks/accuracy.py [--data FOLDER] [--spheres 64]
 
 Without ``--data`` the meshes are those that ship with Warp and a few shapes, under synthetic skies. ``--data`` adds the
 meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder. Each scene is a body of 2 units on a ground of
@@ -9,14 +9,16 @@ meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder. Each s
 
 import argparse
 import dataclasses
+import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from scenes import image_error, on_ground, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import image_error, on_ground, shipped_mesh
 
 METHODS = {
     "none": ws.Visibility(method="none"),

@@ -1,12 +1,13 @@
 """How far the stages can be trusted: hard cases against float64 twins, and where the methods themselves break down.
 
-    python demos/stability.py
+    python demos/benchmarks/stability.py [--output out]
 
-prints tables and writes out/stability.png. A row is a case and a method: the largest error of a value against the
+It prints tables and draws OUTPUT/stability.png. A row is a case and a method: the largest error of a value against the
 float64 twin, the relative error of gradients along random displacements against central differences of the twin, and
 whether all of them are finite. ``tests/test_stability.py`` asserts the same.
 """
 
+import argparse
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 import warp as wp
 from warp.optim import Adam
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
 import twins
 
 import warpshadow as ws
@@ -413,11 +414,11 @@ def plot(overlap: dict[str, list[float]], thresholds: dict[str, list[float]], pa
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.legend()
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
 
 
-def main() -> None:
+def main(output: Path) -> None:
     ws.quiet()
     warnings.filterwarnings(
         "ignore", message="log-SH visibility"
@@ -449,10 +450,12 @@ def main() -> None:
 
     overlap, thresholds = overlap_errors(), threshold_errors()
     print_breakdown(overlap, thresholds)
-    path = Path("out") / "stability.png"
+    path = output / "stability.png"
     plot(overlap, thresholds, path)
     print(f"\nwrote {path}")
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the picture")
+    main(parser.parse_args().output)

@@ -1,7 +1,7 @@
 """How time grows with vertices, spheres, pixels, bodies and instances of a batch, and what memory each size takes.
 
-    python demos/scaling.py [--curves vertices spheres pixels bodies batch] [--most 1000000] [--runs 5] [--output demos]
-    python demos/scaling.py --million
+    python demos/benchmarks/scaling.py [--curves vertices spheres pixels bodies batch] [--most 1000000] [--runs 5]
+    python demos/benchmarks/scaling.py --million
 
 Sizes take turns, and figures are medians, so that a slow moment of the machine strikes all alike. The exponent p of
 time ∝ size^p is printed as fitted to all sizes and between the last two, where the costs that do not grow are small
@@ -33,9 +33,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from scenes import bunny_scene, on_ground, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import bunny_scene, on_ground, shipped_mesh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.spheres import fit_spheres
@@ -280,7 +281,7 @@ if __name__ == "__main__":
     parser.add_argument("--curves", nargs="+", choices=CURVES, default=list(CURVES), help="what is to grow")
     parser.add_argument("--most", type=int, default=10**7, help="largest size of any curve")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each point")
-    parser.add_argument("--output", type=Path, default=Path("demos"), help="folder of the picture")
+    parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the picture")
     parser.add_argument("--million", action="store_true", help="a million vertices instead")
     arguments = parser.parse_args()
     ws.quiet()

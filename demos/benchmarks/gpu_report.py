@@ -1,6 +1,6 @@
 """What a GPU computes and how fast, beside this machine's CPU: one table to paste, and the same as JSON.
 
-    make gpu      or      python demos/gpu_report.py [--devices cuda:0] [--folder out/gpu]
+    make gpu      or      python demos/benchmarks/gpu_report.py [--devices cuda:0] [--folder out/gpu]
 
 For each device, in this order, so that what takes longest comes last:
 
@@ -24,16 +24,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-import benchmark
-import kernel_floor
 import numpy as np
 import torch
 import warp as wp
-from lane_choice import cpu_text
-from scenes import bunny_scene
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.benchmarks import benchmark
+from demos.benchmarks.lane_choice import cpu_text
+from demos.scenes import bunny_scene
+from demos.tools import kernel_floor
 from warpshadow.torch import TorchRenderer, rotation_matrices
+
+ROOT = Path(__file__).parents[2]
 
 AGREEMENT = 1e-4
 """Largest relative L2 difference between devices that is taken for rounding."""
@@ -154,11 +157,11 @@ def sanitize(device: str, seconds: float) -> str:
     tool = shutil.which("compute-sanitizer")
     if tool is None or not device.startswith("cuda"):
         return "left out: " + ("compute-sanitizer is not on the path" if tool is None else "not a CUDA device")
-    script = f"import gpu_report; [gpu_report.image_and_gradients(gpu_report.small_scene(m, 'vertex'), {device!r})"
+    script = f"from demos.benchmarks.gpu_report import *; [image_and_gradients(small_scene(m, 'vertex'), {device!r})"
     script += " for m in ('directional', 'log-sh', 'ray-traced')]"
     command = [tool, "--error-exitcode", "9", sys.executable, "-c", script]
     try:
-        run = subprocess.run(command, cwd=Path(__file__).parent, timeout=seconds, capture_output=True, text=True)
+        run = subprocess.run(command, cwd=ROOT, timeout=seconds, capture_output=True, text=True)
     except subprocess.TimeoutExpired:
         return f"left out: not done after {seconds:.0f} s"
     if run.returncode:
@@ -206,7 +209,7 @@ def run_tests(device: str, seconds: float, folder: Path) -> dict[str, int | list
     report = folder / f"tests_{device.replace(':', '_')}.xml"
     command = [sys.executable, "-m", "pytest", "--devices", device, "--seconds", str(int(seconds))]
     command += ["-p", "no:cacheprovider", f"--junitxml={report}"]
-    run = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if not report.exists():
         return {"passed": 0, "failed": [f"pytest: {(run.stdout + run.stderr)[-600:]}"], "skipped": 0, "not reached": 0}
     cases = list(ElementTree.parse(report).iter("testcase"))

@@ -1,6 +1,6 @@
 """A loop in pure Warp: the pose of a bunny on a ground, recovered from one image of it and its shadow with Adam.
 
-    python demos/warp_loop.py [--output out] [--iterations 60] [--device cpu]
+    python demos/examples/warp_loop.py [--output out] [--iterations 60] [--device cpu]
 
 Nothing here is torch. The bunny is turned by 15° and shifted by 0.2 units, and its image is the target. From where it
 stood, ``wp.optim.Adam`` descends along the gradient that ``wp.Tape`` finds of the squared difference of the images, in
@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import math
 import statistics
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,9 +19,10 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 import warp.optim
-from scenes import on_ground, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.scenes import on_ground, shipped_mesh
 from warpshadow.assets.image import linear_to_srgb
 from warpshadow.device.batch import concatenate
 from warpshadow.stages.poses import Poses

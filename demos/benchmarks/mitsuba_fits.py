@@ -1,6 +1,6 @@
-"""The problems of the paper's tables by differentiable ray tracing, in Mitsuba 3: a column of demos/paper_tables.py.
+"""The problems of the paper's tables by differentiable ray tracing, in Mitsuba 3: a column of paper_tables.py.
 
-    python demos/mitsuba_fits.py [--iterations N] [--problems texture light pose geometry]
+    python demos/benchmarks/mitsuba_fits.py [--iterations N] [--problems texture light pose geometry]
 
 It stands where the paper has Redner: single bounce, 64 samples a pixel, one descent by the same optimizer, loss and
 parameters as our own fit, at the full size of the image. Texture and light are differentiated through the paths; poses
@@ -14,19 +14,22 @@ newer. Where it does not find that, DRJIT_LIBLLVM_PATH names the library.
 import argparse
 import math
 import statistics
+import sys
 import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import problems
 import torch
-from problems import Case
-from scenes import image_error, shipped_mesh
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos import problems
+from demos.problems import Case
+from demos.scenes import image_error, shipped_mesh
 from warpshadow import inverse
 from warpshadow.inverse.target import stacked
 
