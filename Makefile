@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test quick lint types install-check bench gpu clean
+.PHONY: demo test quick lint types docs install-check bench gpu clean
 
 demo: $(INSTALLED)
 	$(BIN)/python demos/examples/bunny.py
@@ -33,6 +33,10 @@ lint: $(INSTALLED)
 
 types: $(INSTALLED)
 	$(BIN)/mypy
+
+# the API reference, from the docstrings, in out/docs
+docs: $(INSTALLED)
+	$(BIN)/python demos/tools/api_reference.py
 
 # what README tells others to do, in an environment of its own
 install-check:
