@@ -1,9 +1,10 @@
 """Argument checks: one clear error that names the argument, what it got and what it accepts."""
 
+import contextlib
 import difflib
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeGuard
 
@@ -14,6 +15,15 @@ LARGEST = 1.0e18
 """The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
 
 _LONGEST = 60  # characters of a value that messages quote
+
+
+class _Nothing:
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+NOTHING = _Nothing()
+"""Given for what is missing, so that the check of an argument says what it expects."""
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -35,7 +45,21 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
             )
 
 
-def is_number(value: object) -> bool:
+@contextlib.contextmanager
+def located(where: str, error: type[ValueError] = ValueError) -> Iterator[None]:
+    """Begin the message of a mistake with where it is, and raise it as ``error``, or as FileNotFoundError if it is one.
+
+    Nested, the message goes from the file to the table in it. "got nothing", of NOTHING, becomes "missing".
+    """
+    try:
+        yield
+    except FileNotFoundError as cause:
+        raise FileNotFoundError(f"{where}: {cause}") from cause
+    except (ValueError, TypeError) as cause:
+        raise error(f"{where}: {cause}".replace(f"got {NOTHING!r},", "missing,")) from cause
+
+
+def is_number(value: object) -> TypeGuard[float]:
     """Whether a value is a finite number, Python's or NumPy's."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         return False
@@ -45,7 +69,7 @@ def is_number(value: object) -> bool:
         return False
 
 
-def is_integer(value: object) -> bool:
+def is_integer(value: object) -> TypeGuard[int]:
     """Whether a value is a whole number, Python's or NumPy's, and of an integer type."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
@@ -138,31 +162,69 @@ def numbers(
         raise error(f"{name}: got {described(values)}, expected {expected}") from cause
     except TypeError as cause:  # a tensor on a GPU, or of a type that NumPy has not
         raise error(f"{name}: got {described(values)}, expected {expected} ({cause})") from cause
-    if found.dtype.kind not in "iuf":
+    if found.dtype.kind not in "iuf" or _holds_truth(values):
         raise error(f"{name}: got {described(values)}, expected {expected}")
     with np.errstate(over="ignore"):
         return np.array(found, dtype, order="C")
 
 
-def positive(name: str, value: float) -> float:
+def _holds_truth(values: object) -> bool:
+    """Whether True or False is among numbers, which NumPy would take for 1 and 0."""
+    return isinstance(values, (list, tuple)) and any(isinstance(v, bool) or _holds_truth(v) for v in values)
+
+
+def number(name: str, value: object) -> float:
+    """Return a finite number as a float, or raise ValueError."""
+    if not is_number(value):
+        raise ValueError(f"{name}: got {described(value)}, expected a finite number")
+    return float(value)
+
+
+def array(name: str, values: object, shape_: tuple[int, ...], meaning: str = "") -> np.ndarray:
+    """Copy finite numbers of a shape to a read-only array of float64; a message ends with what they mean."""
+    rows = "".join(f"{length} rows of " for length in shape_[:-1])
+    meaning = meaning or f"{rows}{shape_[-1]} finite numbers"
+    copied = numbers(name, values, expected=meaning, dtype=np.float64)
+    shape(name, copied.shape, shape_, meaning)
+    finite(name, copied)
+    copied.setflags(write=False)
+    return copied
+
+
+def positive(name: str, value: object) -> float:
     """Return a positive number as a float, or raise ValueError."""
     if not (is_number(value) and 0.0 < value <= LARGEST):
         raise ValueError(f"{name}: got {described(value)}, expected a positive number up to {LARGEST:g}")
     return float(value)
 
 
-def pixel_count(name: str, value: int) -> int:
-    """Return a positive number of pixels, or raise ValueError."""
-    if not is_integer(value) or value < 1:
-        raise ValueError(f"{name}: got {value!r}, expected a positive whole number of pixels")
+def nonnegative(name: str, value: object) -> float:
+    """Return a number of 0 or more as a float, or raise ValueError."""
+    if not (is_number(value) and value >= 0.0):
+        raise ValueError(f"{name}: got {described(value)}, expected a number of 0 or more")
+    return float(value)
+
+
+def whole(name: str, value: object, *, least: int = 1, what: str = "") -> int:
+    """Return a whole number, maybe of something, as an int, or raise ValueError."""
+    if not is_integer(value) or value < least:
+        of = f"{what}, " if what else ""
+        raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of}at least {least}")
     return int(value)
 
 
-def image_size(size: tuple[int, int]) -> tuple[int, int]:
+def flag(name: str, value: object) -> bool:
+    """Return a truth value, or raise ValueError."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name}: got {described(value)}, expected true or false")
+    return bool(value)
+
+
+def image_size(size: object) -> tuple[int, int]:
     """Return width and height [pixels], or raise ValueError."""
     if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
         raise ValueError(f"size: got {described(size)}, expected width and height [pixels], such as (640, 480)")
-    return pixel_count("size (width)", size[0]), pixel_count("size (height)", size[1])
+    return whole("size (width)", size[0], what="pixels"), whole("size (height)", size[1], what="pixels")
 
 
 def pixels(name: str, values: object, *, expected: str, error: type[ValueError] = ValueError) -> np.ndarray:
@@ -196,7 +258,7 @@ def described(value: object) -> str:
         dtype = getattr(value.dtype, "__name__", value.dtype)
         return f"{type(value).__name__} of {dtype} and shape {tuple(value.shape)}"
     text = repr(value)
-    if value is None or isinstance(value, (str, bytes, int, float, complex, np.number)):
+    if value is None or isinstance(value, (str, bytes, int, float, complex, np.number, _Nothing)):
         return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
     if isinstance(value, (list, tuple, dict)):
         return text if len(text) <= _LONGEST else f"{type(value).__name__} of {len(value)} items"

@@ -52,9 +52,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, shape in (("intrinsics", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
-            object.__setattr__(self, name, _array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, check.array(name, getattr(self, name), shape))
         for name in ("width", "height"):
-            object.__setattr__(self, name, check.pixel_count(name, getattr(self, name)))
+            object.__setattr__(self, name, check.whole(name, getattr(self, name), what="pixels"))
         object.__setattr__(self, "near", check.positive("near", self.near))
         if not np.array_equal(self.intrinsics[2], (0.0, 0.0, 1.0)):
             raise ValueError(f"intrinsics: got last row {self.intrinsics[2].tolist()}, expected [0, 0, 1]")
@@ -86,7 +86,7 @@ class Camera:
         Raises:
             ValueError: naming the argument; so when eye and target coincide or up is parallel to the view.
         """
-        origin, goal, top = (_array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
+        origin, goal, top = (check.array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
         view = goal - origin
         distance = np.linalg.norm(view)
         if distance <= 1e-9 * max(np.abs(origin).max(), np.abs(goal).max()):
@@ -127,7 +127,7 @@ class Camera:
             ValueError: naming the argument; so when the view is not rigid or the projection not a
                 perspective.
         """
-        view = _array("view", view, (4, 4))
+        view = check.array("view", view, (4, 4))
         if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
             raise ValueError(f"view: got last row {view[3].tolist()}, expected [0, 0, 0, 1]")
         _check_rotation("view", view[:3, :3])
@@ -138,7 +138,7 @@ class Camera:
             intrinsics = _centered_intrinsics(fov_y, width, height)
             near = 0.01 if near is None else near
         else:
-            projection = _array("projection", projection, (4, 4))
+            projection = check.array("projection", projection, (4, 4))
             if not np.array_equal(projection[3], (0.0, 0.0, -1.0, 0.0)) or projection[:2, 3].any():
                 raise ValueError(
                     f"projection: got {projection.tolist()}, expected a perspective, last row [0, 0, -1, 0] "
@@ -205,14 +205,6 @@ class Camera:
         pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
         directions = pixels @ np.linalg.inv(self.intrinsics).T @ self.rotation
         return self.eye, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def _array(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:
-    array = check.numbers(name, values, expected=f"numbers {list(shape)}", dtype=np.float64)
-    check.shape(name, array.shape, shape)
-    check.finite(name, array)
-    array.setflags(write=False)
-    return array
 
 
 def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:

@@ -36,10 +36,8 @@ class Loss:
         """Validate."""
         check.choice("kind", self.kind, KINDS)
         check.choice("reduction", self.reduction, REDUCTIONS)
-        if not (check.is_number(self.delta) and self.delta > 0):
-            raise ValueError(f"delta: got {self.delta!r}, expected a positive number")
-        if not (check.is_number(self.coverage) and self.coverage >= 0):
-            raise ValueError(f"coverage: got {self.coverage!r}, expected a weight of 0 or more")
+        check.positive("delta", self.delta)
+        check.nonnegative("coverage", self.coverage)
 
     def __call__(self, images: torch.Tensor, targets: torch.Tensor, weights: torch.Tensor, unit: float) -> torch.Tensor:
         """Compare images.

@@ -46,18 +46,15 @@ class Stage:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name in ("iterations", "candidates"):
-            count = getattr(self, name)
-            if not check.is_integer(count) or count < 1:
-                raise ValueError(f"{name}: got {count!r}, expected a whole number from 1 on")
+        check.whole("iterations", self.iterations)
+        check.whole("candidates", self.candidates)
         if not (check.is_number(self.learning_rate) and self.learning_rate > 0):
             raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
-        if not (check.is_number(self.regularization) and self.regularization >= 0):
-            raise ValueError(f"regularization: got {self.regularization!r}, expected a factor of 0 or more")
+        check.nonnegative("regularization", self.regularization)
         if not (check.is_number(self.scale) and 0 < self.scale <= 1):
             raise ValueError(f"scale: got {self.scale!r}, expected a part of the image, above 0 and up to 1")
-        if self.softness is not None and not (check.is_number(self.softness) and self.softness > 0):
-            raise ValueError(f"softness: got {self.softness!r}, expected a positive number of cell radii")
+        if self.softness is not None:
+            check.positive("softness", self.softness)
         if self.directions is not None:
             check_count("directions", self.directions)
         if self.supersampling is not None:

@@ -1,0 +1,89 @@
+"""What a free parameter does, and a free parameter of one body."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from warpshadow import check
+from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.scene.scene import Scene
+
+Values = dict[str, torch.Tensor]
+
+
+class Free(abc.ABC):
+    """A free parameter of a scene."""
+
+    key: ClassVar[str]
+    """What fit files call it."""
+
+    moves: ClassVar[bool] = False
+    """Whether geometry or cameras change with it."""
+
+    @property
+    def name(self) -> str:
+        """What values and messages call it."""
+        return self.key
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError where a scene has no such thing; the message names the argument."""
+        return
+
+    @abc.abstractmethod
+    def start(self, setting: Setting) -> Values:
+        """Values where the scene has them."""
+
+    @abc.abstractmethod
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Put values into the world. Differentiable: values."""
+
+    def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
+        """Other values around these, for a descent that starts at several places; the same where one will do.
+
+        Args:
+            values: The first place.
+            number: Of the other place, from 0.
+            generator: Of random numbers.
+        """
+        return {key: tensor.detach().clone() for key, tensor in values.items()}
+
+    @abc.abstractmethod
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Put final values into what is found."""
+
+    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Regularizer, to be added to the loss; None for none. Differentiable: values."""
+        return None
+
+    def project(self, values: Values) -> None:
+        """Move values in place to the nearest that are possible, after each step."""
+        return
+
+
+@dataclass(frozen=True)
+class FreeOfBody(Free):
+    """A free parameter of a body.
+
+    Args:
+        body: The body, from 0.
+    """
+
+    body: int
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        if not check.is_integer(self.body) or self.body < 0:
+            raise ValueError(f"body: got {check.described(self.body)}, expected the number of a body, from 0")
+
+    @property
+    def name(self) -> str:
+        """What values and messages call it."""
+        return f"{self.key}[{self.body}]"
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError where a scene has no such body."""
+        check.index("body", self.body, len(scene.bodies), "body")

@@ -1,0 +1,109 @@
+"""Free light."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from warpshadow import check
+from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.maths.directions import check_count, fibonacci
+from warpshadow.maths.sh import check_order, equirectangular_directions
+
+_DARKEST = 1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
+
+
+@dataclass(frozen=True)
+class Light(Free):
+    """The light, in spherical harmonics or as a map of cells.
+
+    Args:
+        order: Number of SH bands; None with ``directions``.
+        directions: In place of ``order`` the number of cells, whose radiance is the exponential of a value and so never
+            negative: sharper light, and a longer way to it.
+        nonnegativity: Weight of the mean square of what is negative in spherical harmonics [targets' radiance].
+        smoothness: Weight of the mean square of differences between neighboring cells [targets' radiance].
+    """
+
+    key: ClassVar[str] = "light"
+
+    order: int | None = 5
+    directions: int | None = None
+    nonnegativity: float = 0.0
+    smoothness: float = 1e-4
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        if (self.order is None) == (self.directions is None):
+            raise ValueError(
+                f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them, such as "
+                "Light(5) or Light(None, directions=512)"
+            )
+        if self.directions is not None:
+            check_count("directions", self.directions)
+        if self.order is not None:
+            check_order(self.order)
+        for name in ("nonnegativity", "smoothness"):
+            check.nonnegative(name, getattr(self, name))
+
+    @functools.cached_property
+    def basis(self) -> Basis:
+        """What the light is expressed in."""
+        return CellBasis(fibonacci(self.directions)) if self.order is None else HarmonicBasis(self.order)
+
+    def start(self, setting: Setting) -> Values:
+        """The scene's light."""
+        radiance = self.basis.coefficients(setting.scene.light) / setting.unit
+        if isinstance(self.basis, CellBasis):
+            return {"log_radiance": setting.tensor(np.log(np.maximum(radiance, _DARKEST)))}
+        return {"coefficients": setting.tensor(radiance / np.sqrt(4 * np.pi))}
+
+    def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:
+        """Light in the basis, linear RGB, [coefficient, 3]. Differentiable: values."""
+        if isinstance(self.basis, CellBasis):
+            return values["log_radiance"].exp() * setting.unit
+        return values["coefficients"] * (setting.unit * np.sqrt(4 * np.pi))
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Light the world with it."""
+        world.light = self.coefficients(values, setting)
+
+    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """What is negative, and how neighboring cells differ."""
+        if isinstance(self.basis, CellBasis):
+            first, second = _neighbors(self.basis.size)
+            radiance = values["log_radiance"].exp()
+            return self.smoothness * (radiance[first] - radiance[second]).square().mean() if self.smoothness else None
+        if not self.nonnegativity:
+            return None
+        towards = np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512))
+        radiance = setting.tensor(towards) @ values["coefficients"]
+        return self.nonnegativity * torch.relu(-radiance).square().mean()
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Spherical harmonics stay what they are; cells become a map."""
+        coefficients = self.coefficients(values, setting).cpu().numpy()
+        light: EnvironmentMap | np.ndarray = coefficients
+        if isinstance(self.basis, CellBasis):
+            towards = equirectangular_directions(64)
+            light = EnvironmentMap((self.basis.functions(towards.reshape(-1, 3)) @ coefficients).reshape(64, 128, 3))
+        found.scene = replace(found.scene, light=light)
+
+
+@functools.cache
+def _neighbors(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pairs of cells that lie side by side: each and the six nearest to it."""
+    from scipy.spatial import cKDTree
+
+    directions = fibonacci(count)
+    _, nearest = cKDTree(directions).query(directions, k=7)
+    pairs = np.stack([np.repeat(np.arange(count), 6), nearest[:, 1:].ravel()])
+    pairs = np.unique(np.sort(pairs, axis=0), axis=1)
+    return torch.from_numpy(pairs[0]), torch.from_numpy(pairs[1])

@@ -1,0 +1,136 @@
+"""Free reflectance of a body: its colors or its texture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from warpshadow import check
+from warpshadow.inverse.free.base import FreeOfBody, Values
+from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.scene.scene import Scene, Visibility
+from warpshadow.stages.textures.sample import fill_unseen
+
+
+@dataclass(frozen=True)
+class Albedo(FreeOfBody):
+    """The reflectance of a body: one color, or one for each vertex.
+
+    Args:
+        body: The body, from 0.
+        per_vertex: A color for each vertex.
+    """
+
+    key: ClassVar[str] = "albedo"
+
+    per_vertex: bool = False
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        check.flag("per_vertex", self.per_vertex)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body whose reflectance is of another kind."""
+        super().check_scene(scene)
+        body = scene.bodies[self.body]
+        if body.texture is not None:
+            raise ValueError(f"body: got {self.body}, which has a texture; expected one without, or Texture")
+        if np.ndim(body.albedo) > 1 and not self.per_vertex:
+            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected per_vertex=True")
+
+    def start(self, setting: Setting) -> Values:
+        """The body's albedo."""
+        body = setting.scene.bodies[self.body]
+        colors = np.atleast_2d(body.albedo)
+        if self.per_vertex:
+            colors = np.broadcast_to(colors, (body.mesh.vertex_count, 3))
+        return {"color": setting.tensor(colors)}
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Color the body."""
+        world.albedo[self.body] = values["color"]
+
+    def project(self, values: Values) -> None:
+        """Reflectances are in [0, 1]."""
+        values["color"].clamp_(0, 1)
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Color the body."""
+        color = values["color"].cpu().numpy()
+        found.change_body(self.body, albedo=color if self.per_vertex else color[0])
+
+
+@dataclass(frozen=True)
+class Texture(FreeOfBody):
+    """The reflectance of a body as an image, which needs uvs.
+
+    Args:
+        body: The body, from 0.
+        size: Height and width [texels]; by default those of the body's texture, or 256 × 256.
+        smoothness: Weight of the mean square of differences between neighboring texels.
+    """
+
+    key: ClassVar[str] = "texture"
+
+    size: tuple[int, int] | None = None
+    smoothness: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        if self.size is not None:
+            is_pair = isinstance(self.size, (tuple, list, np.ndarray)) and len(self.size) == 2
+            if not is_pair or not all(check.is_integer(count) and count > 0 for count in self.size):
+                raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels, (256, 256)")
+            object.__setattr__(self, "size", tuple(self.size))
+        check.nonnegative("smoothness", self.smoothness)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that cannot have a texture."""
+        super().check_scene(scene)
+        body = scene.bodies[self.body]
+        if body.mesh.uvs is None:
+            raise ValueError(
+                f"body: got {self.body}, whose mesh has no uvs; expected uvs, as "
+                "warpshadow.assets.unwrap.unwrap makes them"
+            )
+        if body.texture is None and np.ndim(body.albedo) > 1:
+            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected one color")
+
+    def start(self, setting: Setting) -> Values:
+        """The body's texture, or its color."""
+        body = setting.scene.bodies[self.body]
+        image = np.reshape(body.albedo, (1, 1, 3)) if body.texture is None else body.texture
+        size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
+        planes = setting.tensor(image).permute(2, 0, 1)[None]
+        mode = "area" if size[0] <= image.shape[0] else "bilinear"
+        return {"texels": torch.nn.functional.interpolate(planes, size, mode=mode)[0].permute(1, 2, 0).contiguous()}
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Cover the body."""
+        world.textures[self.body] = values["texels"]
+
+    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Differences of neighbors."""
+        if not self.smoothness:
+            return None
+        texels = values["texels"]
+        down, across = (texels.diff(dim=dim).square().sum() for dim in (0, 1))  # sums: a single row has no mean down
+        return self.smoothness * (down + across) / texels.numel()
+
+    def project(self, values: Values) -> None:
+        """Reflectances are in [0, 1]."""
+        values["texels"].clamp_(0, 1)
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
+        texels = values["texels"].cpu().numpy()
+        found.change_body(self.body, texture=texels)
+        unshadowed = replace(found.scene, visibility=Visibility(method="none"))
+        renderer = Renderer(unshadowed, cameras=found.cameras, device=str(setting.device))
+        found.change_body(self.body, texture=fill_unseen(texels, renderer.seen_texels(self.body)))

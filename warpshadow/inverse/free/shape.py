@@ -1,0 +1,155 @@
+"""A free shape of a body: how it is deformed, and how large its spheres are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+
+from warpshadow import check
+from warpshadow.inverse.free.base import FreeOfBody, Values
+from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
+from warpshadow.spheres import Spheres
+from warpshadow.torch import apply, rotation_matrices
+
+_STRETCH = 0.4  # a unit of stretch: nodes stretch less than they turn
+
+
+def _sphere_count(body: Body) -> int:
+    """Spheres of a body, or how many are asked for."""
+    return body.blockers if isinstance(body.blockers, int) else len(body.blockers)
+
+
+@dataclass(frozen=True)
+class Deformation(FreeOfBody):
+    """The shape of a body, by embedded deformation (Sumner et al. 2007); its spheres are the nodes (the paper, sec. 4).
+
+    A node's matrix is a rotation times a symmetric stretch. Values are those of the nodes before they are smoothed over
+    the graph, T = (I + λ L)⁻¹ u, L the graph's Laplacian over the mean number of neighbors: so that a step of the
+    descent moves parts of the body, and not nodes one by one (Nicolet et al. 2021, section 3.2).
+
+    Args:
+        body: The body, from 0; it needs more spheres than ``count``.
+        rigidity: Weight of the as-rigid-as-possible energy, the mean over pairs of neighboring nodes
+            [squares of half the diagonal].
+        firmness: Weight of the mean square of the nodes' stretches.
+        smoothness: λ.
+        count: Nodes that carry a vertex.
+    """
+
+    key: ClassVar[str] = "deformation"
+    moves: ClassVar[bool] = True
+
+    rigidity: float = 1.25
+    firmness: float = 0.001
+    smoothness: float = 6.0
+    count: int = 4
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        for name in ("rigidity", "firmness", "smoothness"):
+            check.nonnegative(name, getattr(self, name))
+        check.whole("count", self.count, what="nodes")
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body with too few spheres."""
+        super().check_scene(scene)
+        nodes = _sphere_count(scene.bodies[self.body])
+        if self.count >= nodes:
+            raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
+
+    def start(self, setting: Setting) -> Values:
+        """The shape as it is."""
+        nodes = setting.graph(self.body, self.count).node_positions.shape[0]
+        sizes = {"turns": 3, "shifts": 3, "stretches": 6}
+        return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
+
+    def _moved_nodes(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Matrices [node, 3, 3] and translations [node, 3] in the body's own space, and stretches [node, 3, 3]."""
+        smoothing = setting.smoothing(self.body, self.count, self.smoothness)
+        turns, shifts, entries = (smoothing @ values[key] for key in ("turns", "shifts", "stretches"))
+        stretches = (_STRETCH * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
+        rotations = rotation_matrices(turns)
+        return rotations + rotations @ stretches, setting.extent(self.body) * shifts, stretches
+
+    def _deformed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+        """Vertices and centers in the body's own space, with a batch of 1."""
+        graph = setting.graph(self.body, self.count)
+        matrices, shifts, _ = self._moved_nodes(values, setting)
+        points = apply(graph.points, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))
+        return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Bend the body."""
+        points, centers = self._deformed(values, setting)
+        has_spheres = len(setting.spheres(self.body)) > 0  # without shadows there are nodes, but no spheres
+        world.rest = world.renderer.deformed(self.body, points, centers if has_spheres else None, rest=world.rest)
+        world.moving.add(self.body)
+
+    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Differences between where neighboring nodes take each other, and stretches."""
+        graph = setting.graph(self.body, self.count)
+        matrices, shifts, stretches = self._moved_nodes(values, setting)
+        gaps = apply(graph.rigidity, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))[0]
+        gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.body) ** 2)
+        return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Bend the body, mesh and spheres."""
+        points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
+        found.change_body(self.body, mesh=replace(found.scene.bodies[self.body].mesh, positions=points))
+        spheres = found.spheres(self.body)
+        if len(spheres):
+            found.change_body(self.body, blockers=Spheres(centers, spheres.radii))
+
+
+@dataclass(frozen=True)
+class Radii(FreeOfBody):
+    """The radii of a body's spheres, as factors.
+
+    Args:
+        body: The body, from 0.
+        persistence: Weight of the mean square of the factors' logarithms.
+    """
+
+    key: ClassVar[str] = "radii"
+    moves: ClassVar[bool] = True
+
+    persistence: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        check.nonnegative("persistence", self.persistence)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body without spheres."""
+        super().check_scene(scene)
+        if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.body]):
+            raise ValueError(f"body: got {self.body}, which has no spheres; expected one that casts a shadow")
+
+    def start(self, setting: Setting) -> Values:
+        """The radii as they are."""
+        return {"log": setting.tensor(np.zeros(len(setting.spheres(self.body))))}
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Swell and shrink the spheres."""
+        radii = setting.tensor(setting.spheres(self.body).radii) * values["log"].exp()
+        world.rest = world.renderer.deformed(self.body, radii=radii, rest=world.rest)
+        world.moving.add(self.body)
+
+    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Logarithms of the factors."""
+        return self.persistence * values["log"].square().mean() if self.persistence else None
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Swell and shrink the spheres."""
+        spheres = found.spheres(self.body)
+        found.change_body(
+            self.body, blockers=Spheres(spheres.centers, spheres.radii * values["log"].exp().cpu().numpy())
+        )

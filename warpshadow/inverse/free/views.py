@@ -1,0 +1,88 @@
+"""What is free of each view: its exposure and its camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.torch import rotation_matrices
+
+
+@dataclass(frozen=True)
+class Exposure(Free):
+    """The exposure of each view, a factor of its colors; known light then keeps its unit."""
+
+    key: ClassVar[str] = "exposure"
+
+    def start(self, setting: Setting) -> Values:
+        """A factor of 1."""
+        return {"log": setting.tensor(np.zeros(len(setting.cameras)))}
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Expose the world's images."""
+        world.exposures = values["log"].exp()
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Factors of the views."""
+        found.exposures = values["log"].exp().tolist()
+
+
+@dataclass(frozen=True)
+class CameraPose(Free):
+    """Where each view was taken: the eye, how it looks, and maybe the focal length.
+
+    Args:
+        focal: Whether the focal length is free, too.
+    """
+
+    key: ClassVar[str] = "camera"
+    moves: ClassVar[bool] = True
+
+    focal: bool = False
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check.flag("focal", self.focal)
+
+    def start(self, setting: Setting) -> Values:
+        """The cameras as they are."""
+        views = len(setting.cameras)
+        values = {"turn": setting.tensor(np.zeros((views, 3))), "shift": setting.tensor(np.zeros((views, 3)))}
+        return values | ({"log_focal": setting.tensor(np.zeros(views))} if self.focal else {})
+
+    def _posed(
+        self, values: Values, setting: Setting, cameras: tuple[Camera, ...]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """R, t and K of the views; shifts of the eye are in units of its distance from the scene."""
+        rotations = rotation_matrices(values["turn"]) @ setting.tensor([camera.rotation for camera in cameras])
+        eyes = setting.tensor([camera.eye for camera in cameras])
+        moved = eyes + setting.tensor(setting.distances) * values["shift"]
+        intrinsics = setting.tensor([camera.intrinsics for camera in cameras])
+        if self.focal:
+            zoom = torch.ones_like(intrinsics)
+            zoom[:, :2, :2] = values["log_focal"].exp()[:, None, None]
+            intrinsics = intrinsics * zoom
+        return rotations, -(rotations @ moved[..., None])[..., 0], intrinsics
+
+    def place(self, values: Values, setting: Setting, world: World) -> None:
+        """Move the cameras."""
+        rotations, translations, intrinsics = self._posed(values, setting, world.cameras)
+        world.clip_matrices = world.renderer.clip_matrices(rotations, translations, intrinsics)
+
+    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+        """Move the cameras."""
+        rotations, translations, intrinsics = (
+            part.cpu().numpy().astype(np.float64) for part in self._posed(values, setting, setting.cameras)
+        )
+        found.cameras = [
+            replace(camera, rotation=rotations[view], translation=translations[view], intrinsics=intrinsics[view])
+            for view, camera in enumerate(found.cameras)
+        ]
+        found.scene = replace(found.scene, camera=found.cameras[0])
