@@ -415,7 +415,7 @@ def test_fingerprints_do_not_change_with_being_asked_or_made_again_or_with_what_
 @pytest.mark.slow
 def test_fingerprints_are_those_of_another_process():
     command = "import test_inverse_problem as t; print({n: p.fingerprint() for n, p in t.variations().items()})"
-    environment = os.environ | {"PYTHONHASHSEED": "7", "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = os.environ | {"PYTHONHASHSEED": "7", "PYTHONPATH": os.pathsep.join(sys.path)}
     output = subprocess.run(
         [sys.executable, "-c", command], env=environment, capture_output=True, text=True, check=True, cwd=Path.cwd()
     ).stdout

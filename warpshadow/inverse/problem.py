@@ -19,7 +19,6 @@ from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import AUTO, METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
-from warpshadow.scene.toml_tables import located
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,7 @@ class Problem:
                 'expected "directional", "log-sh" or "none"'
             )
         for number, each in enumerate(self.free):
-            with located(f"free[{number}]"):
+            with check.located(f"free[{number}]"):
                 each.check_scene(self.scene)
         self.cameras()  # raises for an image of other proportions
 

@@ -12,7 +12,6 @@ import torch
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import linear_to_srgb, read_image
-from warpshadow.scene.toml_tables import located
 
 _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 
@@ -43,7 +42,7 @@ class Target:
         for name, read in (("image", read_target), ("mask", read_mask)):
             if check.is_path(getattr(self, name)):
                 path = check.file(name, getattr(self, name))
-                with located(name):
+                with check.located(name):
                     object.__setattr__(self, name, read(path))
         image = check.pixels("image", self.image, expected="linear RGB [height, width, 3], or the path of a picture")
         if image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:

@@ -1,8 +1,9 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
+import inspect
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility
+from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
 from warpshadow.tuning.tune import resolved
@@ -24,13 +25,8 @@ from warpshadow.tuning.tune import resolved
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
-_LIGHT_KEYS = ("envmap", "sh", "rotation", "scale")
-_VISIBILITY_KEYS = ("method", "directions", "softness", "merging", "order", "log", "base", "samples", "error")
-_PLACE_KEYS = ("albedo", "texture", "blockers", "spheres", "rotation", "translation", "scale", "receivers")
-_PRIMITIVES: dict[str, tuple[Callable[..., Mesh], tuple[str, ...]]] = {
-    "plane": (plane, ("size", "segments")),
-    "icosphere": (icosphere, ("radius", "subdivisions")),
-}
+_PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres")
+_PRIMITIVES: dict[str, Callable[..., Mesh]] = {"plane": plane, "icosphere": icosphere}
 
 
 class SceneError(ValueError):
@@ -54,112 +50,73 @@ def load_scene(path: str | Path, *, progress: bool = False) -> Scene:
 def parse_scene(path: str | Path) -> Scene:
     """Read a scene file as :func:`load_scene` does, but leave "auto" as it is."""
     path = check.path("path", path)
-    with toml_tables.located(str(path), SceneError):
+    with check.located(str(path), SceneError):
         return _scene(toml_tables.read(path, "scene file"), path.parent)
 
 
 def _scene(scene: Table, folder: Path) -> Scene:
-    with toml_tables.located("the scene"):
+    with check.located("the scene"):
         check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
     for name in ("camera", "light", "body"):
         if name not in scene:
             raise ValueError(f"[{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
     bodies = []
     for where, table in toml_tables.numbered(scene, "body"):
-        with toml_tables.located(where):
+        with check.located(where):
             bodies.append(_body(table, folder))
-    with toml_tables.located("[light]"):
+    with check.located("[light]"):
         light = _light(scene["light"], folder)
-    with toml_tables.located("[camera]"):
-        camera, supersampling = _camera(scene["camera"])
-    with toml_tables.located("[visibility]"):
-        visibility = parse_visibility(scene.get("visibility", {}))
-    with toml_tables.located("the scene"):
+    with check.located("[camera]"):
+        toml_tables.check_table(scene["camera"])
+        check.known_keys("key", scene["camera"], (*_CAMERA_KEYS, "supersampling"))
+        placed = dict(scene["camera"])
+        supersampling = placed.pop("supersampling", Scene.supersampling)
+        check_supersampling(supersampling)
+        camera = parse_camera(placed)
+    with check.located("[visibility]"):
+        visibility = toml_tables.make(Visibility, scene.get("visibility", {}))
+    with check.located("the scene"):
         return Scene(tuple(bodies), light, camera, visibility, supersampling)
 
 
-def _camera(table: Table) -> tuple[Camera, int]:
-    toml_tables.check_table(table)
-    check.known_keys("key", table, (*_CAMERA_KEYS, "supersampling"))
-    toml_tables.check_integer(table, "supersampling")
-    camera = parse_camera({key: value for key, value in table.items() if key != "supersampling"})
-    return camera, table.get("supersampling", Scene.supersampling)
-
-
 def parse_camera(table: Table) -> Camera:
-    """A camera from its table: from where it looks at what, or by intrinsics and world-to-camera [R | t].
-
-    Raises:
-        ValueError: naming the key, what it got and what it accepts.
-    """
+    """A camera from its table: from where it looks at what, or by intrinsics and world-to-camera [R | t]."""
     toml_tables.check_table(table)
     check.known_keys("key", table, _CAMERA_KEYS)
-    toml_tables.number(table, "near", 1.0)
-    toml_tables.check_vector(table, "size", 2)
-    if any(key in table for key in _PINHOLE_KEYS):
-        return _pinhole(table)
-    for key in ("eye", "target"):
-        if key not in table:
-            raise ValueError(f"{key}: missing, expected three numbers")
-    for key in ("eye", "target", "up"):
-        toml_tables.check_vector(table, key)
-    toml_tables.number(table, "fov_y", 1.0)
-    return Camera.look_at(**table)
-
-
-def _pinhole(table: Table) -> Camera:
+    if not any(key in table for key in _PINHOLE_KEYS):
+        return toml_tables.make(Camera.look_at, table)
     mixed = next((key for key in _VIEW_KEYS if key in table), None)
     if mixed is not None:
         raise ValueError(
             f"{mixed}: got it beside intrinsics, rotation or translation; "
             f"expected either {', '.join(_VIEW_KEYS)} or {', '.join(_PINHOLE_KEYS)}"
         )
-    accepted = dict(zip(_PINHOLE_KEYS, ("3 rows of 3 numbers", "3 rows of 3 numbers", "three numbers"), strict=True))
-    for key, expected in {**accepted, "size": "width and height"}.items():
-        if key not in table:
-            raise ValueError(f"{key}: missing, expected {expected}")
-    for key in ("intrinsics", "rotation"):
-        toml_tables.rows(table, key, 3)
-    toml_tables.check_vector(table, "translation")
-    width, height = table["size"]
-    placed = {key: value for key, value in table.items() if key != "size"}
-    return Camera(**placed, width=width, height=height)
+    width, height = check.image_size(table.get("size", check.NOTHING))
+    return toml_tables.make(
+        Camera, {key: table[key] for key in table if key != "size"} | {"width": width, "height": height}
+    )
 
 
 def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     toml_tables.check_table(table)
-    check.known_keys("key", table, _LIGHT_KEYS)
+    check.known_keys("key", table, ("envmap", "sh", "rotation", "scale"))
     if ("envmap" in table) == ("sh" in table):
         raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
-    rotation, scale = toml_tables.number(table, "rotation", 0.0), toml_tables.number(table, "scale", 1.0)
-    if scale < 0:
-        raise ValueError(f"scale: got {scale!r}, expected a factor of 0 or more")
+    rotation = check.number("rotation", table.get("rotation", 0.0))
+    scale = check.nonnegative("scale", table.get("scale", 1.0))
     if "envmap" in table:
         light = EnvironmentMap.read(toml_tables.file(table, "envmap", folder))
         light = light.rotated(rotation) if rotation else light
         return light.scaled(scale) if scale != 1 else light
-    coefficients = np.array(toml_tables.rows(table, "sh"), np.float64).reshape(-1, 3)
+    coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
+    check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
+    check.finite("sh", coefficients)
     order = sh.order_of("sh", coefficients)
     if rotation:
         angle = np.radians(rotation)
         about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         coefficients = sh.rotation_matrix(order, about_y) @ coefficients
     return scale * coefficients
-
-
-def parse_visibility(table: Table) -> Visibility:
-    """How visibility is computed, from its table.
-
-    Raises:
-        ValueError: naming the key, what it got and what it accepts.
-    """
-    toml_tables.check_table(table)
-    check.known_keys("key", table, _VISIBILITY_KEYS)
-    for key in ("directions", "order", "samples"):
-        toml_tables.check_integer(table, key)
-    for key in ("softness", "merging", "error"):
-        toml_tables.number(table, key, 1.0)
-    return Visibility(**table)
 
 
 def _body(table: Table, folder: Path) -> Body:
@@ -169,43 +126,26 @@ def _body(table: Table, folder: Path) -> Body:
     for one, other in (("albedo", "texture"), ("blockers", "spheres")):
         if one in table and other in table:
             raise ValueError(f"expected either {one} or {other}")
-    place: dict[str, Any] = {"mesh": _primitive(table) if "primitive" in table else _mesh(table, folder)}
-    place |= {key: table[key] for key in _PLACE_KEYS if key in table}
+    if "primitive" in table:
+        check.choice("primitive", table["primitive"], _PRIMITIVES)
+        make = _PRIMITIVES[table["primitive"]]
+        shape_keys = tuple(inspect.signature(make).parameters)
+        check.known_keys("key", table, ("primitive", *shape_keys, *_PLACE_KEYS))
+        mesh: object = make(**{key: table[key] for key in shape_keys if key in table})
+    else:
+        check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
+        mesh = toml_tables.file(table, "mesh", folder)
+    place: Table = {"mesh": mesh} | {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
         place["texture"] = toml_tables.file(table, "texture", folder)
-    if not isinstance(place.get("albedo"), str):
-        toml_tables.check_vector(table, "albedo")
-    elif place["albedo"].endswith(COLORS):
+    if isinstance(place.get("albedo"), str) and place["albedo"].endswith(COLORS):
         place["albedo"] = toml_tables.file(table, "albedo", folder)
     if "spheres" in place:
-        del place["spheres"]
-        path = toml_tables.file(table, "spheres", folder)
-        with toml_tables.located("spheres"):
+        path = toml_tables.file(place, "spheres", folder)
+        with check.located("spheres"):
             place["blockers"] = Spheres.read(path)
-    for key in ("rotation", "translation"):
-        toml_tables.check_vector(table, key)
-    toml_tables.check_integer(table, "blockers")
-    toml_tables.number(table, "scale", 1.0)
+        del place["spheres"]
     return Body(**place)
-
-
-def _primitive(table: Table) -> Mesh:
-    check.choice("primitive", table["primitive"], _PRIMITIVES)
-    make, shape_keys = _PRIMITIVES[table["primitive"]]
-    check.known_keys("key", table, ("primitive", *shape_keys, *_PLACE_KEYS))
-    toml_tables.number(table, "radius", 1.0)
-    for key in ("subdivisions", "segments"):
-        toml_tables.check_integer(table, key, pair=key == "segments")
-    if isinstance(table.get("size"), list):
-        toml_tables.check_vector(table, "size", 2)
-    else:
-        toml_tables.number(table, "size", 1.0)
-    return make(**{key: table[key] for key in shape_keys if key in table})
-
-
-def _mesh(table: Table, folder: Path) -> Path:
-    check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
-    return toml_tables.file(table, "mesh", folder)
 
 
 # ---------------------------------------------------------------------------------------------- writing
@@ -238,7 +178,7 @@ def write_scene(scene: Scene, folder: str | Path) -> list[Path]:
         light: Table = {"envmap": "light.exr"}
     else:
         light = {"sh": [_numbers(row) for row in scene.light]}
-    visibility = {key: getattr(scene.visibility, key) for key in _VISIBILITY_KEYS}
+    visibility = asdict(scene.visibility)
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
     path = folder / "scene.toml"
     toml_tables.write(path, {"camera": camera, "light": light, "visibility": visibility, "body": bodies})

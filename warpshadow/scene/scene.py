@@ -15,7 +15,6 @@ from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, edge_width
-from warpshadow.scene.toml_tables import located
 from warpshadow.spheres import Spheres
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.exponential import THRESHOLDS
@@ -75,10 +74,8 @@ class Visibility:
         sh.check_order(self.order)
         check.choice("log", self.log, LOGS)
         check.choice("base", self.base, THRESHOLDS)
-        if not check.is_integer(self.samples) or self.samples < 1:
-            raise ValueError(f"samples: got {self.samples!r}, expected a positive whole number of directions")
-        if not (check.is_number(self.error) and self.error > 0):
-            raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
+        check.whole("samples", self.samples, what="directions")
+        check.positive("error", self.error)
         edge_width(self.softness, self.directions)
         check_merging(self.merging)
 
@@ -133,10 +130,7 @@ class Body:
             object.__setattr__(self, "blockers", int(self.blockers))
         remedies = {"rotation": "an axis-angle vector in degrees; scipy's Rotation.as_rotvec(degrees=True) makes one"}
         for name in ("rotation", "translation"):
-            vector = check.numbers(name, getattr(self, name), expected="three numbers", dtype=np.float64)
-            check.shape(name, vector.shape, (3,), remedies.get(name, ""))
-            check.finite(name, vector)
-            object.__setattr__(self, name, vector)
+            object.__setattr__(self, name, check.array(name, getattr(self, name), (3,), remedies.get(name, "")))
         if not (check.is_number(self.scale) and 0 < self.scale <= check.LARGEST):
             raise ValueError(
                 f"scale: got {check.described(self.scale)}, expected a positive number up to {check.LARGEST:g} for all "
@@ -161,7 +155,7 @@ class Body:
             value = getattr(self, name)
             if check.is_path(value) and str(value).endswith(suffix):
                 path = check.file(name, value)
-                with located(name, error):
+                with check.located(name, error):
                     object.__setattr__(self, name, read(path))
 
     def _checked_albedo(self) -> np.ndarray:
@@ -262,7 +256,7 @@ class Scene:
         given: Any = self.light
         if check.is_path(given):
             path = check.file("light", given)
-            with located("light", ImageError):
+            with check.located("light", ImageError):
                 object.__setattr__(self, "light", EnvironmentMap.read(path))
         if not isinstance(self.light, EnvironmentMap):
             expected = "an EnvironmentMap, the path of one, or SH coefficients [order², 3]"
@@ -271,7 +265,7 @@ class Scene:
             check.shape("light", light.shape, ("order²", 3), remedies.get(light.ndim, ""))
             check.finite("light", light)
             order = sh.order_of("light", light)
-            with located("light"):
+            with check.located("light"):
                 sh.check_order(order)
             light.setflags(write=False)
             object.__setattr__(self, "light", light)

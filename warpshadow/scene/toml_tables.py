@@ -1,12 +1,12 @@
-"""Tables of TOML files: read, checked key by key, and written."""
+"""Tables of TOML files: read, made into what they describe, and written."""
 
-import contextlib
+import inspect
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,10 +14,11 @@ from warpshadow import check
 from warpshadow.assets import files
 
 Table = dict[str, Any]
+T = TypeVar("T")
 
 
 def read(path: Path, kind: str) -> Table:
-    """Read a TOML file; messages call it a ``kind``, and leave the path to :func:`located`."""
+    """Read a TOML file; messages call it a ``kind``, and leave the path to :func:`warpshadow.check.located`."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:
@@ -31,50 +32,9 @@ def read(path: Path, kind: str) -> Table:
         raise ValueError(f"not valid TOML: {cause}") from cause
 
 
-def write(path: Path, tables: Mapping[str, Any]) -> None:
-    """Write a TOML file that reads back as the same values, to the last bit of a number.
-
-    Args:
-        path: The file.
-        tables: Strings, numbers, truth values and lists of them, tables of these, and lists of tables.
-    """
-    plain = {key: value for key, value in tables.items() if not _is_table(value) and not _is_tables(value)}
-    blocks = [_lines(plain)] if plain else []
-    for name, value in tables.items():
-        if _is_table(value):
-            blocks.append(block(f"[{name}]", value))
-        elif _is_tables(value):
-            blocks += [block(f"[[{name}]]", table) for table in value]
-    with files.whole(path) as unfinished:
-        unfinished.write_text("\n".join(blocks), encoding="utf-8")
-
-
-def block(header: str, table: Mapping[str, Any]) -> str:
-    """A table as lines of a TOML file, under its header."""
-    return f"{header}\n{_lines(table)}"
-
-
-@contextlib.contextmanager
-def located(where: str, error: type[ValueError] = ValueError) -> Iterator[None]:
-    """Begin the message of a mistake with where it is, and raise it as ``error``, or as FileNotFoundError if it is one.
-
-    Nested, the message goes from the file to the table in it.
-    """
-    try:
-        yield
-    except FileNotFoundError as cause:
-        raise FileNotFoundError(f"{where}: {cause}") from cause
-    except (ValueError, TypeError) as cause:
-        raise error(f"{where}: {cause}") from cause
-
-
-# ---------------------------------------------------------------------------------------------- values
-
-
 def check_table(value: object) -> None:
     """Raise ValueError unless a value is a table."""
-    if not _is_table(value):
-        raise ValueError(f"got {value!r}, expected a table of keys")
+    check.instance("table", value, Mapping, "a table of keys")
 
 
 def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, Any]]:
@@ -85,59 +45,54 @@ def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, An
         yield f"[[{within}{key}]] number {position}", item
 
 
-def number(table: Table, key: str, default: float) -> float:
-    """A finite number."""
-    value = table.get(key, default)
-    if not check.is_number(value):
-        raise ValueError(f"{key}: got {value!r}, expected a finite number")
-    return value
+def make(kind: Callable[..., T], table: Table) -> T:
+    """Call what takes a table's keys as its arguments and checks their values; a missing one is check.NOTHING.
 
-
-def check_integer(table: Table, key: str, *, pair: bool = False) -> None:
-    """Raise ValueError unless a key is missing or a whole number, or maybe a pair of them."""
-    value = table.get(key, 1)
-    values = value if pair and isinstance(value, list) and len(value) == 2 else [value]
-    if not all(map(check.is_integer, values)):
-        raise ValueError(f"{key}: got {value!r}, expected a whole number{' or two' if pair else ''}")
-
-
-def check_vector(table: Table, key: str, count: int = 3) -> None:
-    """Raise ValueError unless a key is missing or a vector."""
-    if key in table and not _is_vector(table[key], count):
-        raise ValueError(f"{key}: got {table[key]!r}, expected {count} finite numbers")
-
-
-def rows(table: Table, key: str, count: int | None = None) -> list[list[float]]:
-    """Rows of three numbers: so many, or any number."""
-    value = table[key]
-    is_right = isinstance(value, list) and all(_is_vector(row, 3) for row in value)
-    if not is_right or (count is not None and len(value) != count):
-        raise ValueError(
-            f"{key}: got {value!r}, expected {'' if count is None else f'{count} '}rows of 3 finite numbers"
-        )
-    return value
+    Not done by msgspec or pydantic: those who write Python get the same messages, with what was got and the nearest
+    key, neither of which these libraries name.
+    """
+    check_table(table)
+    arguments = inspect.signature(kind).parameters
+    check.known_keys("key", table, arguments)
+    missing = {key: check.NOTHING for key, argument in arguments.items() if argument.default is argument.empty}
+    return kind(**missing | table)
 
 
 def file(table: Table, key: str, folder: Path) -> Path:
     """The path of a file that is there, relative to a folder."""
-    if not isinstance(table[key], str):
-        raise ValueError(f"{key}: got {table[key]!r}, expected a file name")
-    path = folder / table[key]
-    if not path.is_file():
-        raise FileNotFoundError(f"{key}: no such file: {path}")
-    return path
+    if not isinstance(table.get(key), str):
+        raise ValueError(f"{key}: got {table.get(key, check.NOTHING)!r}, expected a file name")
+    return check.file(key, folder / table[key])
 
 
-def _is_table(value: object) -> bool:
-    return isinstance(value, Mapping)
+# ---------------------------------------------------------------------------------------------- writing
 
 
-def _is_tables(value: object) -> bool:
-    return isinstance(value, Sequence) and len(value) > 0 and all(map(_is_table, value))
+def write(path: Path, tables: Mapping[str, Any]) -> None:
+    """Write a TOML file that reads back as the same values, to the last bit of a number.
+
+    By hand: tomli-w gives each number of a matrix a line, and puts all bodies into one list; tomlkit is slower to
+    import than the rest of a scene file is to read.
+
+    Args:
+        path: The file.
+        tables: Strings, numbers, truth values and lists of them, tables of these, and lists of tables.
+    """
+    plain, blocks = {}, []
+    for name, value in tables.items():
+        if isinstance(value, Mapping):
+            blocks.append(block(f"[{name}]", value))
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            blocks += [block(f"[[{name}]]", table) for table in value]
+        else:
+            plain[name] = value
+    with files.whole(path) as unfinished:
+        unfinished.write_text("\n".join([_lines(plain), *blocks] if plain else blocks), encoding="utf-8")
 
 
-def _is_vector(value: object, count: int) -> bool:
-    return isinstance(value, list) and len(value) == count and all(map(check.is_number, value))
+def block(header: str, table: Mapping[str, Any]) -> str:
+    """A table as lines of a TOML file, under its header."""
+    return f"{header}\n{_lines(table)}"
 
 
 def _lines(table: Mapping[str, Any]) -> str:
