@@ -20,7 +20,7 @@ import warpshadow
 
 def main(output: Path) -> None:
     for value in list(vars(wp).values()):
-        if isinstance(value, type) and value.__module__.startswith("warp._src"):
+        if isinstance(value, type) and value.__module__.startswith("warp."):
             value.__module__ = "warp"  # where users find it, in place of where it is defined
     names = [module.name for module in pkgutil.iter_modules(warpshadow.__path__, "warpshadow.")]
     names.remove("warpshadow.__main__")
