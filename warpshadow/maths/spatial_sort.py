@@ -26,7 +26,7 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
-    """Order points along a space-filling curve: in hardly any time, if not as compactly (Morton 1966).
+    """Order points along a space-filling curve: in hardly any time, if not as compactly.
 
     Args:
         points: Shape [point, 3].
@@ -38,8 +38,12 @@ def z_order(points: np.ndarray) -> np.ndarray:
         return np.arange(0)
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum((high - low).max(), np.finfo(np.float32).tiny)
-    cells = (points - low) * ((2**21 - 1) / size)
-    codes = sum(_spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis) for axis in range(3))
+    return z_order_of_cells((points - low) * ((2**21 - 1) / size))
+
+
+def z_order_of_cells(cells: np.ndarray) -> np.ndarray:
+    """Order cells [cell, axis] of a grid, indices from 0 to 2²¹ − 1, by their interleaved bits (Morton 1966)."""
+    codes = sum(_spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis) for axis in range(cells.shape[1]))
     return np.argsort(codes, kind="stable")
 
 

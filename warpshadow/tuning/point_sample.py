@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.renderer import Renderer, View
 from warpshadow.scene.scene import Scene, Visibility
@@ -166,9 +167,7 @@ def at_receivers(view: View, renderer: Renderer, points: np.ndarray, normals: np
 def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Draw pixels of a mask [height, width], one from each of as many patches along a Z-order curve: flat indices."""
     rows, columns = np.nonzero(mask)
-    bits = np.arange(16)
-    z_order = ((rows[:, None] >> bits & 1) << 2 * bits + 1 | (columns[:, None] >> bits & 1) << 2 * bits).sum(axis=1)
-    along = np.argsort(z_order, kind="stable")
+    along = z_order_of_cells(np.stack([columns, rows], axis=-1))
     count = min(count, len(along))
     positions = (np.arange(count) + np.random.default_rng(seed).random(count)) * (len(along) / max(count, 1))
     return np.ravel_multi_index((rows, columns), mask.shape)[along[positions.astype(int)]]
