@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 import torch
 
 from warpshadow.inverse import CheckpointError
-from warpshadow.inverse.checkpoint import load, previous_path, save
+from warpshadow.inverse.checkpoint import alone, load, previous_path, save
 
 
 class PowerCut(BaseException):
@@ -196,3 +198,36 @@ def test_a_state_with_more_than_data_is_not_executed(path):
 def test_a_folder_that_is_not_there_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         save(tmp_path / "nowhere" / "fit.checkpoint", state(0))
+
+
+# ---------------------------------------------------------------------------------------------- two at once
+
+HOLD = """import sys
+from warpshadow.inverse.checkpoint import alone
+with alone(sys.argv[1]):
+    print("held", flush=True)
+    input()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["closed", "killed"])
+def test_a_file_that_another_process_fits_to_is_refused_until_that_ends(path, ending):
+    command = [sys.executable, "-c", HOLD, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(CheckpointError, match=r"fit\.checkpoint: another fit is writing it; .*folder by -o"):
+            alone(path).__enter__()
+        with alone(path.with_name("another")):
+            pass
+        other.kill() if ending == "killed" else other.communicate("\n")
+    with alone(path):
+        save(path, state(1))
+    assert number_in(path) == 1
+
+
+def test_two_fits_of_one_process_do_not_share_a_file(path):
+    with alone(path), pytest.raises(CheckpointError, match="another fit is writing it"), alone(path):
+        pass
+    with alone(None), alone(None):
+        pass

@@ -2,7 +2,9 @@
 
 import os
 import stat
+import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -398,6 +400,29 @@ def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tm
     assert fit_spheres(bumpy(), 6, **options).report.cached
     fit_spheres(bumpy(), 7, **options)
     assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
+
+
+@pytest.mark.slow
+def test_of_two_processes_that_want_the_same_fit_one_waits_and_reads_it(tmp_path):
+    command = (
+        "from warpshadow import fit_spheres, icosphere; "
+        "print(fit_spheres(icosphere(1.0, 1), 6, steps=20, progress=False).report.cached)"
+    )
+    environment = os.environ | {"WARPSHADOW_CACHE_DIR": str(tmp_path)}
+    start = partial(
+        subprocess.Popen, [sys.executable, "-c", command], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    processes = [start(), start()]
+    answers = [process.communicate(timeout=300)[0].splitlines()[-1] for process in processes]
+    assert sorted(answers) == ["False", "True"]
+
+
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, short_cover):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "file"))
+    with pytest.warns(UserWarning, match="the fit could not be cached in"):
+        assert not fit_spheres(bumpy(), 6, **{**QUICK, "cache": True, "steps": 5}).report.cached
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and whether one can be written, found out before the work."""
+"""Files that appear whole or not at all, that one process holds, and whether one can be written."""
 
 import contextlib
 import os
@@ -34,6 +34,24 @@ def whole(path: str | Path) -> Iterator[Path]:
         if error.errno is None:  # not the system's: it says itself what it is about
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, timeout: float = -1) -> Iterator[None]:
+    """Hold a file against others that want to hold it, in this process or another; the lock ends with the process.
+
+    Raises:
+        filelock.Timeout: after this time [s]; by default it is waited for.
+    """
+    from filelock import FileLock
+
+    beside = path.with_name(f".{path.name}.lock")
+    with FileLock(beside, timeout=timeout):
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # of Windows, where filelock removes it
+                beside.unlink()
 
 
 def check_file(path: Path) -> None:

@@ -4,10 +4,12 @@ A file holds a mark, the SHA-256 of what follows, and torch's own format. It rep
 that one is kept beside it, so whenever a process is killed a whole file remains.
 """
 
+import contextlib
 import hashlib
 import io
 import os
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,34 @@ import torch
 
 from warpshadow.assets import files
 
+OTHERWISE = "choose another file, which on the command line is another folder by -o"
+"""What to do where a checkpoint cannot be used."""
+
 _MARK = b"warpshadow checkpoint 1\n"
 
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message says why."""
+
+
+@contextlib.contextmanager
+def alone(path: str | Path | None) -> Iterator[None]:
+    """Refuse a second fit that would write the same file; without a file nothing is refused.
+
+    Raises:
+        CheckpointError: while another fit, of this process or another, holds the file.
+    """
+    from filelock import Timeout
+
+    if path is None:
+        yield
+        return
+    path = Path(path)
+    try:
+        with files.locked(path, timeout=0):
+            yield
+    except Timeout as error:
+        raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHERWISE}") from error
 
 
 def save(path: str | Path, state: dict[str, Any]) -> None:

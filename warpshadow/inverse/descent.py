@@ -169,7 +169,7 @@ class _Descent:
         if state.get("fingerprint") != self.fingerprint:
             raise checkpoints.CheckpointError(
                 "checkpoint: got one of another problem, other stages, another optimizer, tolerance or seed, "
-                "expected one of this fit; name another file or remove it"
+                f"expected one of this fit; {checkpoints.OTHERWISE}, or remove it"
             )
         device = self.setting.device
         self.stage = state["stage"]
@@ -329,8 +329,6 @@ def fit(
         ValueError: for a problem that cannot be rendered, naming the argument.
         CheckpointError: for a checkpoint of another problem.
     """
-    from tqdm import tqdm
-
     check.instance("problem", problem, Problem, "a Problem, as Problem(scene, targets, free) makes it")
     stages = tuple(stages) if isinstance(stages, Iterable) else (stages,)
     check_stages(stages, problem)
@@ -345,7 +343,30 @@ def fit(
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
-    descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
+    with checkpoints.alone(checkpoint):
+        descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
+        durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress)
+    if all(run.failure for run in descent.ended):
+        warnings.warn(
+            f"the fit stopped in stage {descent.stage + 1}: {descent.reason}; the best values before it are kept",
+            FitWarning,
+            stacklevel=2,
+        )
+    seconds = statistics.median(durations) if durations else math.nan
+    return Result(problem, descent.setting, descent.best, descent.losses, descent.reason or "", seconds)
+
+
+def _descend(
+    descent: _Descent,
+    checkpoint: str | Path | None,
+    checkpoint_seconds: float,
+    preview: str | Path | None,
+    preview_seconds: float,
+    progress: bool,
+) -> list[float]:
+    """Go on from a checkpoint, to the end; returns the times of the last iterations [s]."""
+    from tqdm import tqdm
+
     state = None if checkpoint is None else checkpoints.load(checkpoint)
     if state is None:
         descent.begin_stage()
@@ -359,7 +380,7 @@ def fit(
     saved = previewed = time.perf_counter()
     durations: list[float] = []
     with tqdm(
-        total=sum(stage.candidates * stage.iterations for stage in stages), unit="it", disable=not progress
+        total=sum(stage.candidates * stage.iterations for stage in descent.stages), unit="it", disable=not progress
     ) as bar:
         bar.update(sum(map(len, descent.losses)))
         start = time.perf_counter()
@@ -377,11 +398,4 @@ def fit(
             bar.update()
             start = time.perf_counter()
     save()
-    if all(run.failure for run in descent.ended):
-        warnings.warn(
-            f"the fit stopped in stage {descent.stage + 1}: {descent.reason}; the best values before it are kept",
-            FitWarning,
-            stacklevel=2,
-        )
-    seconds = statistics.median(durations) if durations else math.nan
-    return Result(problem, descent.setting, descent.best, descent.losses, descent.reason or "", seconds)
+    return durations

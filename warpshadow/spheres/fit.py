@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -109,7 +109,7 @@ def fit_spheres(
 def is_fitted(mesh: Mesh, count: int, *, device: wp.DeviceLike = "cpu") -> bool:
     """Whether the cache has what :func:`fit_spheres` finds for a mesh and a count."""
     job, *_ = _job(mesh, 0, STEPS, wp.get_device(device))
-    return (_cache_folder() / f"{job.key(count)}.npz").exists()
+    return _cache_path(job, count).exists()
 
 
 def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_Job, np.ndarray, float]:
@@ -200,36 +200,36 @@ def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
 # -------------------------------------------------------------------------------- cache
 
 
-def _cache_folder() -> Path:
-    """Folder of cached fits: WARPSHADOW_CACHE_DIR, or the platform's place for caches."""
+def _cache_path(job: _Job, count: int) -> Path:
+    """Where a fit is kept: under WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
+    from platformdirs import user_cache_path
+
     override = os.environ.get("WARPSHADOW_CACHE_DIR")
-    if override:
-        return Path(override) / "spheres"
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "warpshadow" / "spheres"
+    folder = Path(override) if override else user_cache_path("warpshadow", appauthor=False, opinion=False)
+    return folder / "spheres" / f"{job.key(count)}.npz"
 
 
 def _cached_fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
-    """Read a fit from the cache, or make it and write it there."""
-    path = _cache_folder() / f"{job.key(count)}.npz"
-    if path.exists():
+    """Read a fit from the cache, or make it and write it there; a second process that wants the same waits for it."""
+    path = _cache_path(job, count)
+    with contextlib.ExitStack() as held:
+        if not path.exists():
+            with contextlib.suppress(OSError):  # of a folder that cannot be written to
+                path.parent.mkdir(parents=True, exist_ok=True)
+                held.enter_context(files.locked(path))
+        if path.exists():
+            try:
+                with np.load(path, allow_pickle=False) as stored:
+                    spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
+                check.shape("spheres", spheres.shape, (report.sphere_count, 4))
+                return spheres, replace(report, cached=True)
+            except Exception as problem:  # whatever a damaged file raises: a fit can always be made again
+                warnings.warn(f"cached fit {path} cannot be read ({problem}); fitting again", stacklevel=4)
+        spheres, report = _fit(job, progress, count)
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
-            check.shape("spheres", spheres.shape, (report.sphere_count, 4))
-            return spheres, replace(report, cached=True)
-        except Exception as problem:  # whatever a damaged file raises: a fit can always be made again
-            warnings.warn(f"cached fit {path} cannot be read ({problem}); fitting again", stacklevel=4)
-    spheres, report = _fit(job, progress, count)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with files.whole(path) as unfinished:
-            np.savez(unfinished, spheres=spheres, report=json.dumps(asdict(report)))
-    except OSError as problem:
-        warnings.warn(f"the fit could not be cached in {path.parent} ({problem})", stacklevel=4)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with files.whole(path) as unfinished:
+                np.savez(unfinished, spheres=spheres, report=json.dumps(asdict(report)))
+        except OSError as problem:
+            warnings.warn(f"the fit could not be cached in {path.parent} ({problem})", stacklevel=4)
     return spheres, report
