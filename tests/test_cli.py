@@ -16,7 +16,7 @@ import warp as wp
 from typer.testing import CliRunner
 
 import warpshadow as ws
-from warpshadow.assets.image import auto_exposure
+from warpshadow.assets.color import auto_exposure
 from warpshadow.cli import app
 from warpshadow.maths import sh
 
@@ -133,15 +133,6 @@ def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
     assert np.abs(picture[..., :3] - np.clip(image[..., :3] * 2**stops, 0, 1)).max() < EIGHT_BITS
     brightest = (image * 2**stops)[image[..., 3] > 0][:, :3].max(axis=1)
     assert 0 < (brightest > 1).mean() <= 0.011
-
-
-def test_exposure_is_that_of_the_covered_pixels():
-    image = np.zeros((10, 10, 4), np.float32)
-    assert auto_exposure(image) == 0
-    image[5:, :, :] = (4, 1, 1, 1)
-    assert auto_exposure(image) == -2
-    image[..., :3] = 0
-    assert auto_exposure(image) == 0
 
 
 @pytest.mark.parametrize(

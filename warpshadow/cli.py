@@ -95,7 +95,8 @@ def render(
     device: Device = "cpu",
 ) -> None:
     """Render a scene file to an image with soft shadows."""
-    from warpshadow.assets.image import auto_exposure, exposed, write_image
+    from warpshadow.assets.color import auto_exposure, exposed
+    from warpshadow.assets.image import write_image
     from warpshadow.pipeline.renderer import Renderer
     from warpshadow.scene.files import parse_scene
     from warpshadow.scene.scene import AUTO

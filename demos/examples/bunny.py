@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import image_error, on_ground, shipped_mesh
-from warpshadow.assets.image import linear_to_srgb
+from warpshadow.assets.color import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 METHODS = {

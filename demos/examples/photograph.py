@@ -33,7 +33,7 @@ from demos.examples.bunny import checkers, contact_sheet
 from demos.problems import DIRECT, changed, displaced, placement, pose_errors, ray_traced
 from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow import inverse
-from warpshadow.assets.image import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.inverse.world import Found
 from warpshadow.maths.sh import equirectangular_directions

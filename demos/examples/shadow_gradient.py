@@ -20,7 +20,7 @@ import torch
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.assets.image import linear_to_srgb
+from warpshadow.assets.color import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 PARAMETERS = ("x", "z", "scale")

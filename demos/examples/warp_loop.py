@@ -23,7 +23,7 @@ import warp.optim
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import on_ground, shipped_mesh
-from warpshadow.assets.image import linear_to_srgb
+from warpshadow.assets.color import linear_to_srgb
 from warpshadow.device.batch import concatenate
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.rotations import rotation_matrices

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.image import ImageError, write_image
-from warpshadow.assets.light import LUMINANCE, EnvironmentMap
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import draw_test_map, synthetic_sky
 from warpshadow.maths import sh
 from warpshadow.stages.light_samples import sample_map

@@ -8,7 +8,7 @@ from PIL import Image
 
 import warpshadow as ws
 from demos.examples import photograph as demo
-from warpshadow.assets.image import srgb_to_linear
+from warpshadow.assets.color import srgb_to_linear
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.scene.files import write_scene
 

@@ -8,7 +8,7 @@ import torch
 
 import warpshadow as ws
 from warpshadow import inverse
-from warpshadow.assets.image import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.inverse.fit_file import FitFileError, load_fit
 
 SCENE = """

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.assets.image import srgb_to_linear
+from warpshadow.assets.color import srgb_to_linear
 from warpshadow.inverse import (
     Albedo,
     CameraPose,

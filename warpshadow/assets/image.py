@@ -5,7 +5,7 @@ Row 0 is the top. PNG and JPEG hold sRGB, which is decoded and encoded exactly; 
 
 from __future__ import annotations
 
-import re
+import functools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +14,8 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets import files
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.radiance import read_radiance
 
 
 class ImageError(ValueError):
@@ -49,7 +51,7 @@ def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: i
         raise ImageError(f"{path}: got part {part!r}, but only .exr files have parts")
     try:
         return reader(path, part, max_pixels)
-    except ImageError as error:
+    except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
 
 
@@ -162,122 +164,7 @@ def _write_exr(path: Path, pixels: np.ndarray) -> None:
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels}).write(str(path))
 
 
-# --------------------------------------------------------------------------------------------------- Radiance
-
-_RESOLUTION = re.compile(rb"([+-])([XY]) +(\d+) +([+-])([XY]) +(\d+)\s*")
-
-
-def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
-    """Read RGBE: Ward, "Real Pixels", Graphics Gems II, and the file format notes of Radiance."""
-    with path.open("rb") as file:
-        if not file.readline(80).startswith((b"#?RADIANCE", b"#?RGBE")):
-            raise ImageError("not a Radiance file: it does not start with #?RADIANCE or #?RGBE")
-        exposure = np.ones(3)
-        while line := file.readline(4096).strip():
-            key, _, value = line.partition(b"=")
-            if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-                raise ImageError(f"got format {value.strip().decode(errors='replace')}, expected 32-bit_rle_rgbe")
-            if key in (b"EXPOSURE", b"COLORCORR"):  # the product of all, already multiplied into the pixels
-                exposure *= _positive_numbers(key, value)
-        resolution = _RESOLUTION.fullmatch(line := file.readline(80))
-        if not resolution or resolution[2] == resolution[5]:
-            raise ImageError(f"got resolution line {line!r}, expected one like b'-Y 512 +X 1024'")
-        major_sign, major_axis, major, minor_sign, _, minor = resolution.groups()
-        major, minor = int(major), int(minor)
-        _check_size(minor, major, max_pixels)
-        rgbe = _decode_rgbe(file.read(), major, minor)
-    pixels = np.ldexp(rgbe[..., :3].astype(np.float32), rgbe[..., 3:].astype(np.int32) - (128 + 8))
-    pixels[rgbe[..., 3] == 0] = 0
-    if major_axis == b"X":
-        pixels, major_sign, minor_sign = pixels.swapaxes(0, 1), minor_sign, major_sign
-    # Radiance's Y points up and its X right; ours is row 0 at the top.
-    pixels = pixels[:: -1 if major_sign == b"+" else 1, :: -1 if minor_sign == b"-" else 1]
-    return np.ascontiguousarray(pixels / exposure.astype(np.float32))
-
-
-def _positive_numbers(key: bytes, value: bytes) -> np.ndarray:
-    """One number, or three, of a header line."""
-    try:
-        numbers = np.array(value.split(), dtype=np.float64)
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.size not in (1, 3) or not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise ImageError(f"got {key.decode()}={value.decode(errors='replace')}, expected positive numbers")
-    return numbers
-
-
-def _decode_rgbe(data: bytes, line_count: int, width: int) -> np.ndarray:
-    """Decode scanlines, each flat or run-length encoded in the old or new way, to uint8 [line, pixel, 4]."""
-    lines = np.empty((line_count, width, 4), dtype=np.uint8)
-    start = 0
-    for line in range(line_count):
-        is_new_style = (
-            8 <= width < 32768 and data[start : start + 2] == b"\2\2" and data[start + 2 : start + 3] < b"\x80"
-        )
-        decode = _decode_planes if is_new_style else _decode_pixels
-        try:
-            lines[line], start = decode(data, start, width)
-        except (IndexError, ValueError):
-            raise ImageError(f"truncated or damaged: line {line} of {line_count} cannot be decoded") from None
-    return lines
-
-
-def _decode_planes(data: bytes, start: int, width: int) -> tuple[np.ndarray, int]:
-    """Decode a new-style line: four planes of runs (count above 128, value) and literals (count, values)."""
-    if data[start + 2] << 8 | data[start + 3] != width:
-        raise ValueError("the line has another width")
-    start += 4
-    plane = bytearray()
-    while len(plane) < 4 * width:
-        count = data[start]
-        if count > 128:
-            plane += data[start + 1 : start + 2] * (count - 128)
-            start += 2
-        else:
-            plane += data[start + 1 : start + 1 + count]
-            start += 1 + count
-    return np.frombuffer(plane, dtype=np.uint8).reshape(4, width).T, start
-
-
-def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int]:
-    """Decode a flat or old-style line: (1, 1, 1, n) repeats a pixel n times, a second in a row 256 n."""
-    pixels = np.frombuffer(data, dtype=np.uint8, offset=start, count=min(width, (len(data) - start) // 4) * 4)
-    pixels = pixels.reshape(-1, 4)
-    index = np.arange(len(pixels))
-    is_run = (pixels[:, :3] == 1).all(axis=1)
-    source = np.maximum.accumulate(np.where(is_run, -1, index))
-    shift = np.minimum(8 * (index - source - 1), 24)
-    counts = np.where(is_run, pixels[:, 3].astype(np.int64) << np.maximum(shift, 0), 1)
-    used = int(np.searchsorted(np.cumsum(counts), width)) + 1
-    if counts[:used].sum() != width or source[0] < 0:
-        raise ValueError("the line has another width")
-    return pixels[np.repeat(source[:used], counts[:used])], start + 4 * used
-
-
 # ----------------------------------------------------------------------------------------------- PNG and JPEG
-
-
-def auto_exposure(image: np.ndarray) -> float:
-    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
-    covered = image[image[..., 3] > 0]
-    bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
-    return float(-np.log2(bright)) if bright > 0 else 0.0
-
-
-def exposed(image: np.ndarray, stops: float) -> np.ndarray:
-    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
-    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
-    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
-
-
-def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Decode sRGB values in [0, 1] (IEC 61966-2-1), in the precision of the argument."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Encode linear values in [0, 1] as sRGB (IEC 61966-2-1), in the precision of the argument."""
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
@@ -294,12 +181,13 @@ def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndar
     with picture:
         _check_size(*picture.size, max_pixels)
         has_alpha = picture.has_transparency_data
+        is_16_bit = "16B" in str(picture.tile)  # how its pixels are stored; loading them forgets it
         _load(picture)
         ImageOps.exif_transpose(picture, in_place=True)
         if picture.mode.startswith("I"):  # 16-bit gray
             codes = np.asarray(picture).astype(np.uint16)
         else:
-            if path.suffix.lower() == ".png" and _png_depth(path) == 16:
+            if is_16_bit:
                 warnings.warn(f"{path}: 16-bit color is read at 8 bits", stacklevel=3)
             color = "L" if picture.mode in ("1", "L", "LA") else "RGB"
             codes = np.asarray(picture.convert({"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color))
@@ -319,12 +207,6 @@ def _load(picture) -> None:
         raise ImageError(f"truncated or damaged ({error})") from error
 
 
-def _png_depth(path: Path) -> int:
-    """Bits per channel, from the 25th byte of the file."""
-    with path.open("rb") as file:
-        return file.read(25)[-1]
-
-
 def _write_pillow(path: Path, pixels: np.ndarray) -> None:
     from PIL import Image
 
@@ -341,6 +223,10 @@ def _write_pillow(path: Path, pixels: np.ndarray) -> None:
         picture.save(path, quality=95, subsampling=0)
     else:
         picture.save(path)
+
+
+def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    return read_radiance(path, functools.partial(_check_size, max_pixels=max_pixels))
 
 
 _READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {

@@ -13,33 +13,17 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from warpshadow import check
+from warpshadow.assets.cells import CellLight, gather_cells
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.image import ImageError, read_rgb, write_image
 from warpshadow.maths import sh
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
-
 # Degrees about +y that turn a map of the convention into ours, and so what its center shows.
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
-
-
-class CellLight(NamedTuple):
-    """The light of cells of directions, and where in its cell it comes from.
-
-    Args:
-        radiance: Mean radiance, L_q = Q/4π ∫_cell L dω, so that Σ_q (4π/Q) L_q = ∫ L dω; float32 [direction, 3].
-        directions: Mean directions, weighted with luminance; float32 [direction, 3].
-        spreads: Half-angles of the evenly bright caps whose mean vectors are as long: 0 for a point, about 2/√Q for an
-            even cell [radians]; float32 [direction].
-    """
-
-    radiance: np.ndarray
-    directions: np.ndarray
-    spreads: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +93,7 @@ class EnvironmentMap:
     @classmethod
     def constant(cls, rgb: float | Sequence[float] = 1.0, height: int = 16) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB."""
-        check_height(height)
+        check.whole("height", height, what="rows")
         return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
 
     def write(self, path: str | Path) -> None:
@@ -171,9 +155,6 @@ class EnvironmentMap:
     def cells(self, directions: np.ndarray) -> CellLight:
         """Gather the light of the cells around directions: every pixel belongs to the nearest one.
 
-        The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
-        much smaller than a cell are split. A dark cell gets its own direction and the spread of a cap of 4π/Q.
-
         Args:
             directions: Unit vectors, shape [direction, 3].
 
@@ -182,7 +163,7 @@ class EnvironmentMap:
         """
         key = np.asarray(directions, np.float64).tobytes()
         if key not in self._kept_cells:
-            self._kept_cells[key] = self._gathered(directions)
+            self._kept_cells[key] = gather_cells(self.radiance, directions)
             for array in self._kept_cells[key]:
                 array.setflags(write=False)
         return self._kept_cells[key]
@@ -190,34 +171,6 @@ class EnvironmentMap:
     @functools.cached_property
     def _kept_cells(self) -> dict[bytes, CellLight]:
         return {}
-
-    def _gathered(self, directions: np.ndarray) -> CellLight:
-        energy, moment = self._cell_integrals(directions)
-        power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
-        lit = length > 0
-        mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
-        concentration = np.where(lit, length / np.where(lit, power, 1), 1 - 1 / len(energy))
-        spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
-        radiance = energy * (len(energy) / (4 * np.pi))
-        return CellLight(radiance.astype(np.float32), mean.astype(np.float32), spreads.astype(np.float32))
-
-    def _cell_integrals(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Over every cell, ∫ L dω [direction, RGB] and ∫ luminance d dω [direction, 3], float64."""
-        directions = np.asarray(directions, dtype=np.float64)
-        check.shape("directions", directions.shape, ("direction", 3))
-        if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
-            raise ValueError("directions: expected at least one, all unit vectors")
-        count, height = len(directions), len(self.radiance)
-        split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
-        owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
-        weights = sh.pixel_solid_angles(height * split)
-        integrals = np.zeros((6, count))
-        for row, towards in enumerate(sh.equirectangular_directions(height * split)):
-            power = weights[row] * np.repeat(self.radiance[row // split], split, axis=0).astype(np.float64)
-            values = np.concatenate([power, (power @ LUMINANCE)[:, None] * towards], axis=1)
-            for integral, value in zip(integrals, values.T, strict=True):
-                integral += np.bincount(owners[row], value, minlength=count)
-        return integrals[:3].T, integrals[3:].T
 
     def statistics(self) -> dict[str, object]:
         """Measure the radiance (mean over the sphere), its integral and its peak, in plain numbers."""
@@ -239,14 +192,6 @@ class EnvironmentMap:
             "brightest_direction": self.directions().reshape(-1, 3)[order[0]].tolist(),
             "brightest_percent_share": float(brightest / power[-1]) if power[-1] > 0 else 0.0,
         }
-
-
-@functools.lru_cache(maxsize=4)
-def _cells_of_pixels(height: int, directions: bytes) -> np.ndarray:
-    """Number of the direction, of float32 vectors, that is nearest to each pixel, int32 of shape [height, 2·height]."""
-    columns = np.frombuffer(directions, np.float32).reshape(-1, 3).T
-    towards = sh.equirectangular_directions(height)
-    return np.stack([np.argmax(row.astype(np.float32) @ columns, axis=1).astype(np.int32) for row in towards])
 
 
 def _check_aspect(pixels: np.ndarray) -> None:
@@ -274,12 +219,6 @@ def _color(name: str, values: float | Sequence[float]) -> np.ndarray:
     if (color < 0).any():
         raise ImageError(f"{name}: got {check.described(values)}, expected nothing negative")
     return color
-
-
-def check_height(height: int) -> None:
-    """Raise ValueError for what is no number of rows."""
-    if not check.is_integer(height) or height < 1:
-        raise ValueError(f"height: got {check.described(height)}, expected a positive whole number of rows")
 
 
 def _bad_values(radiance: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.image import srgb_to_linear
-from warpshadow.assets.light import LUMINANCE, EnvironmentMap, check_height
+from warpshadow.assets.color import LUMINANCE, srgb_to_linear
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 
 # ---------------------------------------------------------------------------------------- maps from a formula
@@ -64,16 +64,13 @@ def synthetic_sky(
         ground_albedo: Reflectance of the ground.
         height: Rows of the map.
     """
-    sun = check.numbers("sun_direction", sun_direction, expected="a direction (x, y, z)", dtype=np.float64)
-    check.finite("sun_direction", sun)
-    check.shape("sun_direction", sun.shape, (3,))
+    sun = check.array("sun_direction", sun_direction, (3,), "a direction (x, y, z)")
     if not np.any(sun):
         raise ValueError("sun_direction: got a zero vector, expected a direction")
     for name, value in (("sun_strength", sun_strength), ("sun_radius", sun_radius), ("ground_albedo", ground_albedo)):
-        if not (check.is_number(value) and value >= 0):
-            raise ValueError(f"{name}: got {check.described(value)}, expected a number of 0 or more")
-    check_height(height)
-    sun /= np.linalg.norm(sun)
+        check.nonnegative(name, value)
+    check.whole("height", height, what="rows")
+    sun = sun / np.linalg.norm(sun)
     towards, weights = sh.equirectangular_directions(height), sh.pixel_solid_angles(height)[:, None]
     edges = np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)
     on_level = np.pi / height * np.diff(np.sin(edges) ** 2 / 2)[:, None]  # ∫ max(cos θ, 0) dω over a pixel of each row

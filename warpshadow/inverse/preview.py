@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpshadow.assets.image import srgb_to_linear, write_image
+from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.image import write_image
 
 
 def write_preview(path: str | Path, targets: torch.Tensor, images: torch.Tensor) -> None:

@@ -11,7 +11,8 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.image import linear_to_srgb, read_image
+from warpshadow.assets.color import linear_to_srgb
+from warpshadow.assets.image import read_image
 
 _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.light import LUMINANCE, EnvironmentMap
+from warpshadow.assets.color import LUMINANCE
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
@@ -80,10 +82,8 @@ class RandomScenes:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name in ("seed", "count"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 0")
+        check.whole("seed", self.seed, least=0)
+        check.whole("count", self.count, least=0)
         object.__setattr__(self, "bodies", tuple(self.bodies))
         if not self.bodies:
             raise ValueError("bodies: got none, expected one or more to draw from")

@@ -211,7 +211,7 @@ def _check_reflectance(name: str, values: np.ndarray) -> None:
     if (values < 0).any() or (values > 1).any():
         raise ValueError(
             f"{name}: got values from {values.min()} to {values.max()}, expected reflectances in [0, 1], linear: those "
-            "of sRGB colors from 0 to 255 are warpshadow.assets.image.srgb_to_linear(colors / 255)"
+            "of sRGB colors from 0 to 255 are warpshadow.assets.color.srgb_to_linear(colors / 255)"
         )
     values.setflags(write=False)
 

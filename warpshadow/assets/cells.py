@@ -1,0 +1,74 @@
+"""The light of cells of directions, gathered from an environment map."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.color import LUMINANCE
+from warpshadow.maths import sh
+
+
+class CellLight(NamedTuple):
+    """The light of cells of directions, and where in its cell it comes from.
+
+    Args:
+        radiance: Mean radiance, L_q = Q/4π ∫_cell L dω, so that Σ_q (4π/Q) L_q = ∫ L dω; float32 [direction, 3].
+        directions: Mean directions, weighted with luminance; float32 [direction, 3].
+        spreads: Half-angles of the evenly bright caps whose mean vectors are as long: 0 for a point, about 2/√Q for an
+            even cell [radians]; float32 [direction].
+    """
+
+    radiance: np.ndarray
+    directions: np.ndarray
+    spreads: np.ndarray
+
+
+def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:
+    """Gather the light of the cells around directions: every pixel belongs to the nearest one.
+
+    The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
+    much smaller than a cell are split. A dark cell gets its own direction and the spread of a cap of 4π/Q.
+
+    Args:
+        radiance: An equirectangular map, shape [height, 2·height, 3].
+        directions: Unit vectors, shape [direction, 3].
+    """
+    energy, moment = _cell_integrals(radiance, directions)
+    power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
+    lit = length > 0
+    mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
+    concentration = np.where(lit, length / np.where(lit, power, 1), 1 - 1 / len(energy))
+    spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
+    per_cell = energy * (len(energy) / (4 * np.pi))
+    return CellLight(per_cell.astype(np.float32), mean.astype(np.float32), spreads.astype(np.float32))
+
+
+def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Over every cell, ∫ L dω [direction, RGB] and ∫ luminance d dω [direction, 3], float64."""
+    directions = np.asarray(directions, dtype=np.float64)
+    check.shape("directions", directions.shape, ("direction", 3))
+    if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+        raise ValueError("directions: expected at least one, all unit vectors")
+    count, height = len(directions), len(radiance)
+    split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
+    owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
+    weights = sh.pixel_solid_angles(height * split)
+    integrals = np.zeros((6, count))
+    for row, towards in enumerate(sh.equirectangular_directions(height * split)):
+        power = weights[row] * np.repeat(radiance[row // split], split, axis=0).astype(np.float64)
+        values = np.concatenate([power, (power @ LUMINANCE)[:, None] * towards], axis=1)
+        for integral, value in zip(integrals, values.T, strict=True):
+            integral += np.bincount(owners[row], value, minlength=count)
+    return integrals[:3].T, integrals[3:].T
+
+
+@functools.lru_cache(maxsize=4)
+def _cells_of_pixels(height: int, directions: bytes) -> np.ndarray:
+    """Number of the direction, of float32 vectors, that is nearest to each pixel, int32 of shape [height, 2·height]."""
+    columns = np.frombuffer(directions, np.float32).reshape(-1, 3).T
+    towards = sh.equirectangular_directions(height)
+    return np.stack([np.argmax(row.astype(np.float32) @ columns, axis=1).astype(np.int32) for row in towards])
