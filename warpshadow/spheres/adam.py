@@ -11,7 +11,10 @@ RADIUS_RATE = 10.0
 
 
 class Adam:
-    """Descends by gradients whose scale does not matter; it forgets the past of spheres that were moved elsewhere."""
+    """Descends by gradients whose scale does not matter; it forgets the past of spheres that were moved elsewhere.
+
+    By hand: Warp's and torch's Adam count the steps of all rows as one, and cannot forget some.
+    """
 
     def __init__(self, count: int):
         self.mean, self.square, self.age = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros((count, 1))

@@ -93,10 +93,9 @@ def fit_spheres(
     """
     check.instance("mesh", mesh, Mesh, "a Mesh; load_mesh(path) reads one")
     for name, value, least in (("count", count, 0), ("seed", seed, 0), ("steps", steps, 1)):
-        if not check.is_integer(value) or value < least:
-            raise ValueError(f"{name}: got {value!r}, expected an integer of at least {least}")
-    if error is not None and not (check.is_number(error) and error > 0):
-        raise ValueError(f"error: got {error!r}, expected a positive number such as 0.05, or None")
+        check.whole(name, value, least=least)
+    if error is not None:
+        check.positive("error", error)
     job, middle, diagonal = _job(mesh, seed, steps if refine else 0, check.device("device", device))
     fit = partial(_cached_fit if cache else _fit, job, progress)
     with unrecorded():

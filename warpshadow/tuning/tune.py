@@ -188,9 +188,7 @@ def tune(
     wanted = next((value for value in given.values() if value is not None), None)
     if wanted is None or None not in given.values():
         raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
-    if not (check.is_number(wanted) and wanted > 0):
-        name = "error" if milliseconds is None else "milliseconds"
-        raise ValueError(f"{name}: got {wanted!r}, expected a positive number")
+    check.positive("error" if milliseconds is None else "milliseconds", wanted)
     sample = PointSample(scene, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE
     settings = list(_settings(scene, is_coarse, fits, device))
