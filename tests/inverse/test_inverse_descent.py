@@ -32,7 +32,7 @@ from warpshadow.inverse import (
     fit,
 )
 from warpshadow.inverse.descent import WINDOW
-from warpshadow.inverse.stages import check_stages, deformation_stages, pose_stages
+from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages
 from warpshadow.torch import rotation_matrices
 
 

@@ -9,7 +9,7 @@ import torch
 import warpshadow as ws
 from warpshadow.inverse import Albedo, Light, Loss, Pose, Problem, Target, fit
 from warpshadow.inverse.model import LightModel, Model, make_model
-from warpshadow.inverse.stages import Stage
+from warpshadow.inverse.schedule import Stage
 
 CPU = torch.device("cpu")
 

@@ -10,7 +10,7 @@ from warpshadow.inverse.free import Albedo, CameraPose, Deformation, Exposure, F
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import write_result
-from warpshadow.inverse.stages import Stage, deformation_stages, pose_stages
+from warpshadow.inverse.schedule import Stage, deformation_stages, pose_stages
 from warpshadow.inverse.target import Target
 
 __all__ = [

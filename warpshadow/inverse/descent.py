@@ -23,7 +23,7 @@ from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.stages import Stage, check_stages
+from warpshadow.inverse.schedule import Stage, check_stages
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.scene import Scene
 

@@ -31,7 +31,7 @@ from warpshadow.inverse import (
     pose_stages,
     short_adam,
 )
-from warpshadow.inverse.stages import check_stages
+from warpshadow.inverse.schedule import check_stages
 from warpshadow.inverse.target import read_target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera

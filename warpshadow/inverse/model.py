@@ -9,7 +9,7 @@ import torch
 
 from warpshadow.inverse.free import Light, Values
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.stages import Stage
+from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.target import stacked
 from warpshadow.inverse.world import Setting, World
 from warpshadow.torch import TorchRenderer

@@ -17,7 +17,7 @@ from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.preview import white_of
-from warpshadow.inverse.stages import Stage
+from warpshadow.inverse.schedule import Stage
 from warpshadow.maths.sh import reconstruct_map
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene

@@ -1,4 +1,4 @@
-"""Stages: what a descent does in which order, coarse to fine."""
+"""Schedules: the stages of a fit, coarse to fine; the stages of an image are another thing, warpshadow.stages."""
 
 from __future__ import annotations
 
