@@ -9,10 +9,10 @@ import warp as wp
 
 
 def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array:
-    """An array of values on a device, the same one each time for the same values. It must not be written to.
+    """Give constants to a device: equal values give the same array, which must not be written to.
 
-    A loop so copies them once; and a CUDA graph, which would copy from where the host had them at the capture, finds
-    them on the device if they were there before.
+    So a loop copies its constants once, and a CUDA graph copies none. (A graph would record the address of the host's
+    values, which may be gone at a replay; constants that were on the device before the capture are safe.)
 
     Args:
         values: The values, of the array's shape and then that of an item.
@@ -20,8 +20,7 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
         device: Where the array lives.
 
     Raises:
-        RuntimeError: for values that come for the first time while a graph is captured: what is made then is filled
-            by the graph alone, and cannot be kept.
+        RuntimeError: for new values while a graph is captured: only a replay of the graph would fill the array.
     """
     values = np.ascontiguousarray(values)
     array = _constant(values.tobytes(), values.dtype.str, values.shape, dtype, str(device))
@@ -35,7 +34,7 @@ _collections: list[list[wp.array]] = []
 
 @contextlib.contextmanager
 def collected() -> Iterator[list[wp.array]]:
-    """Collect the constants that are asked for meanwhile: who reads them later, as a graph does, has to hold them."""
+    """Collect the constants that are used meanwhile. Whoever reads them later, as a graph does, must hold them."""
     arrays: list[wp.array] = []
     _collections.append(arrays)
     try:

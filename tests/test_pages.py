@@ -1,0 +1,205 @@
+"""Pages are true: links lead somewhere, names exist, commands start, and snippets run as they stand."""
+
+import dataclasses
+import importlib
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import warpshadow as ws
+from warpshadow.cli import app
+from warpshadow.inverse.fit_file import load_fit
+from warpshadow.maths.directions import fibonacci
+from warpshadow.scene import blockers
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("demos", "tests", "warpshadow")
+PAGES = [*sorted(ROOT.glob("*.md")), *(page for folder in FOLDERS for page in sorted((ROOT / folder).rglob("*.md")))]
+FILES = [str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")]
+MAKEFILE = (ROOT / "Makefile").read_text("utf-8")
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=name_of)
+each_page_of_today = pytest.mark.parametrize("page", [p for p in PAGES if p.name != "CHANGELOG.md"], ids=name_of)
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def prose(page):
+    return re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def code(page):
+    """What a page has between backticks, and its lines of commands."""
+    spans = re.findall(r"`([^`]+)`", prose(page))
+    indented = re.findall(r"^    (\S.*)$", prose(page), re.MULTILINE)
+    return [*spans, *indented, *"".join(blocks(page, "sh")).splitlines()]
+
+
+def links(page):
+    return re.findall(r"\]\(([^)\s]+)\)", prose(page))
+
+
+def anchors(page):
+    """What GitHub calls the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+# ------------------------------------------------------------------------------------------------ what pages name
+
+
+@each_page
+def test_links_lead_to_files_and_headings(page):
+    for link in links(page):
+        if not re.match(r"https?:", link):
+            path, _, anchor = link.partition("#")
+            target = page.parent / path if path else page
+            assert target.exists(), link
+            assert not anchor or anchor in anchors(target), link
+
+
+def test_every_page_is_found_from_the_first():
+    found, left = set(), [ROOT / "README.md"]
+    while left:
+        page = left.pop()
+        found.add(page)
+        targets = {(page.parent / link.partition("#")[0]).resolve() for link in links(page) if link[0] != "#"}
+        left += [target for target in targets if target.suffix == ".md" and target not in found]
+    assert set(PAGES) == found
+
+
+def test_the_first_page_takes_a_few_minutes_to_read():
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 150
+
+
+@each_page_of_today
+def test_files_that_a_page_names_exist(page):
+    """By their ends; what users write or get, such as scene.toml, is not looked for."""
+    for text in code(page):
+        for name in re.findall(r"[\w./]+\.(?:py|json)\b", text):
+            assert any(f"/{file}".endswith(f"/{name}") for file in FILES), name
+
+
+@each_page_of_today
+def test_names_of_the_package_exist(page):
+    for text in [*code(page), *blocks(page, "python")]:
+        for name in re.findall(r"\bws\.(\w+)", text):
+            assert hasattr(ws, name), name
+        for path in re.findall(r"\bwarpshadow(?:\.\w+)+", text):
+            if not path.endswith((".py", ".toml")):
+                assert resolved(path), path
+
+
+def resolved(path):
+    """Whether a dotted path leads to a module or what is in it."""
+    parts = path.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if not hasattr(value, part):
+                return False
+            value = getattr(value, part)
+        return True
+    return False
+
+
+# ------------------------------------------------------------------------------------------------ commands
+
+
+@each_page_of_today
+def test_commands_and_their_options_exist(page):
+    for text in code(page):
+        for target in re.findall(r"^make (?!PYTHON)([a-z-]+)", text):
+            assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE), text
+        if match := re.match(r"(?:warpshadow) ([a-z]+)\b", text):
+            assert_options(text, warpshadow_help(match[1]))
+        if match := re.search(r"(demos/\w+/\w+\.py)", text):
+            assert_options(text, (ROOT / match[1]).read_text("utf-8"))
+
+
+def warpshadow_help(command):
+    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"})
+    assert result.exit_code == 0, command
+    return result.output
+
+
+def assert_options(text, accepted):
+    for option in re.findall(r"(?<!\S)\[?(--[a-z-]+)", text.partition("#")[0]):
+        assert option in ("--help", "--nproc_per_node") or option in accepted, text
+
+
+# ------------------------------------------------------------------------------------------------ snippets
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the files that snippets read."""
+    monkeypatch.chdir(tmp_path)
+    ws.icosphere(0.6, 3).write("bunny.obj")
+    ws.synthetic_sky(height=32).write("sky.exr")
+    pixels = np.full((64, 64, 3), 0.5, np.float32)
+    ws.write_image("photo.png", pixels)
+    ws.write_image("mask.png", pixels)
+    return tmp_path
+
+
+def scene_file():
+    return blocks(ROOT / "warpshadow" / "scene" / "README.md", "toml")
+
+
+def test_the_scene_file_is_one(folder):
+    scene, automatic = scene_file()
+    Path("scene.toml").write_text(scene, "utf-8")
+    loaded = ws.load_scene("scene.toml")
+    assert len(loaded.bodies) == 2
+    assert dataclasses.asdict(loaded.visibility) == dataclasses.asdict(ws.Visibility())  # as it says, all are defaults
+    assert ws.Visibility(**tomllib.loads(automatic)["visibility"]).method == "auto"
+
+
+def test_the_fit_files_are_some(folder):
+    Path("scene.toml").write_text(scene_file()[0], "utf-8")
+    fit, stages = blocks(ROOT / "warpshadow" / "inverse" / "README.md", "toml")
+    for text in (fit, re.sub(r"^stages = .*\n", "", fit, flags=re.MULTILINE) + stages):
+        Path("fit.toml").write_text(text, "utf-8")
+        assert load_fit("fit.toml").problem.free
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
+    """Those of the first page, and then of the others with its scene. Only the spheres are known before, not fitted."""
+    balls = ws.Spheres(0.5 * fibonacci(64), np.full(64, 0.1))
+    monkeypatch.setattr(blockers, "fit_spheres", lambda *_, **__: SimpleNamespace(spheres=balls))
+    names = {}
+    for snippet in blocks(ROOT / "README.md", "python"):
+        exec(snippet, names)
+    image = ws.read_image("out.exr")
+    assert image[..., :3].max() > 0.1
+    assert np.abs(names["image"].detach().numpy() - image).mean() < 0.05  # its fit has found light and texture
+    ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
+    for page in ("pipeline", "inverse"):
+        for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
+            exec(snippet, names)
+    assert "receivers" in capsys.readouterr().out  # what explain says
+    assert Path("explained.exr").exists()
+    assert Path("found", "scene.toml").exists()
