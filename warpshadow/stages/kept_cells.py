@@ -1,4 +1,4 @@
-"""Kept visibility of static bodies, combined with that of what moves."""
+"""Kept visibility of static bodies, combined with that of moving bodies."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,6 @@ class KeptRows(NamedTuple):
 
     rows: wp.array  # [row, channel, item] float32
     index: wp.array  # [receiver] int32
-
-
-# ---------------------------------------------------------------------------------------------- joined with what moves
 
 
 @wp.kernel(enable_backward=False)
@@ -62,11 +59,11 @@ def _light_cells_adjoint(
 
 
 def light_cells(transmittance: wp.array, kept: KeptRows) -> wp.array:
-    """Light receivers on still bodies by what still bodies let pass of known light and moving ones of that.
+    """Light receivers on static bodies by known light, which static and moving bodies shadow.
 
     Args:
         transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
-        kept: Light of the cells, [row, 3, direction].
+        kept: Irradiance from each cell of directions, shadowed by static bodies, [row, 3, direction].
 
     Returns:
         Shading, vec3 of shape [batch, receiver].
@@ -108,11 +105,11 @@ def _multiply_cells(
 
 
 def cell_transfer(transmittance: wp.array, kept: KeptRows) -> wp.array:
-    """Transfer vectors of receivers on still bodies: what still bodies let pass times what moving ones do.
+    """Transfer vectors of receivers on static bodies: those that static bodies leave, times the transmittance.
 
     Args:
         transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
-        kept: What of light of 1 the still bodies let pass, [row, 1, direction].
+        kept: Transfer vectors with static bodies alone, [row, 1, direction].
 
     Returns:
         Transfer vectors, float32 of shape [batch, receiver, direction].
@@ -152,7 +149,7 @@ def _add_rows(
 
 
 def add_rows(kept: KeptRows, sums: wp.array) -> None:
-    """Add what stands to sums over what moves, in place.
+    """Add the kept sums over static bodies to sums over moving bodies, in place.
 
     No adjoint is needed: a constant leaves the gradient as it is.
 

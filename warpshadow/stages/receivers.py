@@ -1,7 +1,7 @@
 """Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
 
-They are the vertices of what is seen, and for bodies that want it the points that the samples see. Where a surface is
-seen from behind (:mod:`warpshadow.stages.sides`), they are others, at the same places, with opposite normals.
+Receivers are vertices of visible faces, or for some bodies the points that samples see. The back of a face
+(:mod:`warpshadow.stages.sides`) has receivers of its own, at the same points, with opposite normals.
 """
 
 from typing import NamedTuple
@@ -17,14 +17,18 @@ from warpshadow.stages.silhouettes.find import Silhouettes
 
 
 class Receivers(NamedTuple):
-    """Receivers of every instance."""
+    """Receivers of every instance.
+
+    The first receivers are vertices of static bodies: they have indices, but no points and normals here. A sample with
+    a receiver r of its own sees a face (r, r, r), which follows the mesh's faces.
+    """
 
     points: wp.array  # [batch, receiver − still] vec3
     normals: wp.array  # [batch, receiver − still] vec3
     faces: wp.array  # [face or side + own] vec3i, indices of receivers
-    of_vertices: wp.array  # [vertex, and their backs if any is seen] int32, -1 for none
-    fragments: Fragments  # pixel receivers add a degenerate face (r, r, r) each, which its sample sees
-    still: np.ndarray = np.empty(0, int)  # [still], vertices that are the first receivers; points are of those after
+    of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
+    fragments: Fragments  # of these faces
+    still: np.ndarray = np.empty(0, int)  # [still], the vertices that the first receivers are
 
 
 @wp.func
@@ -96,8 +100,8 @@ def _weigh_own(
 class Numbering(NamedTuple):
     """Which vertices are receivers, and their numbers."""
 
-    vertices: wp.array | None  # [receiver − still] int32, those after the still ones; None for all as they are
-    still: np.ndarray  # [still]
+    vertices: wp.array | None  # [receiver − still] int32, those not on static bodies; None for all vertices as they are
+    still: np.ndarray  # [still], those on static bodies, which are the first receivers
     faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
 
@@ -110,28 +114,28 @@ class Numbering(NamedTuple):
 def number_receivers(
     faces: wp.array,
     keeps_vertex: np.ndarray,
-    is_still: np.ndarray | None = None,
-    order: np.ndarray | None = None,
+    is_static: np.ndarray | None = None,
+    sequence: np.ndarray | None = None,
 ) -> Numbering:
     """Choose the vertices that are receivers.
 
     Args:
         faces: Vertex indices, vec3i of shape [face].
         keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
-        is_still: Vertices that stand still, bool of shape [vertex]; None where any may move.
-        order: Order in which vertices become receivers, shape [vertex]: light is found fastest for neighbors side by
-            side. None for their own.
+        is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
+        sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
+            where neighbors follow each other. None for the mesh's.
     """
     device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
-    if side_count == 1 and keeps_vertex.all() and is_still is None and order is None:
+    if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None:
         of_vertices = constant(np.arange(vertex_count), wp.int32, device)
         return Numbering(None, np.empty(0, int), faces, of_vertices)
-    is_still = np.zeros(vertex_count, bool) if is_still is None else is_still
-    order = np.arange(vertex_count) if order is None else order
+    is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
+    sequence = np.arange(vertex_count) if sequence is None else sequence
     shifts = vertex_count * np.arange(side_count)
-    order = (order + shifts[:, None]).ravel()
-    stays, moves = (keeps_vertex & is_still).ravel(), (keeps_vertex & ~is_still).ravel()
-    still, vertices = order[stays[order]], order[moves[order]]
+    sequence = (sequence + shifts[:, None]).ravel()
+    stays, moves = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
+    still, vertices = sequence[stays[sequence]], sequence[moves[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
     of_vertices[np.concatenate([still, vertices])] = np.arange(len(still) + len(vertices))
     corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
