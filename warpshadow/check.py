@@ -180,12 +180,13 @@ def number(name: str, value: object) -> float:
     return float(value)
 
 
-def array(name: str, values: object, shape_: tuple[int, ...], meaning: str = "") -> np.ndarray:
+def array(name: str, values: object, lengths: tuple[int, ...], meaning: str = "") -> np.ndarray:
     """Copy finite numbers of a shape to a read-only array of float64; a message ends with what they mean."""
-    rows = "".join(f"{length} rows of " for length in shape_[:-1])
-    meaning = meaning or f"{rows}{shape_[-1]} finite numbers"
-    copied = numbers(name, values, expected=meaning, dtype=np.float64)
-    shape(name, copied.shape, shape_, meaning)
+    rows = "".join(f"{length} rows of " for length in lengths[:-1])
+    expected = f"{rows}{lengths[-1]} finite numbers{meaning and f': {meaning}'}"
+    copied = numbers(name, values, expected=expected, dtype=np.float64)
+    if copied.shape != lengths:
+        raise ValueError(f"{name}: got {described(values)}, expected {expected}")
     finite(name, copied)
     copied.setflags(write=False)
     return copied

@@ -351,4 +351,6 @@ def test_a_loaded_fit_runs_with_its_stages_optimizer_tolerance_and_seed(load, mo
     fit.run(device="cpu", progress=True)
     assert isinstance(fit.optimizer, functools.partial)
     expected = {"optimizer": fit.optimizer, "tolerance": 0.5, "seed": 3, "device": "cpu", "progress": True}
-    assert got == expected | {"args": (fit.problem, fit.stages)}
+    assert got.pop("args") == (fit.problem, fit.stages)
+    assert {name: got.pop(name) for name in expected} == expected
+    assert got == {"checkpoint": None, "checkpoint_seconds": 10.0, "preview": None}

@@ -9,7 +9,7 @@ import hashlib
 import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def alone(path: str | Path | None) -> Iterator[None]:
         raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHERWISE}") from error
 
 
-def save(path: str | Path, state: dict[str, Any]) -> None:
+def save(path: str | Path, state: Mapping[str, object]) -> None:
     """Write a state, atomically; the checkpoint before it stays as FILE.previous.
 
     Args:

@@ -245,7 +245,7 @@ class _Descent:
             group["lr"] = stage.rate(len(self.losses[-1]))
         evaluated: list[float] = []
 
-        def closure() -> Any:
+        def closure() -> float:
             self.optimizer.zero_grad()
             try:
                 loss, images = self.model.loss(self.values)
@@ -257,7 +257,7 @@ class _Descent:
             loss.backward()
             _check_finite({f"the gradient of {name}": tensor.grad for name, tensor in self.tensors.items()})
             evaluated.append(float(loss.detach()))
-            return loss
+            return evaluated[-1]
 
         before = _copied(self.values)
         self.optimizer.step(closure)

@@ -43,7 +43,7 @@ _TARGET_KEYS = ("image", "mask", "camera")
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
 _STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {"pose": pose_stages, "deformation": deformation_stages}
-_pair = functools.partial(check.array, shape_=(2,))
+_pair = functools.partial(check.array, lengths=(2,))
 _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Callable[[str, object], Any]]]] = {
     "adam": (torch.optim.Adam, {"betas": _pair}),
     "sgd": (torch.optim.SGD, {"momentum": check.number, "dampening": check.number, "nesterov": check.flag}),
@@ -78,15 +78,27 @@ class Fit:
     tolerance: float
     seed: int
 
-    def run(self, **options: Any) -> Result:
-        """Run it; the options are those of :func:`warpshadow.inverse.fit`: device, checkpoint, preview, progress."""
+    def run(
+        self,
+        *,
+        device: str | torch.device = "cpu",
+        checkpoint: str | Path | None = None,
+        checkpoint_seconds: float = 10.0,
+        preview: str | Path | None = None,
+        progress: bool = False,
+    ) -> Result:
+        """Run it; the options are those of :func:`warpshadow.inverse.fit`."""
         return fit(
             self.problem,
             self.stages,
             optimizer=self.optimizer,
             tolerance=self.tolerance,
             seed=self.seed,
-            **options,
+            device=device,
+            checkpoint=checkpoint,
+            checkpoint_seconds=checkpoint_seconds,
+            preview=preview,
+            progress=progress,
         )
 
 
@@ -135,13 +147,13 @@ def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
     check.known_keys("key", table, _TARGET_KEYS)
     image = read_target(toml_tables.file(table, "image", folder))
-    mask: Any = toml_tables.file(table, "mask", folder) if "mask" in table else None
+    mask: Table = {"mask": toml_tables.file(table, "mask", folder)} if "mask" in table else {}
     camera = None
     if "camera" in table:
         with check.located("camera"):
             toml_tables.check_table(table["camera"])
             camera = parse_camera({"size": [image.shape[1], image.shape[0]]} | table["camera"])
-    return Target(image, mask, camera)
+    return Target(image, camera=camera, **mask)
 
 
 # ---------------------------------------------------------------------------------------------- what is free

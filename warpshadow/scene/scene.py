@@ -75,7 +75,8 @@ class Visibility:
         check.choice("log", self.log, LOGS)
         check.choice("base", self.base, THRESHOLDS)
         check.whole("samples", self.samples, what="directions")
-        check.positive("error", self.error)
+        if not (check.is_number(self.error) and self.error > 0):
+            raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
         edge_width(self.softness, self.directions)
         check_merging(self.merging)
 

@@ -68,7 +68,7 @@ def file(table: Table, key: str, folder: Path) -> Path:
 # ---------------------------------------------------------------------------------------------- writing
 
 
-def write(path: Path, tables: Mapping[str, Any]) -> None:
+def write(path: Path, tables: Mapping[str, object]) -> None:
     """Write a TOML file that reads back as the same values, to the last bit of a number.
 
     By hand: tomli-w gives each number of a matrix a line, and puts all bodies into one list; tomlkit is slower to
@@ -90,16 +90,16 @@ def write(path: Path, tables: Mapping[str, Any]) -> None:
         unfinished.write_text("\n".join([_lines(plain), *blocks] if plain else blocks), encoding="utf-8")
 
 
-def block(header: str, table: Mapping[str, Any]) -> str:
+def block(header: str, table: Mapping[str, object]) -> str:
     """A table as lines of a TOML file, under its header."""
     return f"{header}\n{_lines(table)}"
 
 
-def _lines(table: Mapping[str, Any]) -> str:
+def _lines(table: Mapping[str, object]) -> str:
     return "".join(f"{key} = {_value(value)}\n" for key, value in table.items())
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     """TOML for a value, NumPy's or Python's; matrices get a line for each row."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
