@@ -199,7 +199,7 @@ def test_held_squarings_draw_a_warning_and_plain_ones_none(device, recwarn):
 
 @pytest.mark.slow
 def test_plain_squaring_would_have_overflowed_where_held_squaring_is_good():
-    """What the README says of overlap."""
+    """What stages/README.md says of overlap."""
     errors = stability.overlap_errors()
     for log in LOGS:
         plain, held = np.array(errors[f"{log} 8, plain squaring"]), np.array(errors[f"log-SH {log} 8"])

@@ -75,7 +75,7 @@ def _check_output(path: Path, *suffixes: str, instead: str = "") -> None:
 
 @app.command()
 def render(
-    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
+    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage."),
@@ -132,7 +132,7 @@ def render(
 
 @app.command()
 def tune(
-    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; the README lists its keys.")],
+    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
     error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
     ms: Annotated[
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
@@ -189,7 +189,7 @@ def _device(name: str) -> wp.Device:
 
 @app.command()
 def fit(
-    file: Annotated[Path, typer.Argument(help="Fit file, TOML; the README lists its keys.")],
+    file: Annotated[Path, typer.Argument(help="Fit file, TOML; warpshadow/inverse/README.md lists its keys.")],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="Folder for the results, and for the checkpoint that a fit goes on from."),

@@ -99,7 +99,7 @@ class TorchRenderer(torch.nn.Module):
         Raises:
             ValueError: naming the argument, what it got and what it accepts.
 
-        Differentiable: light, albedo, textures, geometry, clip_matrices; the README's table says how exactly.
+        Differentiable: light, albedo, textures, geometry, clip_matrices; stages/README.md says how exactly.
         """
         renderer, bodies = self.renderer, self.renderer.scene.bodies
         geometry = None if geometry is None else as_geometry("geometry", geometry)
