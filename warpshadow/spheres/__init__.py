@@ -1,15 +1,15 @@
-"""Spheres that stand in for a mesh as it casts shadows.
+"""Spheres that cast the shadows of a mesh in its place.
 
     cover       stage 1, the paper's: medial balls picked greedily, then descent on the volume outside the mesh and
                 the surface left bare                               [Lyu et al. 2021, section 3.2; Wang et al. 2006]
-    refine      stage 2: move, grow, shrink and relocate them until receivers on and around the mesh see through
-                them what they see past the mesh: gradient descent on ray-traced visibility
+    refine      stage 2: gradient descent until receivers on and around the mesh have the same visibility past the
+                spheres as past the mesh, by rays; spheres that matter little are relocated
     measure     irradiance under a sky with a sun, the spheres' against the mesh's
     fit         the stages in order, the search for an error, the cache
 
-Stage 1 serves volume, stage 2 serves light: spheres leave the mesh where that helps the shadow. It sees the cones of
-warpshadow.stages.visibility.cones with the soft edge of the directional method, so the rules that a renderer applies to
-receivers on and inside spheres are part of what is fitted.
+Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh. Stage 2 uses the cones of
+warpshadow.stages.visibility.cones and the soft edge of the directional method, so the fit accounts for what a renderer
+does at receivers on and inside spheres.
 """
 
 from warpshadow.spheres.fit import SphereFit, fit_spheres, is_fitted

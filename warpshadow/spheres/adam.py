@@ -11,9 +11,9 @@ RADIUS_RATE = 10.0
 
 
 class Adam:
-    """Descends by gradients whose scale does not matter; it forgets the past of spheres that were moved elsewhere.
+    """Gradient descent that does not depend on the gradient's scale; relocated spheres start without a history.
 
-    By hand: Warp's and torch's Adam count the steps of all rows as one, and cannot forget some.
+    Written by hand, since in Warp's and torch's Adam all rows share one count of steps, and none starts anew alone.
     """
 
     def __init__(self, count: int):

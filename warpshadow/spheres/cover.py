@@ -1,4 +1,4 @@
-"""Stage 1: spheres that cover a mesh and leave it little.
+"""Stage 1: spheres that cover a mesh and reach little beyond it.
 
     E(c, r) = Σ_i |S_i outside the mesh|  +  BARE ∫_surface max(min_i |p − c_i| − r_i, 0) dA
 

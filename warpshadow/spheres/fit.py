@@ -87,9 +87,6 @@ def fit_spheres(
 
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
     check.instance("mesh", mesh, Mesh, "a Mesh; load_mesh(path) reads one")
     for name, value, least in (("count", count, 0), ("seed", seed, 0), ("steps", steps, 1)):

@@ -1,4 +1,4 @@
-"""Exact occlusion by spheres, ray by ray: the reference of what smooths it or limits its bands."""
+"""Exact occlusion by spheres, ray by ray: the reference for methods that smooth it or limit its bands."""
 
 import warp as wp
 
@@ -46,8 +46,8 @@ def _exact_occlusion(
 def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
     """Test which rays spheres block, without any smoothing: the reference of the approximations.
 
-    A receiver on or inside a sphere sees it as warpshadow.stages.visibility.cones has it: as a hemisphere around the
-    direction of its center, and not at all nearer than FADE/2 radii to the center.
+    For a receiver on or inside a sphere, the rule of warpshadow.stages.visibility.cones holds: the sphere blocks the
+    hemisphere around the direction of its center, and nothing if that is nearer than FADE/2 radii.
 
     Args:
         points: Receiver positions [scene units], vec3, shape [batch, vertex].

@@ -1,8 +1,9 @@
-"""Stage 2: spheres that let through the light that the mesh lets through.
+"""Stage 2: spheres that cast the shadows of the mesh.
 
-Receivers on the mesh, on grounds below it and in a shell around it know from rays which directions they see. Adam moves
-and grows spheres until their transmittance, with the soft edge of warpshadow.stages.visibility.directional, says the
-same after smoothing by lights of several sharpnesses; spheres that matter little are relocated on the way.
+Receivers are on the mesh, on grounds below it and in a shell around it. Rays tell which directions they see past the
+mesh. Adam moves and scales the spheres until their transmittance, with the soft edge of
+warpshadow.stages.visibility.directional, agrees with that under lights of several sharpnesses. Spheres that matter
+little are relocated on the way.
 """
 
 from __future__ import annotations
@@ -238,7 +239,7 @@ class _View(NamedTuple):
 
 
 class Refinement:
-    """Receivers around a body, what they see past it, and how the spheres' view differs."""
+    """Receivers around a body, their visibility past it by rays, and the loss of spheres against it."""
 
     DIRECTIONS = 128
     RECEIVERS = 12288

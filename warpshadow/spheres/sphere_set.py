@@ -20,9 +20,6 @@ class Spheres:
     Args:
         centers: Centers [scene units], float32, shape [sphere, 3].
         radii: Radii [scene units], not negative, float32, shape [sphere]; a radius of 0 blocks nothing.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     centers: np.ndarray = field(repr=False)

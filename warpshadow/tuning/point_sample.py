@@ -31,8 +31,8 @@ class PointReceivers(NamedTuple):
 class PointSample:
     """A seeded sample of the points that the camera of a scene sees, each pixel as likely as any other.
 
-    Each is drawn from a compact patch of the image, as many pixels as any other's, since errors dwell along the edges
-    of shadows, of which each sample should have its share.
+    Each is drawn from a compact patch of the image, as many pixels as any other's, since errors concentrate along
+    the edges of shadows, and each sample should have its share of them.
 
     Args:
         scene: The scene; its method is not looked at.

@@ -178,7 +178,7 @@ def tune(
         What was chosen, and all that was tried. Where none reaches what was wanted it is the nearest.
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so where the camera sees nothing.
+        ValueError: where the camera sees nothing.
     """
     from tqdm import tqdm
 
