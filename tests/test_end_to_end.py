@@ -8,8 +8,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline import renderer as renderer_module
-from warpshadow.pipeline import views
+from warpshadow.pipeline import view as view_module
 from warpshadow.stages import film
 from warpshadow.stages.textures import pyramid, sample
 from warpshadow.torch import TorchRenderer, apply, rotation_matrices
@@ -187,8 +186,8 @@ def test_a_limb_pulls_by_the_color_it_has_at_its_edge(monkeypatch):
     shifts = np.eye(7)[3:6]
     got, expected = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
     assert relative_error(got, expected) < SILHOUETTE
-    monkeypatch.setattr(renderer_module, "find_edge_colors", lambda *arguments: None)
-    monkeypatch.setattr(renderer_module, "pull_surfaces", lambda *arguments: None)
+    monkeypatch.setattr(view_module, "find_edge_colors", lambda *arguments: None)
+    monkeypatch.setattr(view_module, "pull_surfaces", lambda *arguments: None)
     expose = film.expose
     monkeypatch.setattr(film, "expose", lambda *arguments, **_: expose(*arguments))
     beside, _ = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
@@ -331,8 +330,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
     for _ in range(2):
         (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
         results.append((renderer(textures=[None, image]).detach(), gradient))
-    ((_, level),) = renderer.renderer.scene_view.kept.footprints.values()
-    assert level == coarsest
+    assert renderer.renderer.scene_view.surfaces.coarsest_level((None, (size, size))) == coarsest
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
 
@@ -349,7 +347,7 @@ def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, 
     results, counts = {}, {}
     for name in ("seen", "every"):
         if name == "every":
-            monkeypatch.setattr(views, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
+            monkeypatch.setattr(view_module, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
         renderer = TorchRenderer(scene)
         counts[name] = renderer.renderer.scene_view.receivers.points.shape[1]
         rotations, translations, scales = renderer.scene_poses()

@@ -176,13 +176,13 @@ def stages(device: str, runs: int = 10) -> list[dict[str, float | str]]:
     floors = {stage.name: stage for stage in kernel_floor.stages(size, rising, reached)}
     items = kernel_floor.counts(size)
     renderer = TorchRenderer(scene, device="cpu" if device == "cpu" else device)
-    renderer.renderer.ledger.waits = True
+    renderer.renderer.clock.waits = True
     rotations, translations, scales = renderer.scene_poses()
     translations.requires_grad_()
     times: dict[str, list[tuple[float, float]]] = {}
     for _ in range(runs + 1):
         renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
-        for name, timing in renderer.renderer.ledger.timings.items():
+        for name, timing in renderer.renderer.clock.timings.items():
             times.setdefault(name, []).append((1e3 * timing.forward, 1e3 * (timing.backward or 0.0)))
     rows: list[dict[str, float | str]] = []
     for name, each in times.items():

@@ -42,7 +42,6 @@ from warpshadow.pipeline.assembly import Geometry
 from warpshadow.spheres import fit_spheres
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.torch import TorchRenderer
-from warpshadow.tuning.point_sample import at_receivers
 from warpshadow.tuning.timing import median_times
 
 Timed = dict[str, Callable[[], object]]
@@ -95,22 +94,22 @@ def shading(scene: ws.Scene) -> Timed:
     """Visibility and shading of all vertices, by themselves and with all gradients."""
     renderer = ws.Renderer(scene)
     order = renderer.assembly.vertex_order  # in which renderers light them
-    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces).numpy()[:, order]
-    points = renderer.geometry.positions.numpy()[:, order]
-    view = at_receivers(renderer.scene_view, renderer, points, normals)
-    free = [wp.clone(array, requires_grad=True) for array in (*view.receivers[:2], *renderer.geometry[1:])]
+    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces)
+    points, normals = (
+        wp.array(array.numpy()[:, order], dtype=wp.vec3) for array in (renderer.geometry.positions, normals)
+    )
+    free = [wp.clone(array, requires_grad=True) for array in (points, normals, *renderer.geometry[1:])]
 
     def forward_and_backward() -> None:
-        receivers = view.receivers._replace(points=free[0], normals=free[1])
         geometry = Geometry(renderer.geometry.positions, *free[2:])
         with wp.Tape() as tape:
-            result = renderer.shade(view=view._replace(receivers=receivers, geometry=geometry))
+            result = renderer.shade(view=renderer.at_points(*free[:2], geometry))
         result.grad.fill_(1.0)
         tape.backward()
         tape.zero()
 
     return {
-        "visibility and shading": lambda: renderer.shade(view=view._replace()),
+        "visibility and shading": lambda: renderer.shade(view=renderer.at_points(points, normals)),
         "… and back": forward_and_backward,
     }
 

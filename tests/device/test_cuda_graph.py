@@ -10,7 +10,7 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.device import cuda_graph
 from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import views
+from warpshadow.pipeline import view as view_module
 
 SPHERES = ws.Spheres([(0.2, 0, 0), (-0.2, 0.1, 0), (0, 0.2, 0.2)], [0.3, 0.25, 0.2])
 
@@ -121,7 +121,7 @@ def squared_difference(image, target):
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, scene, device, monkeypatch):
     """As on a GPU, all vertices are receivers."""
-    monkeypatch.setattr(views, "is_readable", lambda device: False)  # as on a GPU
+    monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
     scene = ws.Scene(scene.bodies, scene.light, scene.camera, ws.Visibility(method, directions=32, order=3))
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
     target = wp.clone(pose.draw(), requires_grad=False).flatten()
@@ -143,7 +143,7 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, sc
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
 def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, scene, monkeypatch):
     """A graph would copy from memory that the host has long given to others."""
-    monkeypatch.setattr(views, "is_readable", lambda device: False)  # as on a GPU
+    monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
     ground = ws.Body(ws.plane(4, 8), texture=np.full((4, 4, 3), 0.5))
     visibility = ws.Visibility(method, directions=32, order=3)
     pose = warp_loop.FreePose(

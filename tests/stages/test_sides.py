@@ -10,7 +10,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
-from warpshadow.pipeline import views
+from warpshadow.pipeline import view as view_module
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.stages.normals import vertex_normals
@@ -204,7 +204,7 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     """
     scene = bowl_scene("none")
     expected = Renderer(scene).render()
-    monkeypatch.setattr(views, "is_readable", lambda device: False)
+    monkeypatch.setattr(view_module, "is_readable", lambda device: False)
     renderer = Renderer(scene)
     view = renderer.view(renderer.assembly.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
@@ -341,7 +341,7 @@ def launches_of(monkeypatch, call) -> Counter:
 def test_closed_bodies_are_not_asked_which_side_is_seen(monkeypatch):
     scene = bowl_scene("directional")
     renderer = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=ws.icosphere(1.0, 3), texture=None),)))
-    monkeypatch.setattr(views, "find_sides", None)
+    monkeypatch.setattr(view_module, "find_sides", None)
     view = renderer.scene_view
     vertex_count = len(renderer.assembly.body_of_vertex)
     assert view.receivers.of_vertices.shape == (vertex_count,) and view.fragments.sides is None

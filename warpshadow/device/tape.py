@@ -42,6 +42,13 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
         tape.record_func(adjoint, wanted)
 
 
+def record(function: Callable[[], None]) -> None:
+    """Record a function that the tape that is recording, if one is, calls when it plays back to here."""
+    tape = current_tape()
+    if tape is not None:
+        tape.record_func(function, [])
+
+
 def launch(
     kernel: wp.Kernel, dim: int | Sequence[int], *, inputs: Sequence[Any], outputs: Sequence[wp.array], device: Any
 ) -> None:

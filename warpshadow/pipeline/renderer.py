@@ -1,7 +1,6 @@
-"""The pipeline: from a scene to an image, each stage computed once while what it depends on stands still.
+"""Renderers: from a scene to an image, each stage computed once while what it depends on is the same.
 
-Geometry and cameras make a view, which has transfer vectors; they and light make shading; shading, albedo and textures
-make the image. What a call leaves out, and why, :meth:`Renderer.explain` says.
+What a call leaves out, and why, :meth:`Renderer.explain` says.
 """
 
 import functools
@@ -16,19 +15,27 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.batch import common_batch
+from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
-from warpshadow.pipeline.lighting import Light, Lighting
-from warpshadow.pipeline.plan import ALBEDO, LIGHT, TEXTURES, Explanation, Ledger, ViewFacts, exposes_albedo, plan_image
-from warpshadow.pipeline.reflectance import Given, Reflectance
-from warpshadow.pipeline.views import Prospect, View, Viewer
-from warpshadow.scene.scene import AUTO, SCENE, Scene
-from warpshadow.stages import film
+from warpshadow.pipeline.directional import Directional
+from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.lighting import Light, LitPoints
+from warpshadow.pipeline.log_sh import LogSH
+from warpshadow.pipeline.node import Call, Clock, Node, Source
+from warpshadow.pipeline.rays import Rays
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.static import Static
+from warpshadow.pipeline.view import View
+from warpshadow.scene.scene import SCENE, Scene
 from warpshadow.stages.rasterize import Fragments
-from warpshadow.stages.silhouettes.smooth import find_edge_colors, smooth_silhouettes
-from warpshadow.stages.slopes import pull_surfaces
+from warpshadow.stages.receivers import Receivers
+
+METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
+"""How light is blocked."""
 
 COARSE_FACE = 400
 """Pixels of an average face beyond which shading at its corners draws a warning."""
@@ -50,10 +57,11 @@ class Renderer:
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        scene: The scene; a method "auto" has been replaced by what was chosen.
+        scene: The scene.
         cameras: Those that see the scene.
         has_camera_batch: Whether they were given as a batch.
-        ledger: How long stages took; with ``ledger.waits``, stages on a GPU are waited for.
+        basis: What free light is expressed in.
+        clock: How long stages took; with ``clock.waits``, stages on a GPU are waited for.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
@@ -74,10 +82,7 @@ class Renderer:
         check.instance("scene", scene, Scene, SCENE)
         check_basis(basis)
         where = check.device("device", device)
-        if scene.visibility.method == AUTO:
-            from warpshadow.tuning.tune import resolved  # which renders to find out
-
-            scene = resolved(scene, device=where, progress=progress)
+        check.choice("scene.visibility.method", scene.visibility.method, METHODS)
         self._arguments = {
             "scene": scene,
             "cameras": cameras,
@@ -91,11 +96,19 @@ class Renderer:
         self.device = where
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
-        self.ledger = Ledger()
-        self._viewer = Viewer(self.assembly, self.cameras, self.ledger, progress=progress)
-        self._lighting = Lighting(self.assembly, basis, self.ledger, progress=progress)
-        self._reflectance = Reflectance(self.assembly, self.ledger)
-        self.basis = self._lighting.basis
+        self.clock = Clock()
+        self._method = METHODS[scene.visibility.method](self.assembly, basis, progress=progress)
+        self._materials = Materials.of_scene(self.assembly)
+        self.basis = self._method.basis
+        self._vertices = Source("vertices", lambda: self.geometry.positions)
+        self._spheres = Source("spheres", lambda: (self.geometry.centers, self.geometry.radii))
+        clip_matrices = [camera.clip_matrix() for camera in self.cameras]
+        self._cameras = Source("cameras", lambda: wp.array(clip_matrices, dtype=wp.mat44, device=where))
+        self._scene_view: View | None = None
+        self._last_view: View | None = None
+        self._last_cameras: Source | None = None
+        self._statics: dict[tuple[int, ...], Static] = {}  # by what moves
+        self._has_warned = False
 
     def __getstate__(self) -> dict[str, Any]:
         """What it was made of."""
@@ -116,7 +129,7 @@ class Renderer:
     @property
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
-        return self._viewer.clip_matrices
+        return self._cameras.value()
 
     @one_at_a_time
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
@@ -135,7 +148,73 @@ class Renderer:
 
         Differentiable: geometry, clip_matrices.
         """
-        return self._viewer.see(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        is_scenes = geometry is None and clip_matrices is None
+        view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        if view in (self._scene_view, self._last_view):
+            return view
+        for node in (view.receivers_node, view.silhouettes):
+            node.value(view.call)
+        if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
+            self._has_warned = view.warn_if_empty(stacklevel=3)
+        if view.static is not None:
+            self._statics[view.static.moving] = view.static
+        if is_scenes:
+            self._scene_view = view
+        elif view.receivers_node.is_kept:
+            self._last_view = view
+        return view
+
+    def _wired(self, geometry: Geometry | None, clip_matrices: wp.array | None) -> View:
+        """A view of which nothing is computed yet; the scene's or the last one where what is given is the same."""
+        vertices, spheres, cameras, static = self._vertices, self._spheres, self._cameras, None
+        last, poses, matrices = self._last_view, [None], self.cameras
+        if geometry is not None:
+            for name, array, own in zip(Geometry._fields, geometry, self.assembly.rest, strict=True):
+                check.shape(f"geometry.{name}", array.shape, ("batch", *own.shape[1:]))
+            poses = geometry.positions
+            vertices = Source.renewed("vertices", poses, last.vertices if last else None)
+            spheres = Source.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
+        if clip_matrices is not None:
+            matrices = clip_matrices
+            cameras = self._last_cameras = Source.renewed("cameras", matrices, self._last_cameras)
+        image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
+        if geometry is not None and geometry.moving is not None and not self._method.lights_samples:
+            static = self._statics.get(geometry.moving)
+            if static is None or not static.are_those_of(geometry):
+                static = Static(self.assembly, geometry)
+        given = vertices, spheres, cameras, static
+        for view in (self._scene_view, last):
+            if view is not None and view.given == given:
+                return view
+        return View(
+            self._method,
+            self._materials,
+            *given,
+            call=self._call(),
+            camera=self.cameras[0],
+            counts=(len(poses), image_count),
+        )
+
+    def _call(self, view: LitPoints | None = None) -> Call:
+        """A call, which knows what was computed of a view."""
+        return Call(self.clock, view.call if view else None, keeps=not self.device.is_capturing)
+
+    def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
+        """Points to be lit by :meth:`shade` that are given, not found in an image.
+
+        Args:
+            points: Positions [scene units], vec3 of shape [batch, receiver].
+            normals: Unit normals, vec3 of shape [batch, receiver].
+            geometry: What blocks light, by default the scene's bodies.
+
+        Differentiable: all.
+        """
+        receivers = Source("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
+        vertices, spheres = self._vertices, self._spheres
+        if geometry is not None:
+            vertices, spheres = Source("vertices", geometry.positions), Source("spheres", tuple(geometry[1:]))
+        node = Node("", lambda given: given, receivers)
+        return LitPoints(self._method, vertices, spheres, node, self._call())
 
     @functools.cached_property
     def scene_view(self) -> View:
@@ -151,7 +230,7 @@ class Renderer:
         face_ids = view.fragments.face_ids.numpy()
         return np.where(face_ids >= 0, self.assembly.body_of_face[face_ids], -1)
 
-    def _own(self, view: View | None) -> View:
+    def _own(self, view: Any) -> Any:
         """A view of this renderer, by default the scene's; those of others keep what others computed."""
         if view is None:
             return self.scene_view
@@ -170,7 +249,7 @@ class Renderer:
             face_counts += np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
         pixels_per_face = sample_counts / self.scene.supersampling**2 / np.maximum(face_counts, 1)
         for number, body in enumerate(bodies):
-            if body.receivers == "vertex" and not self._lighting.is_traced and pixels_per_face[number] > COARSE_FACE:
+            if body.receivers == "vertex" and not self._method.lights_samples and pixels_per_face[number] > COARSE_FACE:
                 warnings.warn(
                     f"body number {number + 1} ({body.mesh.name!r}): a face covers {pixels_per_face[number]:.0f} "
                     "pixels on average, and light is evaluated at its corners alone; "
@@ -187,7 +266,8 @@ class Renderer:
 
         Cameras share the receivers at vertices, for which there is one view.
         """
-        return self._lighting.transfer(self.scene_view)
+        view = self.scene_view
+        return view.transfers.value(self._call(view))[-1]
 
     @property
     def scene_shading(self) -> wp.array:
@@ -195,14 +275,14 @@ class Renderer:
         return self.shade()
 
     @one_at_a_time
-    def shade(self, light: Light | None = None, view: View | None = None) -> wp.array:
+    def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
         """Light the receivers of a view.
 
         Args:
             light: Known light, as a map or SH coefficients, by default the scene's: it is shaded as accurately as the
                 method can. Free light, an array of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient],
                 is differentiable.
-            view: By default the scene's own.
+            view: From :meth:`view` or :meth:`at_points`, by default the scene's own.
 
         Returns:
             Shading, vec3 of shape [batch, receiver].
@@ -212,7 +292,8 @@ class Renderer:
 
         Differentiable: light, view.
         """
-        return self._lighting.shade(self._own(view), light)
+        view = self._own(view)
+        return view.shading(light).value(self._call(view))
 
     @property
     def albedo(self) -> wp.array:
@@ -241,7 +322,8 @@ class Renderer:
 
         Differentiable: albedo, textures, view.
         """
-        return self._reflectance.find(self._own(view), albedo, textures)
+        view = self._own(view)
+        return view.surfaces.reflect(albedo, textures).samples.value(self._call(view))
 
     @one_at_a_time
     def seen_texels(self, number: int) -> np.ndarray:
@@ -257,7 +339,7 @@ class Renderer:
         Raises:
             ValueError: for a body without a texture.
         """
-        return self._reflectance.seen_texels(self.scene_view, number)
+        return self.scene_view.surfaces.seen_texels(number)
 
     # ------------------------------------------------------------------------------------------ image
 
@@ -288,51 +370,7 @@ class Renderer:
         Differentiable: light, albedo, textures, view.
         """
         view = self._own(view)
-        lit = self.shade(light, view)
-        varying = _varying(view.facts, light, albedo, textures)
-        plan, timed = plan_image(view.facts, varying, supersampling=self.scene.supersampling), self.ledger.timed
-        receivers, silhouettes, clip_positions = view.receivers, view.silhouettes, view.clip_positions
-        if exposes_albedo(varying):
-            samples = self._reflectance.expose(view, self._white(view, lit), plan.exposure, albedo, textures)
-        else:
-            reflected = self.reflect(albedo, textures, view)
-            with timed(plan.exposure, [lit, reflected, clip_positions]):
-                samples = film.expose(
-                    receivers.fragments, receivers.faces, lit, reflected, at_points=not plan.contrasts
-                )
-        edge_colors = None
-        if plan.contrasts:
-            with timed(plan.contrasts, [clip_positions]):
-                edge_colors = find_edge_colors(
-                    samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected
-                )
-                pull_surfaces(
-                    samples,
-                    receivers.fragments,
-                    receivers.faces,
-                    lit,
-                    reflected,
-                    silhouettes,
-                    edge_colors,
-                    clip_positions,
-                )
-        with timed(plan.smoothing, [samples, clip_positions]):
-            smoothed = smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
-        if not plan.averaging:
-            return smoothed
-        with timed(plan.averaging, [smoothed]):
-            return film.average(smoothed, self.scene.supersampling)
-
-    def _white(self, view: View, lit: wp.array) -> wp.array:
-        """The samples of a view if every surface were white, kept while its shading is."""
-        if view.kept.white is None or view.kept.white[1] is not lit:
-            _, height, width = view.fragments.face_ids.shape
-            albedo = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.device)
-            white = film.expose(view.receivers.fragments, view.receivers.faces, lit, albedo)
-            if not view.keeps:
-                return white
-            view.kept.white = white, lit
-        return view.kept.white[0]
+        return view.image(light, albedo, textures).value(self._call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -381,35 +419,20 @@ class Renderer:
             None if given is None else [_as_array(item, wp.vec3, ndim) for item in given]
             for given, ndim in ((albedo, 2), (textures, 3))
         )
-        if view is None:
+        hidden: set[Node] = set()
+        if view is not None:
+            view = self._own(view)
+            hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
+        else:
             if geometry is not None:
                 geometry = as_geometry("geometry", geometry)
                 dtypes = wp.vec3, wp.vec3, wp.float32
                 arrays = (_as_array(array, dtype, 2) for array, dtype in zip(geometry, dtypes, strict=True))
                 geometry = Geometry(*arrays, moving=geometry.moving)
-            prospect = self._viewer.plan(geometry, _as_array(clip_matrices, wp.mat44, 1))
-        else:
-            prospect = Prospect(None, self._own(view).facts, view, view.still)
-        _, facts, view, still = prospect
-        kept = None if view is None else view.kept
-        varying = _varying(facts, light, colors, images)
-        plans = [
-            prospect.plan,
-            self._lighting.plan(facts, light, view=view, still=still),
-            self._reflectance.plan(facts, colors, images, kept, exposes=exposes_albedo(varying)),
-            plan_image(facts, varying, supersampling=self.scene.supersampling),
-        ]
-        stages = [stage for plan in plans if plan is not None for stage in plan.stages()]
-        return Explanation(stages, self.ledger.timings, is_host=self.device.is_cpu or self.ledger.waits)
-
-
-def _varying(view: ViewFacts, light: Light | None, albedo: Given, textures: Given) -> list[str]:
-    """What requires a gradient."""
-    given = {LIGHT: [light], ALBEDO: albedo or (), TEXTURES: textures or ()}
-    return [
-        *view.varying,
-        *(name for name, arrays in given.items() if any(getattr(array, "requires_grad", False) for array in arrays)),
-    ]
+            view = self._wired(geometry, _as_array(clip_matrices, wp.mat44, 1))
+        image = view.preview().image(light, colors, images)
+        is_host = self.device.is_cpu or self.clock.waits
+        return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden)
 
 
 def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
@@ -419,7 +442,9 @@ def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
     tensor = given.detach()
     while tensor.ndim < ndim + len(item_shape(dtype)):
         tensor = tensor[None]
-    return wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
+    array = wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
+    array.version = given._version
+    return array
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

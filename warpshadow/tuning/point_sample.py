@@ -9,8 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.spatial_sort import z_order_of_cells
-from warpshadow.pipeline.assembly import Geometry
-from warpshadow.pipeline.renderer import Renderer, View
+from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene, Visibility
 from warpshadow.stages.normals import vertex_normals
 
@@ -109,7 +108,11 @@ class PointSample:
         glimpse = replace(scene.camera, width=1, height=1)
         renderer = Renderer(scene, cameras=[glimpse], device=self._device, progress=self._progress)
         receivers = self.receivers([body.receivers for body in scene.bodies])
-        view = at_receivers(self._view, renderer, receivers.points[None], receivers.normals[None])
+        points, normals = (
+            wp.array(array[None], dtype=wp.vec3, device=renderer.device)
+            for array in (receivers.points, receivers.normals)
+        )
+        view = renderer.at_points(points, normals)
         shading = renderer.shade(view=view).numpy()[0]
         return np.einsum("pk,pkc->pc", receivers.weights, shading[receivers.corners])
 
@@ -145,23 +148,6 @@ class PointSample:
         squares = ((self.interpolated_truth - self.truth) ** 2).sum(axis=1)
         sums = np.bincount(self.bodies, squares, minlength=len(self._scene.bodies))
         return np.sqrt(sums) / np.linalg.norm(self.truth)
-
-
-def at_receivers(view: View, renderer: Renderer, points: np.ndarray, normals: np.ndarray) -> View:
-    """Make a view that no renderer has kept anything of: of a renderer's spheres, with other receivers.
-
-    Args:
-        view: Of the same scene.
-        renderer: Whose spheres are to block the light.
-        points: Receivers [scene units], shape [1, receiver, 3].
-        normals: Unit normals, shape [1, receiver, 3].
-    """
-    at_points = view.receivers._replace(
-        points=wp.array(points, dtype=wp.vec3, device=renderer.device),
-        normals=wp.array(normals, dtype=wp.vec3, device=renderer.device),
-    )
-    geometry = Geometry(*renderer.geometry)
-    return view._replace(geometry=geometry, receivers=at_points, assembly=renderer.assembly)
 
 
 def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:

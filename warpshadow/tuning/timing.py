@@ -11,7 +11,6 @@ import warp as wp
 
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene
-from warpshadow.tuning.point_sample import at_receivers
 
 TIMED_RECEIVERS = 2048
 """Receivers on which visibility and shading are timed, in neighborhoods, which are culled together."""
@@ -88,14 +87,16 @@ class _Stage:
         self.draw = whole_image(self._renderer)
         points, normals, *_ = self._view.receivers
         chosen = _neighborhoods(points.numpy()[0])
-        self._sample = points.numpy()[:, chosen], normals.numpy()[:, chosen]
+        self._sample = [
+            wp.array(array.numpy()[:, chosen], dtype=wp.vec3, device=array.device) for array in (points, normals)
+        ]
         self.extrapolation = points.shape[1] / len(chosen)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""
         glimpse = replace(scene.camera, width=1, height=1)  # no image is drawn
         renderer = Renderer(scene, cameras=[glimpse], device=self._renderer.device)
-        return lambda: renderer.shade(view=at_receivers(self._view, renderer, *self._sample))
+        return lambda: renderer.shade(view=renderer.at_points(*self._sample))
 
 
 def _neighborhoods(points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Plans: what is left out changes nothing, what changes is noticed, and what is said to be left out is left out."""
+"""What is left out changes nothing, what changes is noticed, and what is said to be left out is left out."""
 
 import dataclasses
 import functools
@@ -12,10 +12,11 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device.batch import expand
-from warpshadow.pipeline import assembly, still
+from warpshadow.pipeline import assembly
+from warpshadow.pipeline import directional as directional_method
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.renderer import Renderer
-from warpshadow.pipeline.views import View
+from warpshadow.pipeline.view import View
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
@@ -437,36 +438,34 @@ def test_what_is_deformed_moves():
 # ---------------------------------------------------------------------------------------------- what is launched
 
 VISIBILITY = "visibility"
-SHADOWS = ("still shadows", "still visibility", VISIBILITY)
+SHADOWS = ("static shadows", VISIBILITY)
 
 
 def stage_of(kernel: wp.Kernel) -> str | None:
     """The stage that a kernel belongs to; None for copies, and for poses, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
-    if module in ("batch", "deform"):
+    if module in ("device.batch", "stages.poses"):
         return None
-    if module.startswith("visibility") or module == "reference" or key == "_add_rows":
+    if module.startswith("stages.visibility") or module == "stages.ray_tracing" or key == "_add_rows":
         return VISIBILITY
-    if module == "silhouette":
+    if module.startswith("stages.silhouettes"):
         after = {
             "_find_edge_colors": "contrasts",
             "blend": "smoothing",
             "_measure_adjoint": "smoothing",
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")
-    if module == "texture":
+    if module.startswith("stages.textures"):
         parts = {"footprints": "footprints", "_expose": "exposure", "_sample": "reflectance"}
         return next((name for part, name in parts.items() if part in key), "mip pyramids")
-    if module == "raster":
+    if module == "stages.rasterize":
         return "reflectance" if "interpol" in key else "rasterization"
-    if module in ("transfer", "still"):
+    if module in ("stages.transfer", "stages.kept_cells"):
         return "shading" if "_light_cells" in key else "transfer"
-    if module == "slopes":
-        return "contrasts"
-    if module == "film":
+    if module == "stages.film":
         return "averaging" if "average" in key else "exposure"
-    same = {name: name for name in ("receivers", "shading", "sides")}
-    return {"camera": "clip positions", "mesh": "normals", **same}[module]
+    same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
+    return {"stages.project": "clip positions", "stages.slopes": "contrasts", **same}[module]
 
 
 class Launches:
@@ -601,17 +600,18 @@ def test_only_what_moves_is_projected_onto_what_stands_still(monkeypatch):
     assert on_still[1:] == (1, False) and on_moving[1:] == (2, True)
     vertex_count = len(renderer.assembly.body_of_vertex)
     assert 0 < on_still[0] < vertex_count - 162 and 0 < on_moving[0] <= 162
-    assert "1 spheres" in explain()["still visibility"].items and "2 spheres" in explain()["visibility"].items
+    items = explain()["visibility"].items
+    assert "receivers × 2 spheres" in items and "receivers on static bodies × 1 spheres" in items
 
 
 def test_rays_are_traced_once(monkeypatch):
     renderer = Renderer(scene_of())
     call, _, explain = one_of_three(renderer)
-    assert explain()["still shadows"]
+    assert explain()["static shadows"]
     call()
-    monkeypatch.setattr(still, "trace_cells", None)
+    monkeypatch.setattr(directional_method, "trace_cells", None)
     call()
-    assert "not seen before" in explain()["still shadows"].forward.why
+    assert "not seen before" in explain()["static shadows"].items
 
 
 # ---------------------------------------------------------------------------------------------- what is said
@@ -620,15 +620,15 @@ def test_rays_are_traced_once(monkeypatch):
 def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
     renderer = Renderer(scene_of())
     call, variables, explain = texture_fit(renderer)
-    assert "the scene is seen for the first time" in str(explain())
+    assert "nothing is kept yet" in str(explain())
     with wp.Tape() as tape:
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
     lines = str(explain()).splitlines()
-    assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
-    (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
-    assert "–" in rasterization and "kept: the scene's geometry and cameras stand" in rasterization
-    (exposure,) = (line for line in lines[19:] if "exposure" in line)
+    assert [line.split()[0] for line in (lines[0], lines[18])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:18] if "rasterization" in line)
+    assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
+    (exposure,) = (line for line in lines[18:] if "exposure" in line)
     assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
     assert "2,304 samples" in exposure
 
@@ -648,7 +648,7 @@ def test_tensors_explain_themselves():
     rotations, translations, scales = renderer.scene_poses()
     geometry = renderer.placed(rotations, translations.requires_grad_(), scales, moving=[1])
     explanation = renderer.renderer.explain(geometry=geometry)
-    assert explanation["still visibility"].backward and "a gradient to vertices" in explanation["normals"].forward.why
+    assert explanation["visibility"].backward and "a gradient to vertices" in explanation["normals"].forward.why
     light = torch.ones(32, 3, requires_grad=True)
     colors = torch.ones(3), torch.ones(162, 3, requires_grad=True), None
     explanation = renderer.renderer.explain(light, albedo=colors, textures=[None, None, torch.ones(4, 4, 3)])

@@ -1,0 +1,101 @@
+"""The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.basis import Basis, CellBasis
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths import sh
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.lighting import Group, KnownLight, SphereMethod
+from warpshadow.pipeline.node import Source
+from warpshadow.pipeline.static import Rows, Static
+from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
+from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.ray_tracing import trace_cells
+from warpshadow.stages.transfer import directional_transfer
+from warpshadow.stages.visibility import directional
+
+
+class Cells(NamedTuple):
+    """Light in cells."""
+
+    directions: np.ndarray  # [direction, 3]
+    coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
+
+
+class Directional(SphereMethod):
+    """Visibility for each cell of directions by itself."""
+
+    def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
+        self._directions = fibonacci(assembly.scene.visibility.directions)
+        super().__init__(assembly, CellBasis(self._directions), basis, progress=progress)
+        self.in_free = Cells(self._directions)
+
+    def in_known(self, light: KnownLight) -> Cells:
+        """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
+        if isinstance(light, EnvironmentMap):
+            coefficients, directions, _ = light.cells(self._directions)
+        else:
+            coefficients, directions = self.own_basis.coefficients(light), self._directions
+        return Cells(directions, wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device))
+
+    def coefficient_count(self, light: Source | None) -> int:
+        """Number of coefficients that take part: all."""
+        return len(self._directions)
+
+    def see(self, group: Group, light: Cells) -> wp.array:
+        """Transmittance, float32 of shape [batch, receiver, direction]."""
+        points, normals, centers, radii, kept = group
+        if not (radii.shape[1] and points.size):
+            return wp.full((*points.shape, len(light.directions)), 1.0, dtype=wp.float32, device=points.device)
+        softness, merging = self.visibility.softness, self.visibility.merging
+        # kept cells have light although their middles are below the horizon
+        facing = normals if kept is None else None
+        return directional.transmittance(
+            points, facing, centers, radii, light.directions, softness=softness, merging=merging
+        )
+
+    def transfer(self, seen: wp.array, group: Group, light: Cells) -> wp.array:
+        """Transfer vectors; the transmittance as it is where kept cells hold known light."""
+        if group.kept is None:
+            return directional_transfer(seen, group.normals, light.directions)
+        return seen if _has_light(group.kept) else cell_transfer(seen, group.kept)
+
+    def light_part(self, transfer: wp.array, group: Group, light: Cells) -> wp.array:
+        """Shading of a part, vec3 of shape [batch, receiver]."""
+        if group.kept is not None and _has_light(group.kept):
+            return light_cells(transfer, group.kept)
+        return super().light_part(transfer, group, light)
+
+    def kept_rows(self, static: Static, light: Source | None) -> Rows:
+        """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
+        is_scenes = light is self.light
+        return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))
+
+    def _trace(self, is_scenes: bool, static: Static, vertices: np.ndarray, normals: wp.array) -> wp.array:
+        points, facing = static.gathered(vertices, normals)
+        numbers = wp.array(vertices % len(static.has_vertex), dtype=wp.int32, device=points.device)
+        samples = self._lit_samples if is_scenes else self._even_samples
+        return trace_cells(static.mesh, points[0], facing[0], numbers, samples, progress=self.progress)
+
+    @functools.cached_property
+    def _lit_samples(self) -> CellSamples:
+        light = self.light.value()
+        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
+        samples = sample_map(radiance, self.visibility.samples)
+        return cell_samples(samples, self._directions, device=self.assembly.device)
+
+    @functools.cached_property
+    def _even_samples(self) -> CellSamples:
+        samples = even_samples(self.visibility.samples)
+        return cell_samples(samples, self._directions, device=self.assembly.device)
+
+
+def _has_light(kept: KeptRows) -> bool:
+    """Whether kept cells have known light, in three channels."""
+    return kept.rows.shape[1] == 3

@@ -1,0 +1,154 @@
+"""Explanations: what the next call computes, what it leaves out, and why."""
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+
+from warpshadow.pipeline.node import Call, Fixed, Input, Node, Source, Timing
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether something runs, and why, or why not; it is true if it runs."""
+
+    runs: bool
+    why: str
+
+    def __bool__(self) -> bool:
+        return self.runs
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a call; it is true if it runs.
+
+    Args:
+        name: What it is called.
+        forward: Whether it is computed.
+        backward: Whether its adjoint is, when gradients are played back.
+        items: On how many items, in words.
+    """
+
+    name: str
+    forward: Decision
+    backward: Decision
+    items: str
+
+    def __bool__(self) -> bool:
+        return self.forward.runs
+
+
+class Explanation:
+    """What the next call computes, stage by stage; as text a table.
+
+    Args:
+        image: The node that the call asks for.
+        call: What is known before.
+        timings: How long stages took last, by name.
+        is_host: Whether launches wait until they are done, as they do on a CPU.
+        hidden: Nodes that are left out.
+
+    Attributes:
+        stages: By name, in the order in which they run.
+    """
+
+    def __init__(
+        self, image: Node, call: Call, timings: dict[str, Timing], *, is_host: bool, hidden: Collection[Node] = ()
+    ):
+        decisions = decide(image, call)
+        nodes = [node for node in decisions if node.name and node not in hidden]
+        self.stages = {node.name: _stage(node, decisions[node]) for node in nodes}
+        self.timings = dict(timings)
+        self._is_host = is_host
+
+    def __getitem__(self, name: str) -> Stage:
+        return self.stages[name]
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        rows = [("forward", "", "last", "items", "why")]
+        for stage in self.stages.values():
+            timing = self.timings.get(stage.name)
+            rows.append(_row(stage.name, stage.forward, timing.forward if timing else None, stage.items))
+        rows.append(("backward", "", "last", "items", "why"))
+        for stage in reversed(self.stages.values()):
+            timing = self.timings.get(stage.name)
+            items = stage.items if stage.backward else ""
+            rows.append(_row(stage.name, stage.backward, timing.backward if timing else None, items))
+        widths = [max(len(row[column]) for row in rows) for column in range(4)]
+        lines = [
+            "  ".join([*(cell.ljust(width) for cell, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip()
+            for row in rows
+        ]
+        if not self._is_host:
+            lines.append("Times are the host's: a launch returns before the GPU is done.")
+        return "\n".join(lines)
+
+
+def decide(image: Node, call: Call) -> dict[Node, Decision]:
+    """Decide which nodes run when a call asks for an image, in the order in which they do; nothing is computed."""
+    decisions: dict[Node, Decision] = {}
+    asked: set[Node] = set()
+
+    def visit(given: Input, reason: Decision) -> None:
+        """Decide on a node, which is asked for if the reason is that something runs."""
+        node = given.node if isinstance(given, Fixed) else given
+        if isinstance(node, Source) or node in asked or (node in decisions and not reason):
+            return
+        if reason:
+            asked.add(node)
+        own = _decision(node, call, reason)
+        is_idle = reason and not own and node.known(call) is None  # what is idle asks for what it passes on
+        for each in node.before:
+            visit(each, reason if is_idle else own)
+        decisions[node] = own
+
+    visit(image, Decision(True, "an image is asked for"))
+    return decisions
+
+
+def _decision(node: Node, call: Call, reason: Decision) -> Decision:
+    """Whether a node runs, given why it is asked for, or why it is not."""
+    if node.known(call) is not None:
+        return Decision(False, f"kept: {_names(node.sources)} are the same")
+    if idle := _words(node.idle):
+        return Decision(False, idle)
+    if not reason:
+        return reason
+    if node.requires_grad:
+        varying = (source for source in node.sources if source.requires_grad)
+        return Decision(True, f"a gradient to {_names(varying)} is asked for")
+    if news := [source.news for source in node.sources if source.news]:
+        return Decision(True, _listed(dict.fromkeys(news)))
+    return Decision(True, "nothing is kept yet") if node.keeps else reason
+
+
+def _stage(node: Node, forward: Decision) -> Stage:
+    """A stage whose adjoint runs if it runs itself and something before it requires a gradient."""
+    if not forward:
+        backward = Decision(False, "nothing is computed")
+    elif node.pulled and node.has_adjoint:
+        backward = Decision(True, f"a gradient to {_names(node.pulled)} is asked for")
+    else:
+        backward = Decision(False, "nothing before it requires a gradient")
+    return Stage(node.name, forward, backward, _words(node.items) if forward else "")
+
+
+def _names(sources: Iterable[Source]) -> str:
+    return _listed(dict.fromkeys(source.name for source in sources))
+
+
+def _words(words: str | Callable[[], str]) -> str:
+    return words() if callable(words) else words
+
+
+def _listed(words: Iterable[str]) -> str:
+    """Words with commas and an "and"."""
+    *first, last = list(words) or ["all of it"]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _row(name: str, decision: Decision, last: float | None, items: str) -> tuple[str, str, str, str, str]:
+    time_taken = "" if last is None else f"{1e3 * last:.2f} ms"
+    return f"  {name}", "runs" if decision else "–", time_taken, items, decision.why

@@ -1,0 +1,268 @@
+"""Nodes: what is computed, from what, whether it is kept, and why.
+
+A source is something given: vertices, a light. A node computes a value from sources and from other nodes when it is
+asked for it. Neither ever changes: where something else is given, there is another source, and there are other nodes
+that take it. So what a node computed is right for as long as the node is there. It is kept, and a node that keeps its
+value asks nothing that comes before it. Only what has a gradient is not kept: a tape is good for one playback.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.tape import record
+
+
+class Source:
+    """Something given.
+
+    Args:
+        name: What it is called.
+        value: The value; or a function that makes it when it is first asked for.
+        news: Why it takes the place of another, in words, such as "light is given".
+
+    Attributes:
+        requires_grad: Whether a gradient to it is asked for.
+    """
+
+    def __init__(self, name: str, value: Any, *, news: str = ""):
+        self.name, self.news, self.given, self._value = name, news, value, value
+        self.requires_grad = False
+        for each in value if isinstance(value, (tuple, list)) else [value]:
+            self.requires_grad |= getattr(each, "requires_grad", False)
+        self.sources, self.pulled = {self: None}, {self: None} if self.requires_grad else {}
+
+    def value(self, call: "Call | None" = None) -> Any:
+        """The value."""
+        if callable(self._value):
+            self._value = self._value()
+        return self._value
+
+    @classmethod
+    def renewed(cls, name: str, given: Any, last: "Source | None") -> "Source":
+        """A source of a copy of what is given now; the last source where that is the same.
+
+        An array at the same place with the same ``version``, a number that counts the writes to it, is the same. Other
+        arrays are compared on a CPU. On a GPU, which would have to wait for that, they count as others.
+        """
+        source = cls(name, given)
+        if source.requires_grad:
+            return source
+        if last is not None and not last.requires_grad:
+            if _is_same(given, last):
+                return last
+            source.news = f"{name} changed since the last call"
+        source._value = _copied(given)
+        return source
+
+
+def _arrays(value: Any) -> list[wp.array]:
+    """The arrays of a value, which may be one or a sequence of them."""
+    return [each for each in (value if isinstance(value, (tuple, list)) else [value]) if isinstance(each, wp.array)]
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    if isinstance(value, wp.array):
+        return wp.clone(value)
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _is_same(given: Any, last: Source) -> bool:
+    """Whether what is given is what a source has, as far as can be told without waiting."""
+    arrays, value = _arrays(given), last.value()
+    if isinstance(given, np.ndarray):
+        return isinstance(value, np.ndarray) and np.array_equal(given, value)
+    if not arrays:
+        return given is value
+    return all(map(_is_same_array, arrays, _arrays(last.given) or arrays, _arrays(value)))
+
+
+def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
+    """Whether an array is another, not written to since, or has the values of a copy of that."""
+    marks = [(each.ptr, each.shape, each.strides, getattr(each, "version", None)) for each in (array, before)]
+    if before is not array and marks[0] == marks[1] and marks[0][-1] is not None:
+        return True
+    return is_readable(array.device) and np.array_equal(array.numpy(), copy.numpy())
+
+
+class Node:
+    """Something computed.
+
+    Args:
+        name: What the stage is called; empty for what is no stage of its own: it is neither timed nor explained.
+        function: Computes the value from those of the inputs; None where nobody asks for it.
+        inputs: Nodes and sources; anything else is passed on as it is.
+        items: On how many items it is computed, in words.
+        idle: Why there is nothing to do, in words; the function then passes something on.
+        has_adjoint: Whether gradients take it more than to hand them on.
+        keeps: Whether the value may outlive a call.
+        beside: Other nodes that run for this one, or are explained beside it.
+
+    Items and idle may be functions that make the words.
+
+    Attributes:
+        before: The nodes and sources that it depends on at once.
+        sources: All sources that it depends on.
+        requires_grad: Whether a gradient to any of them is asked for; then nothing is kept.
+        pulled: Those of them that get a gradient from here.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Any] | None,
+        *inputs: Any,
+        items: str | Callable[[], str] = "",
+        idle: str | Callable[[], str] = "",
+        has_adjoint: bool = True,
+        keeps: bool = True,
+        beside: tuple["Node", ...] = (),
+    ):
+        self.name, self.function, self.inputs = name, function, inputs
+        self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
+        self.before: list[Input] = []
+        self.sources: dict[Source, None] = {}  # in order
+        self.pulled: dict[Source, None] = {}
+        self.requires_grad = False
+        for each in (*inputs, *beside):
+            if isinstance(each, (Node, Source, Fixed)):
+                self.before.append(each)
+                self.sources |= each.sources
+                self.pulled |= each.pulled
+                self.requires_grad |= each.requires_grad
+        self.keeps = keeps and not self.requires_grad
+        self.is_kept = False
+        self._kept: Any = None
+
+    def value(self, call: "Call") -> Any:
+        """The value, which is computed unless it is kept or the call has it."""
+        if self.is_kept:
+            return self._kept
+        if self not in call:
+            value = self.compute(call)
+            if self.keeps and call.keeps:
+                self._kept, self.is_kept = value, True
+                return value
+            call[self] = value
+        return call[self]
+
+    def compute(self, call: "Call") -> Any:
+        """Compute the value."""
+        return self.run(call, *self.values(call))
+
+    def values(self, call: "Call") -> list[Any]:
+        """The values of the inputs."""
+        return [each.value(call) if isinstance(each, (Node, Source, Fixed)) else each for each in self.inputs]
+
+    def run(self, call: "Call", *values: Any) -> Any:
+        """Call the function, and time it."""
+        assert self.function is not None
+        if not self.name or isinstance(self.idle, str) and self.idle:
+            return self.function(*values)
+        end = call.start(self.name, is_marked=self.has_adjoint and bool(self.pulled))
+        value = self.function(*values)
+        end()
+        return value
+
+    def known(self, call: "Call") -> Any:
+        """The value if it needs no computation, else None."""
+        return self._kept if self.is_kept else call.get(self)
+
+
+class Fixed:
+    """An input that matters by its value alone: it gets no gradient.
+
+    Args:
+        node: The node or source.
+        is_constant: Whether the value is the same whatever the sources of the node are.
+    """
+
+    def __init__(self, node: Node | Source, *, is_constant: bool = False):
+        self.node, self.value = node, node.value
+        self.requires_grad = node.requires_grad and not is_constant
+        self.sources = {} if is_constant else node.sources
+        self.pulled: dict[Source, None] = {}
+
+
+Input = Node | Source | Fixed
+
+
+class Timing:
+    """How long a stage took when it last ran, seconds of the host; on a GPU that is the time to launch it."""
+
+    def __init__(self) -> None:
+        self.forward = 0.0
+        self.adjoints: dict[object, float] = {}  # of each part of it
+
+    @property
+    def backward(self) -> float | None:
+        """How long its adjoint took; None where it was not played back."""
+        return sum(self.adjoints.values()) if self.adjoints else None
+
+
+class Clock:
+    """How long each stage took when it last ran.
+
+    Attributes:
+        timings: By the stages' names.
+        waits: Whether a stage begins and ends with the device idle. On a GPU times are of its work then, and an image
+            takes longer.
+    """
+
+    def __init__(self) -> None:
+        self.timings: dict[str, Timing] = {}
+        self.waits = False
+
+    def now(self) -> float:
+        """Seconds since some moment."""
+        if self.waits:
+            wp.synchronize()
+        return time.perf_counter()
+
+
+class Call(dict[Node, Any]):
+    """What a call computes and does not keep: values by node.
+
+    Args:
+        clock: Where times are noted.
+        known: Values that are known before.
+        keeps: Whether nodes may keep values. What is made while a CUDA graph is captured belongs to the graph.
+    """
+
+    def __init__(self, clock: Clock, known: Mapping[Node, Any] | None = None, *, keeps: bool = True):
+        super().__init__(known or {})
+        self.keeps = keeps
+        self._clock = clock
+        self._timings: dict[str, Timing] = {}
+
+    def start(self, name: str, *, is_marked: bool) -> Callable[[], None]:
+        """Start a stage, or a part of one that has run in this call, and return what ends it.
+
+        Its adjoint is timed by marks on the tape.
+        """
+        timing = self._timings.get(name)
+        if timing is None:
+            timing = self._timings[name] = self._clock.timings[name] = Timing()
+        part, now = object(), self._clock.now
+
+        def end_adjoint() -> None:
+            timing.adjoints[part] += now()
+
+        def start_adjoint() -> None:
+            timing.adjoints[part] = -now()
+
+        def end() -> None:
+            if is_marked:
+                record(start_adjoint)
+            timing.forward += now() - start
+
+        if is_marked:
+            record(end_adjoint)  # the tape plays back from the end
+        start = now()
+        return end

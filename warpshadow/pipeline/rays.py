@@ -1,0 +1,99 @@
+"""The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
+
+import warp as wp
+
+from warpshadow.assets.basis import Basis, HarmonicBasis
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths import sh
+from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, receiver_words
+from warpshadow.pipeline.node import Fixed, Node, Source
+from warpshadow.stages.light_samples import sample_map
+from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
+from warpshadow.stages.receivers import Receivers
+
+Meshes = list[wp.Mesh | None]
+"""What blocks the light of each instance of receivers; None for nothing."""
+
+
+class Rays(Method):
+    """Visibility of the meshes."""
+
+    lights_samples = True
+
+    def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
+        super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
+
+    def shading(self, points: LitPoints, light: Source) -> Node:
+        """Shading of points in known light, towards which rays are drawn."""
+        return Node(
+            "shading",
+            self._shade,
+            self._meshes(points),
+            points.receivers_node,
+            light,
+            items=lambda: receiver_words(points),
+            beside=(Node("transfer", None, idle="rays shade known light at once"),),
+        )
+
+    def transfers(self, points: LitPoints) -> Node:
+        """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
+        node = Node(
+            "transfer",
+            self._transfer,
+            self._meshes(points),
+            points.receivers_node,
+            items=lambda: f"{receiver_words(points)} × {self.basis.size} coefficients",
+        )
+        if node.requires_grad:
+            node.function = _refuse
+        return node
+
+    def _meshes(self, points: LitPoints) -> Node:
+        """Node of the meshes that rays meet."""
+        alike = "rays treat all receivers alike"
+        return Node(
+            "visibility",
+            self._casting_meshes,
+            points.vertices,
+            Fixed(points.receivers_node),
+            items=lambda: f"{receiver_words(points)} by rays",
+            idle="" if self.assembly.casting else "no body has blockers",
+            keeps=False,
+            beside=(Node("static shadows", None, idle=alike),),
+        )
+
+    def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
+        points = receivers.points
+        count = min(len(points) if points.size else 0, len(positions))
+        meshes = [self.assembly.casting_mesh(positions[instance]) for instance in range(count)]
+        return [*meshes, *meshes[-1:] * (len(points) - count)]
+
+    def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
+        points, normals = receivers.points, receivers.normals
+        if points.requires_grad:
+            raise ValueError(
+                "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
+            )
+        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
+        count = max(1, self.visibility.samples // self.assembly.scene.supersampling**2)
+        samples = sample_map(radiance, count)
+        traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+        for instance, mesh in enumerate(meshes):
+            lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
+            wp.copy(traced[instance], lit)
+        return traced
+
+    def _transfer(self, meshes: Meshes, receivers: Receivers) -> list[wp.array]:
+        points, normals = receivers.points, receivers.normals
+        transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
+        for instance, mesh in enumerate(meshes):
+            traced = trace_transfer(
+                mesh, points[instance], normals[instance], self.basis.functions, self.visibility.samples, progress=self.progress
+            )
+            wp.copy(transfer[instance], traced)
+        return [transfer]
+
+
+def _refuse(*_: object) -> None:
+    raise ValueError("light: got free light for moving geometry, which rays cannot shade; expected known light")

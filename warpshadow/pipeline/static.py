@@ -1,0 +1,210 @@
+"""Static bodies: those that stand still among moving ones. What is found out about them once is kept.
+
+Where the spheres of moving bodies let the share T_q of the light of a cell through, a receiver on a static body gets
+
+    B = Σ_q T_q S_q,  S_q = ∫_{cell q} L(ω) V(ω) max(n·ω, 0) dω / π,
+
+V the visibility past the meshes of the static bodies. S does not change, so rays find it, and the shadows of static
+bodies on static ones are exact. In log-SH space the sum over the spheres of the static bodies does not change.
+"""
+
+import functools
+from collections.abc import Callable, Hashable
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import concatenate
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.assembly import Assembly, Geometry, exchanged
+from warpshadow.pipeline.node import Node, Source
+from warpshadow.stages.kept_cells import KeptRows
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.project import to_clip
+from warpshadow.stages.receivers import Receivers
+
+
+class Static:
+    """The static bodies of a geometry, and what was found out about them.
+
+    Args:
+        assembly: All bodies.
+        geometry: Has them; what moves in it does not matter.
+
+    Attributes:
+        moving: The other bodies, from 0.
+        has_vertex: Whether each vertex is static, bool of shape [vertex].
+        normals: Node of the normals of all vertices, vec3 of shape [1, vertex]; those of moving ones mean nothing.
+
+    Raises:
+        ValueError: where the static bodies of the instances differ.
+    """
+
+    def __init__(self, assembly: Assembly, geometry: Geometry):
+        assert geometry.moving is not None
+        self.moving = geometry.moving
+        self.bodies = [number for number in range(len(assembly.scene.bodies)) if number not in geometry.moving]
+        self.has_vertex = np.isin(assembly.body_of_vertex, self.bodies)
+        self._assembly = assembly
+        self._geometry = Geometry(*map(_first_instance, geometry))
+        if not self.are_those_of(geometry):
+            raise ValueError(
+                f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
+                "name all that do"
+            )
+        self._vertex_runs = assembly.runs(assembly.first_vertex, self.moving)
+        self._sphere_runs = assembly.runs(assembly.first_sphere, self.moving)
+        self.normals = Node("", vertex_normals, self._geometry.positions, assembly.faces)
+        self._clip_positions: Node | None = None
+        self._gathered: tuple = (None,)  # vertices, and points and normals of them
+        self._rows: dict[Hashable, Rows] = {}
+
+    def are_those_of(self, geometry: Geometry) -> bool:
+        """Whether the static bodies of another geometry are these; on a GPU that is taken on trust."""
+        if geometry.moving != self.moving:
+            return False
+        if not is_readable(self._assembly.device):
+            return True
+        starts = self._assembly.first_vertex, self._assembly.first_sphere, self._assembly.first_sphere
+        return all(
+            (array.numpy()[:, first:end] == own.numpy()[:, first:end]).all()
+            for array, own, start in zip(geometry, self._geometry, starts, strict=True)
+            for first, end in self._assembly.runs(start, self.bodies)
+        )
+
+    # ------------------------------------------------------------------------------------------ vertices
+
+    def clip_positions(self, cameras: Source) -> Node:
+        """Clip positions of all vertices, vec4 of shape [camera, vertex]; those of moving ones mean nothing."""
+        if self._clip_positions is None or self._clip_positions.inputs[1] is not cameras:
+            self._clip_positions = Node("", to_clip, self._geometry.positions, cameras)
+        return self._clip_positions
+
+    def with_moving_clip_positions(self, positions: wp.array, clip_matrices: wp.array, kept: wp.array) -> wp.array:
+        """Put clip positions of moving vertices into those of static ones. Differentiable: positions."""
+        return exchanged(kept, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
+
+    def with_moving_normals(self, positions: wp.array, kept: wp.array) -> wp.array:
+        """Put normals of moving vertices into those of static ones. Differentiable: positions."""
+        faces_of = self._assembly.faces_of
+        return exchanged(kept, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
+
+    def receivers(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
+        """Gather points and normals of some vertices: vec3 of shape [1, receiver].
+
+        Args:
+            vertices: Their numbers, after which their backs are numbered.
+            normals: Of all vertices: the value of :attr:`normals`.
+        """
+        if not np.array_equal(vertices, self._gathered[0]):
+            self._gathered = vertices, *self.gathered(vertices, normals)
+        return self._gathered[1:]
+
+    def gathered(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
+        """The same anew each time."""
+        count = len(self.has_vertex)
+        outward = np.where(vertices < count, 1, -1).astype(np.float32)[:, None]
+        return tuple(
+            wp.array(array.numpy()[:, vertices % count] * sign, dtype=wp.vec3, device=array.device)
+            for array, sign in ((self._geometry.positions, np.float32(1)), (normals, outward))
+        )
+
+    # ------------------------------------------------------------------------------------------ what blocks light
+
+    @functools.cached_property
+    def spheres(self) -> tuple[wp.array, wp.array]:
+        """Centers and radii of their spheres."""
+        own = self._geometry.centers, self._geometry.radii
+        return _of_runs(own, self._assembly.runs(self._assembly.first_sphere, self.bodies))
+
+    def moving_spheres(self, spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of what moves, of those of all bodies. Differentiable: spheres."""
+        return _of_runs(spheres, self._sphere_runs)
+
+    @functools.cached_property
+    def mesh(self) -> wp.Mesh | None:
+        """The mesh of the static bodies that rays meet."""
+        return self._assembly.casting_mesh(self._geometry.positions[0], self.bodies)
+
+    def rows(self, key: Hashable, find: Callable[["Static", np.ndarray, wp.array], wp.array]) -> "Rows":
+        """Rows of numbers, such as log sums, of static vertices.
+
+        Args:
+            key: What the numbers are.
+            find: Finds the rows of some vertices, given these bodies, the vertices and :attr:`normals`.
+        """
+        if key not in self._rows:
+            is_two_sided = self._assembly.is_two_sided[self._assembly.body_of_vertex]
+            most = self.has_vertex.sum() + (self.has_vertex & is_two_sided).sum()
+            self._rows[key] = Rows(2 * len(self.has_vertex), int(most), functools.partial(find, self))
+        return self._rows[key]
+
+
+def _first_instance(array: wp.array) -> wp.array:
+    """A copy of the first instance, which is there even where it is empty."""
+    first = wp.empty((1, *array.shape[1:]), dtype=array.dtype, device=array.device)
+    if array.size:
+        wp.copy(first, array[:1])
+    return first
+
+
+def _of_runs(spheres: tuple[wp.array, wp.array], runs: list[tuple[int, int]]) -> tuple[wp.array, wp.array]:
+    """Centers and radii of some spheres, in runs of consecutive ones."""
+    if runs == [(0, spheres[1].shape[1])]:
+        return spheres
+    if not runs:
+        centers, radii = (wp.empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
+        return centers, radii
+    counts = [end - first for first, end in runs]
+    centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
+    return centers, radii
+
+
+class Rows:
+    """Rows of numbers that vertices get when they are first asked for; room for them doubles.
+
+    Args:
+        count: Number of vertices and backs.
+        most: Number of those that may be asked for.
+        find: Finds the rows of some vertices, float32 of shape [vertex, channel, item], given normals.
+    """
+
+    def __init__(self, count: int, most: int, find: Callable[[np.ndarray, wp.array], wp.array]):
+        self._most, self._find = most, find
+        self._row_of_vertex = np.full(count, -1, np.int32)
+        self._count = 0
+        self._rows: wp.array | None = None
+        self._vertices = np.empty(0, int)
+        self._index: wp.array | None = None
+
+    def missing(self, vertices: np.ndarray | None = None) -> int:
+        """Number of vertices, all or some, without a row."""
+        if vertices is None:
+            return self._most - self._count
+        return int((self._row_of_vertex[vertices] < 0).sum())
+
+    def of_receivers(self, receivers: Receivers, normals: wp.array) -> KeptRows | None:
+        """Rows of the static receivers, those of vertices that come for the first time found; None without any."""
+        vertices = receivers.still
+        if not len(vertices):
+            return None
+        new = vertices[self._row_of_vertex[vertices] < 0]
+        if len(new):
+            self._append(self._find(new, normals))
+            self._row_of_vertex[new] = np.arange(self._count - len(new), self._count)
+        assert self._rows is not None
+        if self._index is None or not np.array_equal(vertices, self._vertices):
+            self._vertices = vertices
+            self._index = wp.array(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
+        return KeptRows(self._rows, self._index)
+
+    def _append(self, rows: wp.array) -> None:
+        count = self._count + rows.shape[0]
+        if self._rows is None or self._rows.shape[0] < count:
+            room = min(max(2 * self._count, count), self._most)
+            larger = wp.empty((room, *rows.shape[1:]), dtype=wp.float32, device=rows.device)
+            if self._rows is not None:
+                wp.copy(larger[: self._count], self._rows[: self._count])
+            self._rows = larger
+        wp.copy(self._rows[self._count : count], rows)
+        self._count = count

@@ -1,0 +1,228 @@
+"""Views: what cameras see of a geometry, wired from the vertices to the image."""
+
+import copy
+import functools
+import warnings
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.camera import Camera
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
+from warpshadow.pipeline.node import Call, Fixed, Node, Source
+from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
+from warpshadow.pipeline.static import Static
+from warpshadow.stages import film
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.project import to_clip
+from warpshadow.stages.rasterize import Fragments, rasterize
+from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.sides import find_sides
+from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
+from warpshadow.stages.silhouettes.smooth import find_edge_colors, smooth_silhouettes
+from warpshadow.stages.slopes import pull_surfaces
+from warpshadow.stages.textures.sample import expose_albedo
+
+
+class View(LitPoints):
+    """What cameras see of a geometry: all that an image takes but light and reflectance.
+
+    Args:
+        method: How light is blocked.
+        materials: What the scene's bodies reflect.
+        vertices: Positions of all vertices.
+        spheres: Centers and radii of the spheres.
+        cameras: Clip matrices.
+        static: The static bodies among moving ones; None where any may move.
+        call: Has what may not be kept of it.
+        camera: Has the cameras' size and near plane.
+        counts: Number of geometries, and of images.
+
+    Attributes:
+        given: Vertices, spheres, cameras and static bodies.
+        clip_positions, fragments_node, silhouettes, receivers_node: Nodes of what is seen.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        materials: Materials,
+        vertices: Source,
+        spheres: Source,
+        cameras: Source,
+        static: Static | None,
+        *,
+        call: Call,
+        camera: Camera,
+        counts: tuple[int, int],
+    ):
+        self.given = vertices, spheres, cameras, static
+        self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
+        self._size = self._across * camera.width, self._across * camera.height
+        self._sample_count = counts[1] * self._size[0] * self._size[1]
+        receivers = self._wire(method, vertices, cameras, static)
+        super().__init__(method, vertices, spheres, receivers, call, static)
+        self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
+        self._white = receivers, receivers  # a node of shading, and one of white samples in it
+
+    def _wire(self, method: Method, vertices: Source, cameras: Source, static: Static | None) -> Node:
+        """From the vertices to the receivers."""
+        assembly, samples, corners = method.assembly, self._samples, self._vertices
+        faces, two_sided = assembly.faces, assembly.two_sided_faces
+        if static is None or cameras.requires_grad:
+            clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
+        else:
+            kept = static.clip_positions(cameras)
+            clip = Node("clip positions", static.with_moving_clip_positions, vertices, cameras, kept, items=corners)
+        fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
+        if two_sided.size:
+            placed = Fixed(vertices), Fixed(cameras)
+            sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
+        else:
+            sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
+        around = assembly.edges, clip, assembly.surfaces
+        silhouettes = Node("silhouettes", find_silhouettes, sides, faces, *around, items=samples, has_adjoint=False)
+        if static is None:
+            normals = Node("normals", vertex_normals, vertices, faces, items=corners)
+        else:
+            normals = Node("normals", static.with_moving_normals, vertices, static.normals, items=corners)
+        # receivers at vertices move with these alone; those of samples move with what a sample sees, too
+        seen = sides if method.samples_receive.any() else Fixed(sides)
+        words = functools.partial(receiver_words, self)
+        receivers = Node("receivers", self._receive, vertices, normals, seen, Fixed(silhouettes), items=words)
+        self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
+        return receivers
+
+    def _receive(
+        self, positions: wp.array, normals: wp.array, fragments: Fragments, silhouettes: Silhouettes
+    ) -> Receivers:
+        """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
+        assembly, method = self.assembly, self.method
+        has_backs = fragments.sides is not None
+        keeps_vertex = method.can_receive[: 1 + has_backs]
+        is_static = None if self.static is None else self.static.has_vertex
+        if is_readable(assembly.device):
+            keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order)
+        elif is_static is None:
+            numbering = method.numberings[has_backs]
+        else:
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static)
+        wants_samples = method.samples_receive[assembly.body_of_face]
+        return find_receivers(positions, normals, assembly.faces, fragments, numbering, wants_samples)
+
+    def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
+        """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
+        words, clip, receivers, fragments = self._samples, self.clip_positions, self.receivers_node, self.fragments_node
+        lit, reflected = self.shading(light), self.surfaces.reflect(albedo, textures)
+        samples_of = functools.partial(Node, items=words, keeps=False)
+        if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
+            found = (Node("reflectance", None, idle="found as samples are exposed"),)
+            reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
+            white = self._exposed_white(lit)
+            faces = self.assembly.faces
+            samples = samples_of("exposure", expose_albedo, fragments, faces, *reflecting, white, beside=found)
+        else:
+            expose = functools.partial(_expose, at_points=not clip.requires_grad)
+            samples = samples_of("exposure", expose, receivers, lit, reflected.samples)
+        if clip.requires_grad:
+            seen = self.silhouettes, clip, lit, receivers, reflected.samples
+            edge_colors = samples_of("contrasts", _find_contrasts, samples, *seen)
+        else:
+            edge_colors = Node("contrasts", _nothing, idle="no gradient moves silhouettes")
+        smoothed = samples_of("smoothing", smooth_silhouettes, samples, self.silhouettes, clip, edge_colors)
+        if self._across == 1:
+            return Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
+        return samples_of("averaging", film.average, smoothed, self._across)
+
+    def _exposed_white(self, lit: Node) -> Node:
+        """Node of the samples if every surface were white; kept with the last shading."""
+        if self._white[0] is not lit:
+            self._white = lit, Node("", _expose_white, self.receivers_node, lit)
+        return self._white[1]
+
+    # ------------------------------------------------------------------------------------------ in words
+
+    @property
+    def fragments(self) -> Fragments:
+        """What each sample sees."""
+        return self.fragments_node.value(self.call)
+
+    def counts(self) -> tuple[str, int, int]:
+        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+        if self.receivers_node.known(self.call) is not None:
+            return super().counts()
+        can_receive, static = self.method.can_receive, 0
+        if self.static is not None:
+            static = int((can_receive & self.static.has_vertex).sum())
+        own = self._sample_count * self.method.samples_receive.any()
+        return "up to ", int(self._pose_count * (can_receive.sum() - static) + own), static
+
+    def _samples(self) -> str:
+        return f"{self._sample_count:,} samples"
+
+    def _vertices(self) -> str:
+        count, static = int(self.assembly.first_vertex[-1]), 0
+        if self.static is not None:
+            static = int(self.static.has_vertex.sum())
+        return f"{count - static:,} vertices, {static:,} kept" if static else f"{count:,} vertices"
+
+    def preview(self) -> "View":
+        """The view, to be asked what it would compute: what it is given it does not remember."""
+        view = copy.copy(self)
+        view.surfaces = copy.copy(self.surfaces)
+        return view
+
+    def warn_if_empty(self, *, stacklevel: int) -> bool:
+        """Warn of the first image that shows nothing of the scene, and say why."""
+        face_ids = self.fragments.face_ids.numpy()
+        empty = np.flatnonzero(face_ids.max(axis=(1, 2), initial=-1) < 0)
+        if not len(empty):
+            return False
+        number, near = int(empty[0]), self._camera.near
+        depths = self.clip_positions.value(self.call).numpy()
+        depths = depths[min(number, len(depths) - 1), :, 3]
+        nearest, farthest = float(depths.min()), float(depths.max())
+        if farthest <= 0:
+            reason = f"all of it is behind the camera, by {-farthest:g} or more"
+        elif farthest <= near:
+            reason = f"near = {near:g} cuts all of it away, which is {farthest:g} or less in front of the camera"
+        else:
+            reason = f"it is outside of the frame, at depths from {nearest:g} to {farthest:g}"
+        which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
+        warnings.warn(f"camera: {which} shows nothing of the scene: {reason}", stacklevel=stacklevel + 1)
+        return True
+
+
+def _same(value: object) -> object:
+    return value
+
+
+def _nothing() -> None:
+    return None
+
+
+def _expose(receivers: Receivers, lit: wp.array, reflected: wp.array, *, at_points: bool) -> wp.array:
+    return film.expose(receivers.fragments, receivers.faces, lit, reflected, at_points=at_points)
+
+
+def _expose_white(receivers: Receivers, lit: wp.array) -> wp.array:
+    _, height, width = receivers.fragments.face_ids.shape
+    white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=lit.device)
+    return film.expose(receivers.fragments, receivers.faces, lit, white)
+
+
+def _find_contrasts(
+    samples: wp.array,
+    silhouettes: Silhouettes,
+    clip_positions: wp.array,
+    lit: wp.array,
+    receivers: Receivers,
+    reflected: wp.array,
+) -> wp.array:
+    """Colors at edges, by which silhouettes pull; and surfaces pull by the slope of the light that they receive."""
+    edge_colors = find_edge_colors(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
+    seen = receivers.fragments, receivers.faces, lit, reflected
+    pull_surfaces(samples, *seen, silhouettes, edge_colors, clip_positions)
+    return edge_colors
