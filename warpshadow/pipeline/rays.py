@@ -89,7 +89,12 @@ class Rays(Method):
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
         for instance, mesh in enumerate(meshes):
             traced = trace_transfer(
-                mesh, points[instance], normals[instance], self.basis.functions, self.visibility.samples, progress=self.progress
+                mesh,
+                points[instance],
+                normals[instance],
+                self.basis.functions,
+                self.visibility.samples,
+                progress=self.progress,
             )
             wp.copy(transfer[instance], traced)
         return [transfer]
