@@ -11,10 +11,10 @@ from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.device.parallel import set_thread_count, thread_count
-from warpshadow.pipeline.renderer import Renderer, render
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
+from warpshadow.tuning.renderer import Renderer, render
 from warpshadow.tuning.tune import Tuning, tune
 
 __version__ = "0.1.0"

@@ -98,7 +98,7 @@ def render(
     from warpshadow.assets.color import auto_exposure, exposed
     from warpshadow.assets.image import write_image
     from warpshadow.pipeline.renderer import Renderer
-    from warpshadow.scene.files import parse_scene
+    from warpshadow.scene.files import load_scene
     from warpshadow.scene.scene import AUTO
     from warpshadow.tuning.tune import describe, resolved
 
@@ -109,7 +109,7 @@ def render(
             _check_output(png, *_PICTURES)
         if exposure is not None and not abs(exposure) <= _MOST_STOPS:
             raise ValueError(f"--exposure: got {exposure:g}, expected {-_MOST_STOPS} to {_MOST_STOPS} stops")
-        loaded = parse_scene(scene)
+        loaded = load_scene(scene)
         visibility = loaded.visibility
         visibility = dataclasses.replace(
             visibility, method=method or visibility.method, samples=samples or visibility.samples
@@ -146,7 +146,7 @@ def tune(
 
     Exit status 1: none reaches it; the one that comes nearest is named, and what to try next.
     """
-    from warpshadow.scene.files import parse_scene
+    from warpshadow.scene.files import load_scene
     from warpshadow.tuning.timing import TIMED_RECEIVERS
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene
@@ -154,7 +154,7 @@ def tune(
     with _clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = parse_scene(scene)
+        loaded = load_scene(scene)
         tuning = tune_scene(loaded, error=error, milliseconds=ms, fits=fit, device=_device(device), progress=True)
         typer.echo(
             f"{scene}: error of the shading at points of the image, against rays; time of a warm image of "

@@ -24,12 +24,12 @@ from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_at_a_time, one_call
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.assembly import Geometry, as_geometry
-from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.stages import rotations
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.stages.rotations import Vec6
+from warpshadow.tuning.renderer import Renderer
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 _GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
@@ -439,6 +439,8 @@ class _WarpFunction(torch.autograd.Function):
             wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
             for tensor, dtype in zip(tensors, dtypes, strict=True)
         ]
+        for argument, tensor in zip(arguments, tensors, strict=True):
+            argument.version = tensor._version  # by which a renderer knows what has not been written to
         # streams are the device's, as Warp has it, not a thread's
         with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
             for argument, is_wanted in zip(arguments, wants, strict=True):

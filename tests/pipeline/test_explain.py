@@ -12,7 +12,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device.batch import expand
-from warpshadow.pipeline import assembly
+from warpshadow.pipeline import assembly, node
 from warpshadow.pipeline import directional as directional_method
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.renderer import Renderer
@@ -161,6 +161,20 @@ def test_tensors_that_are_mutated_in_place_are_seen_anew():
     second = renderer(geometry=geometry)
     assert not torch.equal(second, first)
     assert torch.equal(second, TorchRenderer(scene_of())(geometry=geometry))
+
+
+def test_tensors_that_are_not_written_to_are_known_again_without_a_look_at_them(monkeypatch):
+    """As on a GPU, where arrays are not compared."""
+    renderer = TorchRenderer(scene_of())
+    monkeypatch.setattr(node, "is_readable", lambda device: False)
+    geometry = renderer.placed(*renderer.scene_poses())
+    seen = []
+    for factor in (1.0, None, 1.1):
+        if factor is not None:
+            geometry.positions.mul_(factor)
+        renderer(geometry=geometry)
+        seen.append(renderer.renderer._last_view)
+    assert seen[0] is seen[1] and seen[1] is not seen[2]
 
 
 def test_free_light_over_a_given_geometry_has_the_gradient_that_it_has_over_the_scenes():

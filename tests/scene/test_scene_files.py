@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene import toml_tables
-from warpshadow.scene.files import parse_scene, write_scene
+from warpshadow.scene.files import write_scene
 
 RANDOM = np.random.default_rng(0)
 LIGHTS = {
@@ -169,16 +169,16 @@ def test_tables_read_back_as_they_were_written(tmp_path):
 AUTO = '[visibility]\nmethod = "auto"\nerror = 0.9\n'
 
 
-def test_a_method_that_is_left_open_is_chosen_on_load(load, tmp_path):
+def test_a_method_that_is_left_open_is_chosen_by_who_renders(load):
     scene = load(AUTO + TABLES + "blockers = 0\n")
-    assert (scene.visibility.method, scene.visibility.error) == ("none", 0.9)
-    assert parse_scene(tmp_path / "scene.toml").visibility.method == "auto"
+    assert (scene.visibility.method, scene.visibility.error) == ("auto", 0.9)
+    chosen = ws.Renderer(scene).scene.visibility
+    assert (chosen.method, chosen.error) == ("none", 0.9)
 
 
 def test_a_scene_whose_method_is_open_is_written_as_such(load, tmp_path):
-    load(AUTO + TABLES + "blockers = 0\n")
-    path = write_scene(parse_scene(tmp_path / "scene.toml"), tmp_path / "again")[0]
-    again = parse_scene(path).visibility
+    scene = load(AUTO + TABLES + "blockers = 0\n")
+    again = ws.load_scene(write_scene(scene, tmp_path / "again")[0]).visibility
     assert (again.method, again.error) == ("auto", 0.9)
 
 

@@ -18,7 +18,8 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import AUTO, METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.tuning.tune import resolved
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +72,7 @@ class Problem:
                 raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
         if self.still is not None:
             check.choice("still.method", self.still.method, METHODS)
-        if self.scene.visibility.method == AUTO:
-            from warpshadow.tuning.tune import resolved  # which renders to find out
-
-            object.__setattr__(self, "scene", resolved(self.scene))
+        object.__setattr__(self, "scene", resolved(self.scene))
         if self.moves and self.scene.visibility.method == "ray-traced":
             raise ValueError(
                 'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '

@@ -57,7 +57,7 @@ class Renderer:
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        scene: The scene.
+        scene: The scene; a method "auto" has been replaced by what was chosen.
         cameras: Those that see the scene.
         has_camera_batch: Whether they were given as a batch.
         basis: What free light is expressed in.
@@ -461,17 +461,3 @@ def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
                 f"expected {first.width} × {first.height} and {first.near}, as the first has"
             )
     return tuple(cameras)
-
-
-def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
-    """Render a scene once; for several images of it, keep a :class:`Renderer`.
-
-    Args:
-        scene: The scene.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
-
-    Returns:
-        Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
-    """
-    return Renderer(scene, device=device, progress=progress).render()

@@ -20,7 +20,6 @@ from warpshadow.scene import toml_tables
 from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
-from warpshadow.tuning.tune import resolved
 
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
@@ -33,22 +32,16 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: str | Path, *, progress: bool = False) -> Scene:
-    """Read a scene file; where it leaves the method to "auto", choose one: :func:`warpshadow.tuning.tune.resolved`.
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene file.
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
-        progress: Show progress where a choice takes longer than a second.
 
     Raises:
         SceneError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
         FileNotFoundError: for a file that is not there.
     """
-    return resolved(parse_scene(path), progress=progress)
-
-
-def parse_scene(path: str | Path) -> Scene:
-    """Read a scene file as :func:`load_scene` does, but leave "auto" as it is."""
     path = check.path("path", path)
     with check.located(str(path), SceneError):
         return _scene(toml_tables.read(path, "scene file"), path.parent)

@@ -1,0 +1,223 @@
+"""Sources and nodes: what is computed once, what is computed again, and what is said of it."""
+
+import time
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warpshadow.device.tape import recorded
+from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.node import Call, Clock, Fixed, Node, Source
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def counting(name, log, **options):
+    """Make nodes that add their inputs up, and note each time they do."""
+
+    def add(*values):
+        log.append(name)
+        return sum(values)
+
+    return lambda *inputs: Node(name, add, *inputs, **options)
+
+
+def array(values=(1.0, 2.0), **options):
+    return wp.array(np.array(values, np.float32), device="cpu", **options)
+
+
+# ---------------------------------------------------------------------------------------------- values
+
+
+def test_a_node_is_computed_once_for_all_that_ask(clock):
+    log = []
+    source = Source("vertices", 2)
+    first = counting("first", log)(source, 1)
+    second, third = counting("second", log)(first, first), counting("third", log)(first)
+    total = counting("total", log)(second, third)
+    assert [total.value(Call(clock)) for _ in range(2)] == [9, 9]
+    assert log == ["first", "second", "third", "total"]
+
+
+def test_a_node_that_keeps_its_value_asks_nothing_before_it(clock):
+    log = []
+    transfer = counting("transfer", log, keeps=False)(Source("vertices", 2))
+    shading = counting("shading", log)(transfer)
+    for _ in range(3):
+        assert shading.value(Call(clock)) == 2
+    assert log == ["transfer", "shading"]
+    assert transfer.value(Call(clock)) == 2  # which was thrown away
+    assert log == ["transfer", "shading", "transfer"]
+
+
+def test_what_a_call_may_not_keep_is_computed_once_in_it(clock):
+    log = []
+    source = Source("vertices", array(requires_grad=True))
+    first = Node("first", lambda given: log.append("first") or 3, source)
+    total = Node("total", lambda *given: log.append("total") or sum(given), first, first)
+    for _ in range(2):
+        assert total.value(Call(clock)) == 6
+    assert log == ["first", "total"] * 2 and total.requires_grad and not total.is_kept
+
+
+def test_nothing_is_kept_of_a_call_that_is_captured(clock):
+    node = counting("node", [])(Source("vertices", 2))
+    assert node.value(Call(clock, keeps=False)) == 2 and not node.is_kept
+
+
+def test_a_call_knows_what_another_found(clock):
+    log = []
+    node = counting("node", log, keeps=False)(Source("vertices", 2))
+    call = Call(clock)
+    node.value(call)
+    node.value(Call(clock, call))
+    assert log == ["node"]
+
+
+def test_a_source_is_made_when_it_is_first_asked_for():
+    log = []
+    source = Source("vertices", lambda: log.append("made") or 5)
+    assert not log
+    assert [source.value(), source.value()] == [5, 5] and log == ["made"]
+
+
+# ---------------------------------------------------------------------------------------------- the same or another
+
+
+def test_the_same_values_are_the_same_source():
+    first = Source.renewed("vertices", array(), None)
+    assert Source.renewed("vertices", array(), first) is first
+    other = Source.renewed("vertices", array((1.0, 3.0)), first)
+    assert other is not first and other.news == "vertices changed since the last call" and not first.news
+
+
+def test_a_source_has_the_values_that_it_was_given():
+    given = array()
+    first = Source.renewed("vertices", given, None)
+    given.zero_()
+    assert first.value().numpy()[1] == 2
+    assert Source.renewed("vertices", given, first) is not first
+
+
+def test_an_array_and_its_version_are_the_same_without_a_look_at_their_values(monkeypatch):
+    given = array()
+    given.version = 7
+    first = Source.renewed("spheres", (given, given), None)
+    again = wp.array(ptr=given.ptr, shape=given.shape, dtype=given.dtype, device="cpu")
+    again.version = 7
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "array_equal", None)
+        assert Source.renewed("spheres", (again, again), first) is first
+    again.version = 8
+    again.fill_(5.0)
+    assert Source.renewed("spheres", (again, again), first) is not first
+
+
+def test_what_has_a_gradient_is_never_the_same():
+    given = array(requires_grad=True)
+    first = Source.renewed("vertices", given, None)
+    assert first.requires_grad and first.value() is given
+    assert Source.renewed("vertices", given, first) is not first
+    assert Source.renewed("vertices", array(), first) is not first
+
+
+def test_coefficients_are_compared_and_other_things_are_what_they_are():
+    first = Source.renewed("light", np.ones((4, 3)), None)
+    assert Source.renewed("light", np.ones((4, 3)), first) is first
+    assert Source.renewed("light", np.zeros((4, 3)), first) is not first
+    sky = object()
+    last = Source.renewed("light", sky, first)
+    assert Source.renewed("light", sky, last) is last and Source.renewed("light", object(), last) is not last
+
+
+# ---------------------------------------------------------------------------------------------- what is said
+
+
+def wired(vertices=2, cameras=3, **options):
+    """Silhouettes of what cameras see, which no gradient passes, and an image."""
+    vertices = Source("vertices", vertices)
+    cameras = Source("cameras", cameras, news="cameras changed since the last call")
+    clip = Node("clip positions", lambda a, b: 1, vertices, cameras, items="4 vertices")
+    silhouettes = Node("silhouettes", lambda clip: clip, clip, has_adjoint=False)
+    normals = Node("normals", lambda a: 1, vertices)
+    sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
+    image = Node("image", lambda *given: sum(given), sides, Fixed(silhouettes), normals, keeps=False)
+    return image, {node.name: node for node in (clip, silhouettes, normals, sides, image)}
+
+
+def test_each_node_says_why_it_runs_or_does_not(clock):
+    image, nodes = wired()
+    call = Call(clock)
+    explanation = Explanation(image, call, clock.timings, is_host=True)
+    whys = {name: (stage.forward.runs, stage.forward.why) for name, stage in explanation.stages.items()}
+    assert whys == {
+        "clip positions": (True, "cameras changed since the last call"),
+        "sides": (False, "every body is closed"),
+        "silhouettes": (True, "cameras changed since the last call"),
+        "normals": (True, "nothing is kept yet"),
+        "image": (True, "cameras changed since the last call"),
+    }
+    assert list(explanation.stages)[0] == "clip positions" and explanation["clip positions"].items == "4 vertices"
+    image.value(call)
+    decisions = decide(image, Call(clock))
+    assert decisions[nodes["normals"]].why == "kept: vertices are the same"
+    assert decisions[nodes["clip positions"]].why == "kept: vertices and cameras are the same"
+    assert decisions[image].runs
+
+
+def test_what_is_not_asked_for_is_left_out_for_the_reason_of_who_would_ask(clock):
+    transfer = Node("transfer", lambda a: a, Source("vertices", 1), keeps=False)
+    shading = Node("shading", lambda a, b: a + b, transfer, Source("light", 2))
+    shading.value(Call(clock))
+    decisions = decide(shading, Call(clock))
+    assert not decisions[transfer] and decisions[transfer].why == "kept: vertices and light are the same"
+
+
+def test_an_explanation_computes_nothing(clock):
+    node = Node("node", None, Source("vertices", lambda: pytest.fail("asked for")))
+    assert Explanation(node, Call(clock), {}, is_host=True)["node"]
+
+
+def test_gradients_pass_where_they_can(clock):
+    image, _ = wired(array(requires_grad=True), array())
+    explanation = Explanation(image, Call(clock), {}, is_host=True)
+    backward = {name: stage.backward.runs for name, stage in explanation.stages.items()}
+    assert backward == {"clip positions": True, "sides": False, "silhouettes": False, "normals": True, "image": True}
+    assert explanation["normals"].forward.why == "a gradient to vertices is asked for"
+    assert explanation["normals"].backward.why == "a gradient to vertices is asked for"
+    assert explanation["silhouettes"].backward.why == "nothing before it requires a gradient"
+    assert explanation["sides"].backward.why == "nothing is computed"
+
+
+def test_a_fixed_input_matters_and_gets_no_gradient(clock):
+    vertices = Source("vertices", array(requires_grad=True))
+    fixed, constant = (Node("node", None, Fixed(vertices, is_constant=is_constant)) for is_constant in (False, True))
+    assert fixed.requires_grad and not fixed.pulled and list(fixed.sources) == [vertices]
+    assert not constant.requires_grad and not constant.sources
+
+
+# ---------------------------------------------------------------------------------------------- times
+
+
+def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock):
+    source = Source("vertices", array(requires_grad=True))
+    node = Node("transfer", lambda seconds: time.sleep(seconds), source)
+    with recorded() as tape:
+        call = Call(clock)
+        for seconds in (0.02, 0.03):
+            node.run(call, seconds)
+    assert clock.timings["transfer"].forward >= 0.05 and clock.timings["transfer"].backward is None
+    for _ in range(2):
+        tape.backward()
+    assert 0 <= clock.timings["transfer"].backward < 0.05
+    node.run(Call(clock), 0.01)
+    assert 0.01 <= clock.timings["transfer"].forward < 0.05
+
+
+def test_what_is_idle_takes_no_time(clock):
+    node = Node("sides", lambda: 1, idle="every body is closed")
+    assert node.value(Call(clock)) == 1 and not clock.timings

@@ -1,0 +1,50 @@
+"""Renderers of any scene: what "auto" leaves open is chosen before the pipeline sees the scene."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.basis import Basis, check_basis
+from warpshadow.assets.camera import Camera
+from warpshadow.pipeline import renderer
+from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.tuning import tune
+
+
+class Renderer(renderer.Renderer):
+    """Renders any scene, as :class:`warpshadow.pipeline.renderer.Renderer` does; "auto" is replaced by a choice.
+
+    Args:
+        scene: The scene.
+        cameras, device, basis, progress: As there.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        cameras: Sequence[Camera] | None = None,
+        device: wp.DeviceLike = "cpu",
+        basis: Basis | None = None,
+        progress: bool = False,
+    ):
+        check.instance("scene", scene, Scene, SCENE)
+        check_basis(basis)
+        chosen = tune.resolved(scene, device=check.device("device", device), progress=progress)
+        super().__init__(chosen, cameras=cameras, device=device, basis=basis, progress=progress)
+
+
+def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
+    """Render a scene once; for several images of it, keep a :class:`Renderer`.
+
+    Args:
+        scene: The scene.
+        device: Warp device.
+        progress: Show progress where something takes longer than a second.
+
+    Returns:
+        Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
+    """
+    return Renderer(scene, device=device, progress=progress).render()
