@@ -9,6 +9,7 @@ from test_point_sample import make_scene
 
 import warpshadow as ws
 from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.renderer import Renderer
 from warpshadow.tuning import timing
 from warpshadow.tuning.timing import image_times, median_times, whole_image
 
@@ -74,8 +75,8 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
         receivers = view.receivers.points.shape[1]
         clock.append(receivers * (1.0 if self.scene.visibility.method == "none" else 4.0))
 
-    monkeypatch.setattr(ws.Renderer, "shade", shade)
-    monkeypatch.setattr(ws.Renderer, "draw", lambda self, view: clock.append(1000.0))
+    monkeypatch.setattr(Renderer, "shade", shade)
+    monkeypatch.setattr(Renderer, "draw", lambda self, view: clock.append(1000.0))
     monkeypatch.setattr(
         timing, "median_times", lambda functions, runs, **_: [(function(), clock[-1])[1] for function in functions]
     )
