@@ -39,8 +39,8 @@ def test_kernels_of_files_compile_for_cuda(tmp_path):
     assert {
         "warpshadow.stages.shading",
         "warpshadow.stages.rasterize",
-        "warpshadow.assets.mesh",
-        "warpshadow.assets.camera",
+        "warpshadow.stages.normals",
+        "warpshadow.stages.project",
     } <= set(modules)
     for name, module in modules.items():
         folder = tmp_path / name

@@ -54,14 +54,14 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for make in (
             rasterize._interpolation,
             rasterize._interpolation_adjoint,
-            batch._add_kernel,
+            batch._make_add,
             smooth._blend_kernel,
             smooth._blend_adjoint_kernel,
         )
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
-    **{f"_copy_kernel {dtype.__name__}": partial(batch._copy_kernel, dtype) for dtype in (wp.float32, wp.vec3)},
-    "_empty_kernel": partial(lanes._empty_kernel, ""),
+    **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},
+    "_make_empty": partial(lanes._make_empty, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""
 

@@ -36,7 +36,7 @@ def instance_in(batch: int, count: int):
 
 
 @functools.cache
-def _copy_kernel(dtype: type) -> wp.Kernel:
+def _make_copy(dtype: type) -> wp.Kernel:
     @wp.kernel(module="unique")
     def copy(
         # in
@@ -67,7 +67,7 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     whole = wp.empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
     first = 0
     for part, count in zip(parts, counts, strict=True):
-        launch(_copy_kernel(part.dtype), (instances, count), inputs=[part, first], outputs=[whole])
+        launch(_make_copy(part.dtype), (instances, count), inputs=[part, first], outputs=[whole])
         first += count
     return whole
 
@@ -85,7 +85,7 @@ def expand(array: wp.array, instances: int) -> wp.array:
 
 
 @functools.cache
-def _add_kernel(dtype: type) -> wp.Kernel:
+def _make_add(dtype: type) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def add(
         # in
@@ -107,7 +107,7 @@ def accumulate(values: wp.array, totals: wp.array) -> None:
         return
     if totals.ndim == 1:
         values, totals = values.reshape((1, -1)), totals.reshape((1, -1))
-    launch(_add_kernel(totals.dtype), totals.shape, inputs=[values], outputs=[totals])
+    launch(_make_add(totals.dtype), totals.shape, inputs=[values], outputs=[totals])
 
 
 def rows(images: Any) -> Any:

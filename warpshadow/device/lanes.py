@@ -125,7 +125,7 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
     return " ".join((base, *(flag for flag in flags if flag not in refused)))
 
 
-def _empty_kernel(flags: str) -> wp.Kernel:
+def _make_empty(flags: str) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
     def do_nothing():
         """What the compiler makes of the flags is all that matters."""
@@ -136,7 +136,7 @@ def _empty_kernel(flags: str) -> wp.Kernel:
 def _builds(flags: str) -> bool:
     """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
     try:
-        wp.launch(_empty_kernel(flags), dim=1, device="cpu", record_tape=False)
+        wp.launch(_make_empty(flags), dim=1, device="cpu", record_tape=False)
     except Exception:  # Warp raises no other
         return False
     return True
