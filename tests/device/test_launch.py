@@ -146,7 +146,8 @@ def test_a_launch_that_is_cut_into_slices_adds_to_sums(device):
 
 def test_threads_record_on_their_own_tapes(device):
     gradients, barrier = {}, threading.Barrier(2)
-    cube(floats(device, 5))  # loads the module, of which threads must not be the first
+    cube(floats(device, 5))  # loads the module, which threads must not be the first to do
+    launch(_cube_adjoint, 1, inputs=[floats(device, 1)] * 2, outputs=[floats(device, 1)])
 
     def work(factor):
         values = floats(device, 5)
@@ -157,8 +158,6 @@ def test_threads_record_on_their_own_tapes(device):
         tape.backward(grads={cubes: wp.full(5, factor, dtype=wp.float32, device=device)})
         gradients[factor] = values.grad.numpy() / values.numpy() ** 2
 
-    cube(floats(device, 5)).numpy()
-    launch(_cube_adjoint, 1, inputs=[floats(device, 1)] * 2, outputs=[floats(device, 1)])
     threads = [threading.Thread(target=work, args=(factor,)) for factor in (1.0, 2.0)]
     for thread in threads:
         thread.start()

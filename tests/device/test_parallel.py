@@ -12,7 +12,8 @@ import warp as wp
 
 from warpshadow.assets.primitives import icosphere
 from warpshadow.device import parallel
-from warpshadow.device.parallel import Scratch, launch_slices, scratch_place
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.rasterize import interpolate, rasterize
 from warpshadow.stages.shading import shade
@@ -58,15 +59,14 @@ def spread(values, *, wants_total=True, cost=1e4):
     squares = wp.full(count, np.nan, dtype=wp.float32, device=device)
     workers = wp.empty(count, dtype=wp.int32, device=device)
     total = wp.full(1, 3.0, dtype=wp.float32, device=device) if wants_total else None
-    launch_slices(
+    launch(
         _spread,
-        dim=[count],
-        cost=cost,
+        count,
         inputs=[wp.array(values, dtype=wp.float32, device=device)],
         scratch=[Scratch((1,), wp.float32)],
         outputs=[squares, workers],
         sums=[total],
-        device=device,
+        cost=cost,
     )
     return squares.numpy(), workers.numpy(), None if total is None else total.numpy()
 
