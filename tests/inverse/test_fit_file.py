@@ -135,6 +135,7 @@ def test_every_optimizer_is_torchs_with_the_options_that_are_given(load, lines, 
     assert type(made) is kind
     (group,) = made.param_groups
     assert {name: group[name] for name in options} == options
+    assert all(type(group[name]) is type(value) for name, value in options.items())  # or a checkpoint cannot be read
     assert group["lr"] == 0.25
 
 
@@ -351,6 +352,4 @@ def test_a_loaded_fit_runs_with_its_stages_optimizer_tolerance_and_seed(load, mo
     fit.run(device="cpu", progress=True)
     assert isinstance(fit.optimizer, functools.partial)
     expected = {"optimizer": fit.optimizer, "tolerance": 0.5, "seed": 3, "device": "cpu", "progress": True}
-    assert got.pop("args") == (fit.problem, fit.stages)
-    assert {name: got.pop(name) for name in expected} == expected
-    assert got == {"checkpoint": None, "checkpoint_seconds": 10.0, "preview": None}
+    assert got == expected | {"args": (fit.problem, fit.stages)}

@@ -17,7 +17,6 @@ class HarmonicBasis:
     order: int
 
     def __post_init__(self) -> None:
-        """Validate."""
         sh.check_order(self.order)
 
     @property
@@ -47,7 +46,6 @@ class CellBasis:
     directions: np.ndarray
 
     def __post_init__(self) -> None:
-        """Validate."""
         expected = "unit vectors [direction, 3]; warpshadow.maths.directions.fibonacci(128) makes 128"
         directions = check.numbers("directions", self.directions, expected=expected, dtype=np.float64)
         check.shape(

@@ -39,8 +39,6 @@ class Camera:
         width: Image width [pixels].
         height: Image height [pixels].
         near: Distance of the near plane along z [scene units]; what is nearer is not drawn.
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     intrinsics: np.ndarray
@@ -84,7 +82,7 @@ class Camera:
             size: Width and height [pixels].
             near: Distance of the near plane [scene units].
         Raises:
-            ValueError: naming the argument; so when eye and target coincide or up is parallel to the view.
+            ValueError: when eye and target coincide or up is parallel to the view.
         """
         origin, goal, top = (check.array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
         view = goal - origin
@@ -124,8 +122,7 @@ class Camera:
             near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with
                 ``fov_y``.
         Raises:
-            ValueError: naming the argument; so when the view is not rigid or the projection not a
-                perspective.
+            ValueError: when the view is not rigid or the projection not a perspective.
         """
         view = check.array("view", view, (4, 4))
         if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):

@@ -28,7 +28,6 @@ def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
 
     Raises:
         ImportError: when xatlas, the extra ``unwrap``, is not installed.
-        MeshError: naming the argument, what it got and what it accepts.
     """
     try:
         import xatlas

@@ -6,7 +6,12 @@ to a :class:`Result`, whose scene can be rendered, relit and written. Needs torc
 
 from warpshadow.inverse.checkpoint import CheckpointError
 from warpshadow.inverse.descent import FitWarning, Result, fit, short_adam
-from warpshadow.inverse.free import Albedo, CameraPose, Deformation, Exposure, Free, Light, Pose, Radii, Texture
+from warpshadow.inverse.free.base import Free
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.free.reflectance import Albedo, Texture
+from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.views import CameraPose, Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import write_result

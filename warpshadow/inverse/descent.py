@@ -19,7 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse import checkpoint as checkpoints
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
@@ -326,7 +326,7 @@ def fit(
         says what.
 
     Raises:
-        ValueError: for a problem that cannot be rendered, naming the argument.
+        ValueError: for a problem that cannot be rendered.
         CheckpointError: for a checkpoint of another problem.
     """
     check.instance("problem", problem, Problem, "a Problem, as Problem(scene, targets, free) makes it")

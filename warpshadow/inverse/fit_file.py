@@ -43,7 +43,12 @@ _TARGET_KEYS = ("image", "mask", "camera")
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
 _STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {"pose": pose_stages, "deformation": deformation_stages}
-_pair = functools.partial(check.array, lengths=(2,))
+
+
+def _pair(key: str, value: object) -> tuple[float, ...]:
+    return tuple(check.array(key, value, (2,)).tolist())
+
+
 _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Callable[[str, object], Any]]]] = {
     "adam": (torch.optim.Adam, {"betas": _pair}),
     "sgd": (torch.optim.SGD, {"momentum": check.number, "dampening": check.number, "nesterov": check.flag}),
@@ -78,28 +83,11 @@ class Fit:
     tolerance: float
     seed: int
 
-    def run(
-        self,
-        *,
-        device: str | torch.device = "cpu",
-        checkpoint: str | Path | None = None,
-        checkpoint_seconds: float = 10.0,
-        preview: str | Path | None = None,
-        progress: bool = False,
-    ) -> Result:
-        """Run it; the options are those of :func:`warpshadow.inverse.fit`."""
-        return fit(
-            self.problem,
-            self.stages,
-            optimizer=self.optimizer,
-            tolerance=self.tolerance,
-            seed=self.seed,
-            device=device,
-            checkpoint=checkpoint,
-            checkpoint_seconds=checkpoint_seconds,
-            preview=preview,
-            progress=progress,
-        )
+    @property
+    def run(self) -> Callable[..., Result]:
+        """:func:`warpshadow.inverse.fit` of it; what is left to say is device, checkpoint, preview and progress."""
+        run = functools.partial(fit, self.problem, self.stages, optimizer=self.optimizer)
+        return functools.partial(run, tolerance=self.tolerance, seed=self.seed)
 
 
 def load_fit(path: str | Path) -> Fit:

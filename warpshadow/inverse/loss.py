@@ -22,9 +22,6 @@ class Loss:
         delta: Where "huber" changes over [root mean squares of the target].
         coverage: Weight of the coverage, for targets that have it.
         reduction: "mean" over pixels, or "sum": what a plain gradient descent on many pixels' own parameters wants.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     kind: str = "l2"
@@ -33,7 +30,6 @@ class Loss:
     reduction: str = "mean"
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.choice("kind", self.kind, KINDS)
         check.choice("reduction", self.reduction, REDUCTIONS)
         check.positive("delta", self.delta)

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from warpshadow.inverse.free import Light, Values
+from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.target import stacked

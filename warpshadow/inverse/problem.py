@@ -13,7 +13,9 @@ import torch
 from warpshadow import check
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
-from warpshadow.inverse.free import Albedo, Free, Light, Texture, Values
+from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
@@ -33,9 +35,6 @@ class Problem:
         loss: What counts as alike.
         still: How visibility is computed where no geometry and no camera moves: rays by default, since then they are
             traced once and an iteration costs the same; None for the scene's own method.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     scene: Scene
@@ -45,7 +44,6 @@ class Problem:
     still: Visibility | None = field(default_factory=lambda: Visibility(method="ray-traced"))
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.instance("scene", self.scene, Scene, SCENE)
         check.instance("loss", self.loss, Loss, "a Loss, such as Loss('huber')")
         rays = "a Visibility, such as Visibility('ray-traced'), or None for the scene's"

@@ -14,7 +14,7 @@ from warpshadow.assets import files
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.descent import Result
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.preview import white_of
 from warpshadow.inverse.schedule import Stage

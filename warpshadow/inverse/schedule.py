@@ -30,9 +30,6 @@ class Stage:
         candidates: How many descents take part. They go on from the best of the stage before; where those are fewer,
             others start scattered around the best. The least loss tells them apart.
         regularization: Factor of all regularizers: coarse stages want more of them.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     iterations: int = 200
@@ -45,7 +42,6 @@ class Stage:
     regularization: float = 1.0
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.whole("iterations", self.iterations)
         check.whole("candidates", self.candidates)
         if not (check.is_number(self.learning_rate) and self.learning_rate > 0):

@@ -29,9 +29,6 @@ class Target:
         mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out what the scene has
             no body for: the background of a photograph, say. Or a file that :func:`read_mask` reads.
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     image: np.ndarray = field(repr=False)

@@ -68,9 +68,6 @@ class RandomScenes:
             Bodies of one's own: ``[Body(load_mesh("bunny.obj"), blockers=32)]``.
         visibility: How visibility is computed.
         supersampling: As of a :class:`warpshadow.Scene`.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     seed: int = 0
@@ -81,7 +78,6 @@ class RandomScenes:
     supersampling: int = 2
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.whole("seed", self.seed, least=0)
         check.whole("count", self.count, least=0)
         object.__setattr__(self, "bodies", tuple(self.bodies))

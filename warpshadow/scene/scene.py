@@ -52,9 +52,6 @@ class Visibility:
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
         samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
         error: Largest relative error of shading that "auto" is to accept.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     method: str = "directional"
@@ -68,7 +65,6 @@ class Visibility:
     error: float = 0.05
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.choice("method", self.method, (*METHODS, AUTO))
         check_count("directions", self.directions)
         sh.check_order(self.order)
@@ -100,9 +96,6 @@ class Body:
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     mesh: Mesh
@@ -233,9 +226,6 @@ class Scene:
         camera: The camera.
         visibility: How visibility is computed.
         supersampling: Each pixel averages this many samples across and down, which smooths silhouettes.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
 
     bodies: tuple[Body, ...]
@@ -245,7 +235,6 @@ class Scene:
     supersampling: int = 2
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.instance("bodies", self.bodies, Iterable, "a list of one or more: [Body(mesh)]")
         object.__setattr__(self, "bodies", tuple(self.bodies))
         if not self.bodies:

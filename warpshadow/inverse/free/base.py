@@ -75,7 +75,6 @@ class FreeOfBody(Free):
     body: int
 
     def __post_init__(self) -> None:
-        """Validate."""
         if not check.is_integer(self.body) or self.body < 0:
             raise ValueError(f"body: got {check.described(self.body)}, expected the number of a body, from 0")
 

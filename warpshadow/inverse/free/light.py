@@ -40,7 +40,6 @@ class Light(Free):
     smoothness: float = 1e-4
 
     def __post_init__(self) -> None:
-        """Validate."""
         if (self.order is None) == (self.directions is None):
             raise ValueError(
                 f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them, such as "

@@ -44,7 +44,6 @@ class Pose(FreeOfBody):
     spread: float = 0.55
 
     def __post_init__(self) -> None:
-        """Validate."""
         super().__post_init__()
         check.choice("rotation", self.rotation, _NO_TURN)
         check.flag("scale", self.scale)

@@ -30,7 +30,6 @@ class Albedo(FreeOfBody):
     per_vertex: bool = False
 
     def __post_init__(self) -> None:
-        """Validate."""
         super().__post_init__()
         check.flag("per_vertex", self.per_vertex)
 
@@ -81,7 +80,6 @@ class Texture(FreeOfBody):
     smoothness: float = 0.0
 
     def __post_init__(self) -> None:
-        """Validate."""
         super().__post_init__()
         if self.size is not None:
             is_pair = isinstance(self.size, (tuple, list, np.ndarray)) and len(self.size) == 2

@@ -50,7 +50,6 @@ class Deformation(FreeOfBody):
     count: int = 4
 
     def __post_init__(self) -> None:
-        """Validate."""
         super().__post_init__()
         for name in ("rigidity", "firmness", "smoothness"):
             check.nonnegative(name, getattr(self, name))
@@ -123,7 +122,6 @@ class Radii(FreeOfBody):
     persistence: float = 0.0
 
     def __post_init__(self) -> None:
-        """Validate."""
         super().__post_init__()
         check.nonnegative("persistence", self.persistence)
 

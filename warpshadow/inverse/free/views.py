@@ -48,7 +48,6 @@ class CameraPose(Free):
     focal: bool = False
 
     def __post_init__(self) -> None:
-        """Validate."""
         check.flag("focal", self.focal)
 
     def start(self, setting: Setting) -> Values:
