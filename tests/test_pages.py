@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 from typer.testing import CliRunner
 
 import warpshadow as ws
@@ -182,6 +183,21 @@ def test_the_fit_files_are_some(folder):
     for text in (fit, re.sub(r"^stages = .*\n", "", fit, flags=re.MULTILINE) + stages):
         Path("fit.toml").write_text(text, "utf-8")
         assert load_fit("fit.toml").problem.free
+
+
+def test_the_stage_that_a_page_adds_has_an_adjoint(tmp_path, monkeypatch):
+    """It is linear, so the adjoint is its transpose: ⟨w, darken(x)⟩ = ⟨adjoint(w), x⟩."""
+    (snippet,) = blocks(ROOT / "warpshadow" / "README.md", "python")
+    (tmp_path / "vignette.py").write_text(snippet, "utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    x, w = np.random.default_rng(0).random((2, 2, 5, 7, 4)).astype(np.float32)
+    image = wp.array(x, dtype=wp.vec4, requires_grad=True, device="cpu")
+    with wp.Tape() as tape:
+        darkened = importlib.import_module("vignette").darken_corners(image, 0.6)
+    tape.backward(grads={darkened: wp.array(w, dtype=wp.vec4, device="cpu")})
+    assert np.array_equal(darkened.numpy()[..., 3], x[..., 3])
+    assert (darkened.numpy()[:, 0, 0, :3] < 0.6 * x[:, 0, 0, :3]).all()
+    assert np.vdot(w, darkened.numpy()) == pytest.approx(np.vdot(image.grad.numpy(), x), rel=1e-6)
 
 
 @pytest.mark.slow
