@@ -59,7 +59,7 @@ def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, r
         1 where a sphere blocks the ray, else 0; uint8, shape [batch, vertex, direction].
 
     Raises:
-        ValueError: naming the argument whose shape does not fit.
+        ValueError: for shapes that do not fit.
 
     Differentiable: no.
     """
