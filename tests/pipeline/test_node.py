@@ -197,7 +197,7 @@ def test_a_fixed_input_matters_and_gets_no_gradient(clock):
     vertices = Source("vertices", array(requires_grad=True))
     fixed, constant = (Node("node", None, Fixed(vertices, is_constant=is_constant)) for is_constant in (False, True))
     assert fixed.requires_grad and not fixed.pulled and list(fixed.sources) == [vertices]
-    assert not constant.requires_grad and not constant.sources
+    assert not constant.requires_grad and not constant.sources and not constant.before
 
 
 # ---------------------------------------------------------------------------------------------- times

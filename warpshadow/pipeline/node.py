@@ -131,7 +131,7 @@ class Node:
         self.pulled: dict[Source, None] = {}
         self.requires_grad = False
         for each in (*inputs, *beside):
-            if isinstance(each, (Node, Source, Fixed)):
+            if isinstance(each, (Node, Source)) or (isinstance(each, Fixed) and not each.is_constant):
                 self.before.append(each)
                 self.sources |= each.sources
                 self.pulled |= each.pulled
@@ -148,6 +148,7 @@ class Node:
             value = self.compute(call)
             if self.keeps and call.keeps:
                 self._kept, self.is_kept = value, True
+                self.inputs = ()  # which may be large, and constants are not asked for again
                 return value
             call[self] = value
         return call[self]
@@ -184,9 +185,8 @@ class Fixed:
     """
 
     def __init__(self, node: Node | Source, *, is_constant: bool = False):
-        self.node, self.value = node, node.value
-        self.requires_grad = node.requires_grad and not is_constant
-        self.sources = {} if is_constant else node.sources
+        self.node, self.value, self.is_constant = node, node.value, is_constant
+        self.requires_grad, self.sources = node.requires_grad, node.sources
         self.pulled: dict[Source, None] = {}
 
 

@@ -135,8 +135,10 @@ class Renderer:
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
-        A view sees what it is given as it is now: arrays may change afterwards, unless they require a gradient. (On a
-        GPU values are not compared, since the host would have to wait for them: hold on to a view that stands.)
+        A view sees what it is given as it is now: arrays may change afterwards, unless they require a gradient. A
+        tensor is known again by torch's count of the writes to it, which leaves out those through NumPy and ``.data``;
+        other arrays by their values. On a GPU values are not compared, since the host would have to wait: hold on to
+        the view there.
 
         Args:
             geometry: Instances of vertices and spheres, by default the scene's own.
@@ -156,9 +158,10 @@ class Renderer:
             node.value(view.call)
         if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
             self._has_warned = view.warn_if_empty(stacklevel=3)
+        self._last_cameras = view.cameras
         if view.static is not None:
             self._statics[view.static.moving] = view.static
-        if is_scenes:
+        if view.receivers_node.is_kept and is_scenes:
             self._scene_view = view
         elif view.receivers_node.is_kept:
             self._last_view = view
@@ -176,7 +179,7 @@ class Renderer:
             spheres = Source.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
         if clip_matrices is not None:
             matrices = clip_matrices
-            cameras = self._last_cameras = Source.renewed("cameras", matrices, self._last_cameras)
+            cameras = Source.renewed("cameras", matrices, self._last_cameras)
         image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
         if geometry is not None and geometry.moving is not None and not self._method.lights_samples:
             static = self._statics.get(geometry.moving)

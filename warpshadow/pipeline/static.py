@@ -76,7 +76,7 @@ class Static:
 
     def clip_positions(self, cameras: Source) -> Node:
         """Clip positions of all vertices, vec4 of shape [camera, vertex]; those of moving ones mean nothing."""
-        if self._clip_positions is None or self._clip_positions.inputs[1] is not cameras:
+        if self._clip_positions is None or self._clip_positions.before != [cameras]:
             self._clip_positions = Node("", to_clip, self._geometry.positions, cameras)
         return self._clip_positions
 

@@ -58,6 +58,7 @@ class View(LitPoints):
         counts: tuple[int, int],
     ):
         self.given = vertices, spheres, cameras, static
+        self.cameras = cameras
         self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
