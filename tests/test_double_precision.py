@@ -398,7 +398,7 @@ def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, mo
     monkeypatch.setattr(double("stages.film"), "expose", lambda *arguments, **_: expose(*arguments))
     monkeypatch.setattr(double("pipeline.view"), "pull_surfaces", lambda *arguments: None)
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
-    camera = renderer.renderer.scene.camera
+    camera = renderer.scene.camera
     towards, offset, intrinsics = variables(renderer, camera.rotation, camera.translation, camera.intrinsics)
 
     def draw(turns, translations, scales, camera_turn, light, color):

@@ -86,7 +86,7 @@ class Cameras:
         self.start = torch.zeros(7)
 
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
-        camera = self.renderer.renderer.scene.camera
+        camera = self.renderer.scene.camera
         matrix, turn, shift = (
             torch.tensor(array, dtype=torch.float32)
             for array in (camera.intrinsics, camera.rotation, camera.translation)
@@ -103,8 +103,8 @@ class Deformations:
 
     def __init__(self, renderer: TorchRenderer):
         self.renderer = renderer
-        self.graph = renderer.renderer.assembly.graph(0, count=3)
-        self.radii = torch.tensor(renderer.renderer.scene.bodies[0].blockers.radii)
+        self.graph = renderer.deformation_graph(0, count=3)
+        self.radii = torch.tensor(renderer.scene.bodies[0].blockers.radii)
         self.start = torch.zeros(7 * len(self.radii))
 
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
@@ -149,7 +149,7 @@ def relative_error(got: np.ndarray, expected: np.ndarray) -> float:
 def test_a_shadow_alone_moves_the_body_that_casts_it(method):
     """The camera sees the ground alone; pose and scale of the blob out of view change what it sees by its shadow."""
     renderer = TorchRenderer(scene_of(method, ON_GROUND))
-    assert set(np.unique(renderer.renderer.body_ids())) == {1}
+    assert set(np.unique(renderer.warp.body_ids())) == {1}
     got, expected = gradient_and_differences(Poses(renderer), np.eye(7), 2e-3, slice(3))
     assert np.abs(expected[[0, 3, 4, 5, 6]]).min() > 0
     assert relative_error(got, expected) < SMOOTH
@@ -200,8 +200,8 @@ def test_a_limb_pulls_by_the_color_it_has_at_its_edge(monkeypatch):
 def random_batch(renderer: TorchRenderer, count: int) -> dict[str, torch.Tensor]:
     """Turns and shifts of both bodies, cameras, lights and colors."""
     generator = torch.Generator().manual_seed(0)
-    basis_size = renderer.renderer.basis.size
-    camera = torch.tensor(renderer.renderer.scene.camera.clip_matrix(), dtype=torch.float32)
+    basis_size = renderer.basis.size
+    camera = torch.tensor(renderer.scene.camera.clip_matrix(), dtype=torch.float32)
     return {
         "turns": 0.3 * torch.randn(count, 2, 3, generator=generator),
         "shifts": 0.1 * torch.randn(count, 2, 3, generator=generator),
@@ -330,7 +330,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
     for _ in range(2):
         (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
         results.append((renderer(textures=[None, image]).detach(), gradient))
-    assert renderer.renderer.scene_view.surfaces.coarsest_level((None, (size, size))) == coarsest
+    assert renderer.warp.view().surfaces.coarsest_level((None, (size, size))) == coarsest
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
 
@@ -349,7 +349,7 @@ def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, 
         if name == "every":
             monkeypatch.setattr(view_module, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
         renderer = TorchRenderer(scene)
-        counts[name] = renderer.renderer.scene_view.receivers.points.shape[1]
+        counts[name] = renderer.warp.view().receivers.points.shape[1]
         rotations, translations, scales = renderer.scene_poses()
         shifts = torch.zeros(3, 3, 3)
         shifts[1, :, 0], shifts[2] = 0.1, 50.0  # the last instance sees nothing
@@ -369,11 +369,11 @@ def test_an_image_of_nothing_has_no_gradient(method):
     renderer = TorchRenderer(scene_of(method, ws.Camera.look_at((0, 5, 0), (0, 10, 0.1), size=(16, 16))))
     rotations, translations, scales = renderer.scene_poses()
     translations.requires_grad_()
-    light = torch.ones(renderer.renderer.basis.size, 3, requires_grad=True)
+    light = torch.ones(renderer.basis.size, 3, requires_grad=True)
     geometry = renderer.placed(rotations, translations, scales)
     images = [renderer(light), renderer(light, geometry=geometry)]
     assert not images[0].any() and not images[1].any()
-    assert renderer.renderer.scene_view.receivers.points.shape == (1, 0)
+    assert renderer.warp.view().receivers.points.shape == (1, 0)
     for image in images:
         image.sum().backward()
     assert not light.grad.any() and not translations.grad.any()

@@ -484,20 +484,20 @@ def test_every_method_refuses_what_is_beyond_the_bound_by_the_name_of_the_argume
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_are_refused_where_they_or_what_they_place_are_beyond_the_bound(method):
     renderer = ws.Renderer(small_scene(method))
-    rotations = renderer.assembly.poses.rotations
+    rotations = renderer.scene_poses().rotations
     for shift, scale, name in ((2e18, 1.0, "translations"), (0, 2e18, "scales"), (LARGEST, LARGEST, "positions")):
         poses = Poses(rotations, put(np.full((2, 3), shift), wp.vec3), put([scale, scale], wp.float32))
         with pytest.raises(ValueError, match=rf"^{name}: got .*1e\+18"):
-            renderer.view(renderer.assembly.placed(poses))
+            renderer.view(renderer.placed(poses))
 
 
 @pytest.mark.parametrize("method", METHODS[:3])
 @pytest.mark.parametrize("scale", [2.0**-57, 2.0**57])
 def test_poses_of_the_smallest_and_the_largest_scenes_have_finite_gradients(method, scale):
     renderer = ws.Renderer(small_scene(method, scale=scale))
-    assembly, poses = renderer.assembly, renderer.assembly.poses
+    poses = renderer.scene_poses()
     free = [wp.clone(array, requires_grad=True) for array in (poses.rotations, poses.translations, poses.scales)]
-    values, gradients = backward(lambda *free: renderer.draw(view=renderer.view(assembly.placed(Poses(*free)))), *free)
+    values, gradients = backward(lambda *free: renderer.draw(view=renderer.view(renderer.placed(Poses(*free)))), *free)
     assert_finite(values, gradients)
     assert all(gradient.any() for gradient in gradients)
 

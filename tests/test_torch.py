@@ -66,9 +66,9 @@ def renderer() -> TorchRenderer:
 
 def inputs_of(renderer: TorchRenderer) -> dict[str, torch.Tensor]:
     """Everything that can be free at once."""
-    vertex_count = renderer.renderer.scene.bodies[0].mesh.vertex_count
+    vertex_count = renderer.scene.bodies[0].mesh.vertex_count
     return {
-        "light": random(renderer.renderer.basis.size, 3, seed=1),
+        "light": random(renderer.basis.size, 3, seed=1),
         "color": random(3, seed=2),
         "vertices": random(vertex_count, 3, seed=3),
         "texture": random(5, 7, 3, seed=4),
@@ -99,13 +99,13 @@ def test_free_light_in_the_methods_own_basis_is_the_scenes_light(method):
     light = np.random.default_rng(1).normal(size=(16, 3)).astype(np.float32)
     scene = dataclasses.replace(small_scene(method), light=light)
     renderer = TorchRenderer(scene)
-    coefficients = torch.from_numpy(renderer.renderer.basis.coefficients(light))
+    coefficients = torch.from_numpy(renderer.basis.coefficients(light))
     expected = ws.render(scene)
     assert np.abs(renderer(coefficients).numpy() - expected).max() < FLOAT32 * 5 * np.abs(expected).max()
 
 
 def test_albedo_as_tensors_gives_the_same_image_as_in_the_scene(renderer):
-    scene = renderer.renderer.scene
+    scene = renderer.scene
     ball, ground = scene.bodies
     color, texture = torch.from_numpy(ball.albedo), torch.from_numpy(ground.texture)
     expected = renderer()
@@ -142,7 +142,7 @@ def test_writing_into_a_geometry_does_not_change_the_next_image():
     expected, renderer = TorchRenderer(small_scene())(), TorchRenderer(small_scene())
     poses, centers = renderer.scene_poses(), torch.zeros(1, 3)
     for geometry in (renderer.placed(*poses, moving=[]), renderer.deformed(0, centers=centers)):
-        for part in geometry:
+        for part in geometry.arrays().values():
             part.add_(0.5)
     assert not centers.any()
     assert torch.equal(renderer(), expected)
@@ -151,9 +151,10 @@ def test_writing_into_a_geometry_does_not_change_the_next_image():
 
 def test_a_plain_tuple_is_a_geometry(renderer):
     placed = renderer.placed(*renderer.scene_poses())
-    assert torch.equal(renderer(geometry=tuple(placed)), renderer(geometry=placed))
+    plain = tuple(placed.arrays().values())
+    assert torch.equal(renderer(geometry=plain), renderer(geometry=placed))
     with pytest.raises(ValueError, match="^geometry: got tuple of 2, expected a Geometry"):
-        renderer(geometry=placed[:2])
+        renderer(geometry=plain[:2])
 
 
 # ---------------------------------------------------------------------------------------------- gradients
@@ -226,7 +227,7 @@ def test_backward_twice_gives_the_same(renderer):
 
 
 def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
-    light = random(renderer.renderer.basis.size, 3)
+    light = random(renderer.basis.size, 3)
     texture = random(8, 8, 3)
     weights = torch.rand(12, 12, 4, generator=torch.Generator().manual_seed(8))
 
@@ -242,7 +243,7 @@ def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
 
 
 def test_a_second_derivative_is_refused_instead_of_being_wrong(renderer):
-    light = random(renderer.renderer.basis.size, 3)
+    light = random(renderer.basis.size, 3)
     loss = renderer(light).square().sum()
     (gradient,) = torch.autograd.grad(loss, light, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
@@ -250,7 +251,7 @@ def test_a_second_derivative_is_refused_instead_of_being_wrong(renderer):
 
 
 def test_without_gradients_nothing_is_recorded(renderer):
-    light = random(renderer.renderer.basis.size, 3)
+    light = random(renderer.basis.size, 3)
     with torch.no_grad():
         image = renderer(light, albedo=[random(3), None], textures=[None, random(4, 4, 3)])
     assert not image.requires_grad
@@ -259,7 +260,7 @@ def test_without_gradients_nothing_is_recorded(renderer):
 
 
 def test_tensors_need_not_be_contiguous(renderer):
-    count = renderer.renderer.basis.size
+    count = renderer.basis.size
     light = random(3, count).detach().T.requires_grad_()
     texture = random(3, 6, 5).detach().permute(1, 2, 0).requires_grad_()
     vertices = random(3, 162).detach().T.requires_grad_()
@@ -351,7 +352,7 @@ def test_a_body_has_an_albedo_or_a_texture(renderer):
 def test_a_batch_of_poses_and_one_of_cameras_are_both_named_with_how_to_pair_them(renderer):
     poses = [part.expand(4, *part.shape) for part in renderer.scene_poses()]
     geometry = renderer.placed(*poses)
-    matrix = torch.tensor(renderer.renderer.cameras[0].clip_matrix(), dtype=torch.float32)
+    matrix = torch.tensor(renderer.cameras[0].clip_matrix(), dtype=torch.float32)
     matrices = matrix.expand(3, 4, 4)
     with pytest.raises(ValueError) as caught:
         renderer(geometry=geometry, clip_matrices=matrices)
@@ -365,7 +366,7 @@ def test_a_batch_of_poses_and_one_of_cameras_are_both_named_with_how_to_pair_the
 
 @pytest.mark.parametrize("name", ["light", "albedo", "textures"])
 def test_batches_of_other_arguments_are_named_as_they_were_given(renderer, name):
-    matrix = torch.tensor(renderer.renderer.cameras[0].clip_matrix(), dtype=torch.float32)
+    matrix = torch.tensor(renderer.cameras[0].clip_matrix(), dtype=torch.float32)
     given = {
         "light": torch.ones(4, 32, 3),
         "albedo": [torch.ones(4, 1, 3), None],
@@ -411,7 +412,7 @@ def test_a_huge_finite_tensor_is_not_mistaken_for_infinity(renderer):
 
 
 def test_a_tensor_that_changes_before_backward_is_noticed(renderer):
-    light = random(renderer.renderer.basis.size, 3)
+    light = random(renderer.basis.size, 3)
     loss = renderer(light).square().sum()
     with torch.no_grad():
         light.mul_(2)
@@ -619,7 +620,7 @@ def test_several_cameras_make_a_batch_of_images_and_add_up_their_gradients():
     scene = small_scene()
     cameras = [ws.Camera.look_at(eye, (0, 0.6, 0), size=(12, 12)) for eye in [(0, 2.5, 5), (3, 2, -3)]]
     together = TorchRenderer(scene, cameras=cameras)
-    light, texture = random(together.renderer.basis.size, 3, seed=1), random(5, 7, 3, seed=2)
+    light, texture = random(together.basis.size, 3, seed=1), random(5, 7, 3, seed=2)
     shifts = together.scene_poses()[1].requires_grad_()
     weights = random(2, 12, 12, 4, seed=3).detach()
 
@@ -696,6 +697,6 @@ def test_the_rotations_that_a_caller_gets_may_be_changed_before_the_gradient_is_
 
 
 def test_light_that_is_no_tensor_is_refused(renderer):
-    light = np.ones((renderer.renderer.basis.size, 3), np.float32)
+    light = np.ones((renderer.basis.size, 3), np.float32)
     with pytest.raises(ValueError, match="light: got ndarray, expected a tensor of torch.float32"):
         renderer(light)

@@ -11,6 +11,7 @@ from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.pipeline.assembly import Geometry
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
@@ -24,6 +25,7 @@ __all__ = [
     "Camera",
     "CellBasis",
     "EnvironmentMap",
+    "Geometry",
     "HarmonicBasis",
     "ImageError",
     "Mesh",

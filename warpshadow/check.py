@@ -98,19 +98,6 @@ def instance(name: str, value: object, kind: type | tuple[type, ...], expected: 
         raise ValueError(f"{name}: got {described(value)}, expected {expected}")
 
 
-def per_body(name: str, given: object, count: int) -> None:
-    """Raise ValueError unless something is given for each of ``count`` bodies, or None for all."""
-    if given is None:
-        return
-    if not isinstance(given, Sequence) or isinstance(given, str):
-        raise ValueError(
-            f"{name}: got {described(given)}, expected a list of {count} items, one for each body, None for what the "
-            "scene has"
-        )
-    if len(given) != count:
-        raise ValueError(f"{name}: got {len(given)} items, expected {count}, one for each body")
-
-
 def file(name: str, value: str | os.PathLike) -> Path:
     """The path of a file, relative to the current folder; FileNotFoundError if there is none."""
     found = Path(value)

@@ -8,8 +8,8 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -23,16 +23,17 @@ from warpshadow.device.batch import common_batch
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_at_a_time, one_call
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.assembly import Geometry, as_geometry
-from warpshadow.scene.scene import Scene
+from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, Geometry, as_geometry
+from warpshadow.pipeline.explain import Explanation
+from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages import rotations
+from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.stages.rotations import Vec6
 from warpshadow.tuning.renderer import Renderer
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
-_GEOMETRY_DTYPES = Geometry(wp.vec3, wp.vec3, wp.float32)
 
 
 class TorchRenderer(torch.nn.Module):
@@ -50,9 +51,12 @@ class TorchRenderer(torch.nn.Module):
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        renderer: The :class:`warpshadow.Renderer` whose methods it calls.
+        warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
 
-    Threads may share it, and it can be copied, pickled and saved, as :class:`warpshadow.Renderer` can.
+    Threads may share it, and it can be copied and pickled, as :class:`warpshadow.Renderer` can. It has no parameters.
+    ``to`` and ``cuda`` move it, which computes all anew there; ``half`` and ``double`` are refused. Its ``state_dict``
+    holds what tensors beside it refer to: the basis of the light, and the bodies with their numbers of vertices.
+    ``load_state_dict`` raises ValueError where they are others.
     """
 
     def __init__(
@@ -65,29 +69,69 @@ class TorchRenderer(torch.nn.Module):
         progress: bool = False,
     ):
         super().__init__()
-        self.renderer = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
-        self.device = torch.device(wp.device_to_torch(self.renderer.device))
+        self.warp = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene; a method "auto" has been replaced by what was chosen."""
+        return self.warp.scene
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those that see the scene."""
+        return self.warp.cameras
+
+    @property
+    def basis(self) -> Basis:
+        """What free light is expressed in."""
+        return self.warp.basis
+
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return torch.device(wp.device_to_torch(self.warp.device))
+
+    def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
+        """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
+        moved = fn(torch.empty(0, device=self.device))
+        if moved.dtype != torch.float32:
+            raise ValueError(f"dtype: got {moved.dtype} for a TorchRenderer, expected torch.float32, as it computes in")
+        if moved.device != self.device:
+            self.warp = self.warp.moved(str(moved.device))
+        return super()._apply(fn, recurse)
+
+    def get_extra_state(self) -> dict[str, object]:
+        """What tensors beside it refer to, for ``state_dict``."""
+        bodies = [[body.called, body.mesh.vertex_count] for body in self.scene.bodies]
+        return {"basis": type(self.basis).__name__, "coefficients": self.basis.size, "bodies": bodies}
+
+    def set_extra_state(self, state: object) -> None:
+        """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
+        own = self.get_extra_state()
+        if state != own:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {state}, expected {own}")
 
     @one_at_a_time
     def forward(
         self,
         light: torch.Tensor | EnvironmentMap | None = None,
         *,
-        albedo: Sequence[torch.Tensor | None] | None = None,
-        textures: Sequence[torch.Tensor | None] | None = None,
-        geometry: Geometry | None = None,
+        albedo: PerBody[torch.Tensor] | None = None,
+        textures: PerBody[torch.Tensor] | None = None,
+        geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Render images.
 
         Args:
-            light: Free light, coefficients in ``renderer.basis``, linear RGB, shape [coefficient, 3] or
+            light: Free light, coefficients in :attr:`basis`, linear RGB, shape [coefficient, 3] or
                 [batch, coefficient, 3]; or known light, which is shaded more accurately than free light can be, by
                 default the scene's.
-            albedo: For each body its reflectance in linear RGB, one color [3], one for each vertex [vertex, 3], or
-                either in a batch, [batch, 1 or vertex, 3]; None for what the scene has.
-            textures: For each body its reflectance as an image, [height, width, 3] or [batch, height, width, 3], which
-                needs uvs; None for what the scene has.
+            albedo: Reflectance of bodies in linear RGB, one color [3], one for each vertex [vertex, 3], or either in a
+                batch, [batch, 1 or vertex, 3]: a list for all bodies, None for what the scene has, or a mapping for
+                some, by their numbers or names: ``{"bunny": color}``.
+            textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
+                a list or a mapping likewise.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
                 still.
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices`; by default the renderer's own.
@@ -96,51 +140,78 @@ class TorchRenderer(torch.nn.Module):
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
 
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
         Differentiable: light, albedo, textures, geometry, clip_matrices; stages/README.md says how exactly.
         """
-        renderer, bodies = self.renderer, self.renderer.scene.bodies
-        geometry = None if geometry is None else as_geometry("geometry", geometry)
-        has_cameras = renderer.has_camera_batch and clip_matrices is None
-        arguments = _Arguments(self.device, cameras=renderer.cameras if has_cameras else None)
+        given = self._given(light, albedo, textures, geometry, clip_matrices)
+
+        def draw(arrays: Mapping[str, wp.array]) -> wp.array:
+            inputs = self._inputs(given, arrays, light)
+            seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
+            return self.warp.draw(**inputs, view=self.warp.view(*seen))
+
+        return given.apply(draw)
+
+    @one_at_a_time
+    def explain(
+        self,
+        light: torch.Tensor | EnvironmentMap | None = None,
+        *,
+        albedo: PerBody[torch.Tensor] | None = None,
+        textures: PerBody[torch.Tensor] | None = None,
+        geometry: Geometry[torch.Tensor] | None = None,
+        clip_matrices: torch.Tensor | None = None,
+    ) -> Explanation:
+        """Say what a call with the same arguments computes and what it leaves out, as :meth:`Renderer.explain` does."""
+        given = self._given(light, albedo, textures, geometry, clip_matrices)
+        return self.warp.explain(**self._inputs(given, given.arrays(), light))
+
+    def _given(
+        self,
+        light: torch.Tensor | EnvironmentMap | None,
+        albedo: PerBody[torch.Tensor] | None,
+        textures: PerBody[torch.Tensor] | None,
+        geometry: Geometry[torch.Tensor] | None,
+        clip_matrices: torch.Tensor | None,
+    ) -> "_Arguments":
+        """The tensors among the arguments of a call, checked."""
+        has_cameras = self.warp.has_camera_batch and clip_matrices is None
+        given = _Arguments(self.device, cameras=self.cameras if has_cameras else None)
         if isinstance(light, torch.Tensor):
-            what = describe_coefficients(renderer.basis, light.shape[-2] if light.ndim > 1 else 0)
-            arguments.add("light", light, wp.vec3, (renderer.basis.size,), what)
+            what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
+            given.add("light", light, wp.vec3, (self.basis.size,), what)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
-        for name, tensor, dtype in zip(Geometry._fields, geometry or (), _GEOMETRY_DTYPES, strict=False):
-            arguments.add(f"geometry.{name}", tensor, dtype, getattr(renderer.assembly.rest, name).shape[1:])
+        if geometry is not None:
+            given.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
-        for name, tensors in (("albedo", albedo), ("textures", textures)):
-            check.per_body(name, tensors, len(bodies))
-        for number, tensor in enumerate(albedo or ()):
+            given.add("clip_matrices", clip_matrices, wp.mat44, ())
+        for number, tensor in enumerate(self.scene.per_body(albedo, "albedo")):
             if tensor is not None:
                 counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
-                shape = counts if counts in ((), (1,)) else (bodies[number].mesh.vertex_count,)
-                arguments.add(f"albedo[{number}]", tensor, wp.vec3, shape)
-        for number, tensor in enumerate(textures or ()):
+                shape = counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,)
+                given.add(f"albedo[{number}]", tensor, wp.vec3, shape)
+        for number, tensor in enumerate(self.scene.per_body(textures, "textures")):
             if tensor is not None:
                 remedy = check.channels_last(np.shape(tensor))
-                arguments.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy)
+                given.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy)
+        return given
 
-        def draw(*arrays: wp.array) -> wp.array:
-            given = dict(zip(arguments.names, arrays, strict=True))
-
-            colors = [given.get(f"albedo[{number}]") for number in range(len(bodies))]
-            colors = [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors]
-            images = [given.get(f"textures[{number}]") for number in range(len(bodies))]
-            view = None
-            if geometry is not None or clip_matrices is not None:
-                moved = None
-                if geometry is not None:
-                    moved = Geometry(*(given[f"geometry.{name}"] for name in Geometry._fields), moving=geometry.moving)
-                view = renderer.view(moved, given.get("clip_matrices"))
-            return renderer.draw(given.get("light", light), albedo=colors, textures=images, view=view)
-
-        return arguments.apply(draw)
+    def _inputs(
+        self,
+        given: "_Arguments",
+        arrays: Mapping[str, wp.array],
+        light: torch.Tensor | EnvironmentMap | None,
+    ) -> dict[str, Any]:
+        """What the renderer of arrays is given in place of tensors."""
+        bodies = range(len(self.scene.bodies))
+        colors = [arrays.get(f"albedo[{number}]") for number in bodies]
+        return {
+            "light": arrays.get("light", light),
+            "albedo": [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors],
+            "textures": [arrays.get(f"textures[{number}]") for number in bodies],
+            "geometry": given.geometry("geometry", arrays),
+            "clip_matrices": arrays.get("clip_matrices"),
+        }
 
     @one_at_a_time
     def placed(
@@ -149,9 +220,9 @@ class TorchRenderer(torch.nn.Module):
         translations: torch.Tensor,
         scales: torch.Tensor | None = None,
         *,
-        rest: Geometry | None = None,
-        moving: Iterable[int] | None = None,
-    ) -> Geometry:
+        rest: Geometry[torch.Tensor] | None = None,
+        moving: Iterable[BodyLike] | None = None,
+    ) -> Geometry[torch.Tensor]:
         """Place the bodies in the world: x → s R x + t.
 
         Args:
@@ -161,59 +232,54 @@ class TorchRenderer(torch.nn.Module):
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
-            moving: Bodies that the poses move, from 0; None for any. The others stand where the scene has them, without
-                a gradient, and what is found out about them once is kept: so the shadows that they cast on one another
-                are those of their meshes. What ``rest`` deforms is among those that move.
+            moving: Bodies that the poses move, by number or name; None for any. The others stand where the scene has
+                them, without a gradient, and what is found out about them once is kept: so the shadows that they cast
+                on one another are those of their meshes. What ``rest`` deforms is among those that move.
 
         Returns:
             Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one; tensors of their
             own, which may be written to.
 
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
         Differentiable: all.
         """
-        assembly, count = self.renderer.assembly, len(self.renderer.scene.bodies)
-        rest = None if rest is None else as_geometry("rest", rest)
-        scales = wp.to_torch(assembly.poses.scales) if scales is None else scales
-        arguments = _Arguments(self.device)
-        arguments.add("rotations", rotations, wp.mat33, (count,))
-        arguments.add("translations", translations, wp.vec3, (count,))
-        arguments.add("scales", scales, wp.float32, (count,))
-        arguments.expand()
-        for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
-            arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
+        count = len(self.scene.bodies)
+        scales = self.scene_poses()[2] if scales is None else scales
+        given = _Arguments(self.device)
+        given.add("rotations", rotations, wp.mat33, (count,))
+        given.add("translations", translations, wp.vec3, (count,))
+        given.add("scales", scales, wp.float32, (count,))
+        given.expand()
+        if rest is not None:
+            given.add_geometry("rest", rest, self.warp.rest())
 
-        bodies: list[tuple[int, ...] | None] = []
+        def place(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
+            poses = Poses(arrays["rotations"], arrays["translations"], arrays["scales"])
+            return self.warp.placed(poses, given.geometry("rest", arrays), moving=moving)
 
-        def place(rotations: wp.array, translations: wp.array, scales: wp.array, *parts: wp.array) -> Geometry:
-            whole = None if rest is None else Geometry(*parts, moving=rest.moving)
-            placed = assembly.placed(Poses(rotations, translations, scales), whole, moving=moving)
-            bodies.append(placed.moving)
-            return placed
-
-        return Geometry(*arguments.apply(place), moving=bodies[0])
+        return given.apply_geometry(place)
 
     def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotations [body, 3, 3], translations [body, 3] and scales [body] of the scene's bodies, as copies."""
-        poses = self.renderer.assembly.poses
-        return tuple(wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales))
+        poses = self.warp.scene_poses()
+        rotations, translations, scales = (
+            wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales)
+        )
+        return rotations, translations, scales
 
     @one_at_a_time
     def deformed(
         self,
-        number: int,
+        body: BodyLike,
         positions: torch.Tensor | None = None,
         centers: torch.Tensor | None = None,
         radii: torch.Tensor | None = None,
         *,
-        rest: Geometry | None = None,
-    ) -> Geometry:
-        """Exchange the shape of one body at rest, as :meth:`warpshadow.pipeline.assembly.Assembly.deformed` does.
+        rest: Geometry[torch.Tensor] | None = None,
+    ) -> Geometry[torch.Tensor]:
+        """Exchange the shape of one body at rest, as :meth:`warpshadow.Renderer.deformed` does.
 
         Args:
-            number: The body, from 0.
+            body: The body, its number or name.
             positions: Its vertices in its own space, [vertex, 3] or [batch, vertex, 3].
             centers: Its spheres' centers, [sphere, 3] or [batch, sphere, 3].
             radii: Its spheres' radii, [sphere] or [batch, sphere].
@@ -223,30 +289,28 @@ class TorchRenderer(torch.nn.Module):
         Returns:
             All bodies at rest, for :meth:`placed`; tensors of their own, which may be written to.
 
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
         Differentiable: all.
         """
-        assembly = self.renderer.assembly
-        rest = None if rest is None else as_geometry("rest", rest)
         parts = {"positions": positions, "centers": centers, "radii": radii}
-        arguments = _Arguments(self.device)
-        for (name, tensor), dtype in zip(parts.items(), _GEOMETRY_DTYPES, strict=True):
+        given = _Arguments(self.device)
+        for name, tensor in parts.items():
             if tensor is not None:
-                arguments.add(name, tensor, dtype, ("item",))
-        for name, tensor, dtype in zip(Geometry._fields, rest or (), _GEOMETRY_DTYPES, strict=False):
-            arguments.add(f"rest.{name}", tensor, dtype, getattr(assembly.rest, name).shape[1:])
+                given.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
+        if rest is not None:
+            given.add_geometry("rest", rest, self.warp.rest())
 
-        def exchange(*arrays: wp.array) -> Geometry:
-            given = dict(zip(arguments.names, arrays, strict=True))
-            whole = None
-            if rest is not None:
-                whole = Geometry(*(given[f"rest.{name}"] for name in Geometry._fields), moving=rest.moving)
-            return assembly.deformed(number, *(given.get(name) for name in parts), rest=whole)
+        def exchange(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
+            shape = {name: arrays.get(name) for name in parts}
+            return self.warp.deformed(body, **shape, rest=given.geometry("rest", arrays))
 
-        before: tuple[int, ...] | None = () if rest is None else rest.moving
-        return Geometry(*arguments.apply(exchange), moving=None if before is None else (*before, number))
+        return given.apply_geometry(exchange)
+
+    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres, which are the nodes, as :meth:`Renderer.deformation_graph` does.
+
+        Its functions take Warp's arrays: ``apply(graph.points, matrices, shifts, dtypes=(wp.mat33, wp.vec3))``.
+        """
+        return self.warp.deformation_graph(body, count=count)
 
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
@@ -263,16 +327,16 @@ class TorchRenderer(torch.nn.Module):
 
         Differentiable: all, so focal lengths and the principal point, too.
         """
-        camera = self.renderer.cameras[0]
-        arguments = _Arguments(self.device)
-        arguments.add("intrinsics", intrinsics, wp.mat33, ())
-        arguments.add("rotations", rotations, wp.mat33, ())
-        arguments.add("translations", translations, wp.vec3, ())
+        camera = self.cameras[0]
+        given = _Arguments(self.device)
+        given.add("intrinsics", intrinsics, wp.mat33, ())
+        given.add("rotations", rotations, wp.mat33, ())
+        given.add("translations", translations, wp.vec3, ())
 
-        def compose(*arrays: wp.array) -> wp.array:
-            return compose_clip_matrices(*arrays, size=(camera.width, camera.height), near=camera.near)
+        def compose(arrays: Mapping[str, wp.array]) -> wp.array:
+            return compose_clip_matrices(*arrays.values(), size=(camera.width, camera.height), near=camera.near)
 
-        return arguments.apply(compose)
+        return given.apply(compose)
 
 
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
@@ -310,6 +374,7 @@ class _Arguments:
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
+        self._moving: dict[str, tuple[int, ...] | None] = {}  # of geometries
 
     def add(
         self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...], meaning: str = ""
@@ -328,13 +393,51 @@ class _Arguments:
         count = self._common_batch()
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
-    def apply(self, function: Callable) -> Any:
-        """Apply a function of arrays to them; results lose a batch dimension that no tensor had."""
+    def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> None:
+        """Add the tensors of a geometry, of which arrays there are as many items as of another."""
+        geometry, own = as_geometry(name, geometry), like.arrays()
+        self._moving[name] = geometry.moving
+        for part, tensor in geometry.arrays().items():
+            self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:])
+
+    def geometry(self, name: str, arrays: Mapping[str, wp.array]) -> Geometry[wp.array] | None:
+        """A geometry that was added, of arrays; None if none was."""
+        if name not in self._moving:
+            return None
+        return Geometry(*(arrays[f"{name}.{part}"] for part in GEOMETRY_DTYPES), moving=self._moving[name])
+
+    def arrays(self) -> dict[str, wp.array]:
+        """The tensors as arrays, which require a gradient as they do."""
+        found = {}
+        for name, tensor, dtype in zip(self.names, self.tensors, self.dtypes, strict=True):
+            found[name] = _as_array(tensor, dtype)
+            found[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
+        return found
+
+    def apply(self, function: Callable[[Mapping[str, wp.array]], Any]) -> Any:
+        """Apply a function of arrays by their names; results lose a batch dimension that no tensor had."""
         self._common_batch()
-        results = apply(function, *self.tensors, dtypes=self.dtypes, device=self.device)
+        results = apply(
+            lambda *arrays: function(dict(zip(self.names, arrays, strict=True))),
+            *self.tensors,
+            dtypes=self.dtypes,
+            device=self.device,
+        )
         if self._has_batch:
             return results
         return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
+
+    def apply_geometry(
+        self, function: Callable[[Mapping[str, wp.array]], Geometry[wp.array]]
+    ) -> Geometry[torch.Tensor]:
+        """Apply a function that makes a geometry."""
+        made: list[Geometry[wp.array]] = []
+
+        def make(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
+            made.append(function(arrays))
+            return tuple(made[0].arrays().values())
+
+        return Geometry(*self.apply(make), moving=made[0].moving)
 
     def _common_batch(self) -> int:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
@@ -368,9 +471,30 @@ def _check_tensor(
 # ---------------------------------------------------------------------------------------------- autograd
 
 
+@overload
 def apply(
-    function: Callable, *tensors: torch.Tensor, dtypes: Sequence[type], device: torch.device | None = None
-) -> Any:
+    function: Callable[..., tuple[wp.array, ...]],
+    *tensors: torch.Tensor,
+    dtypes: Sequence[type],
+    device: torch.device | None = None,
+) -> tuple[torch.Tensor, ...]: ...
+
+
+@overload
+def apply(
+    function: Callable[..., wp.array],
+    *tensors: torch.Tensor,
+    dtypes: Sequence[type],
+    device: torch.device | None = None,
+) -> torch.Tensor: ...
+
+
+def apply(
+    function: Callable[..., wp.array | tuple[wp.array, ...]],
+    *tensors: torch.Tensor,
+    dtypes: Sequence[type],
+    device: torch.device | None = None,
+) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """Apply a differentiable function of Warp arrays to tensors.
 
     Args:
@@ -423,6 +547,13 @@ def _let_waiting_threads_sleep() -> None:
         event.wait()
 
 
+def _as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
+    """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
+    array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+    array.version = tensor._version  # by which a renderer knows what has not been written to
+    return array
+
+
 class _WarpFunction(torch.autograd.Function):
     """Records Warp launches on a tape in forward and plays it back in backward, as often as asked."""
 
@@ -435,12 +566,7 @@ class _WarpFunction(torch.autograd.Function):
         device: torch.device,
         *tensors: torch.Tensor,
     ):
-        arguments = [
-            wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
-            for tensor, dtype in zip(tensors, dtypes, strict=True)
-        ]
-        for argument, tensor in zip(arguments, tensors, strict=True):
-            argument.version = tensor._version  # by which a renderer knows what has not been written to
+        arguments = [_as_array(*pair) for pair in zip(tensors, dtypes, strict=True)]
         # streams are the device's, as Warp has it, not a thread's
         with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
             for argument, is_wanted in zip(arguments, wants, strict=True):

@@ -49,7 +49,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     """The size of the scene in words, and functions that run its stages once, by what they do."""
     scene = bunny_scene()
     renderer = Renderer(scene, device=device, progress=True)
-    positions, centers, radii = renderer.geometry
+    positions, centers, radii = renderer.geometry().arrays().values()
     order = renderer.assembly.vertex_order  # in which renderers light them; all, also those that no sample sees
     normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device=device) for a in (positions.numpy()[:, order], normals))
@@ -87,7 +87,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         tape.backward()
 
     def draw() -> None:
-        clip = to_clip(renderer.geometry.positions, clip_matrices)
+        clip = to_clip(renderer.geometry().positions, clip_matrices)
         interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, colors)
 
     def from_scratch() -> None:
@@ -116,7 +116,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     free_matrices = wp.clone(clip_matrices, requires_grad=True)
 
     def draw_smoothly(matrices: wp.array = clip_matrices) -> wp.array:
-        clip = to_clip(renderer.geometry.positions, matrices)
+        clip = to_clip(renderer.geometry().positions, matrices)
         fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
         found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.surfaces)
         return smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)

@@ -99,7 +99,7 @@ def image_and_gradients(scene: ws.Scene, device: str) -> dict[str, np.ndarray]:
 
     renderer = TorchRenderer(scene, device=torch_device)
     free = {
-        "light": random(renderer.renderer.basis.size, 3, seed=1),
+        "light": random(renderer.basis.size, 3, seed=1),
         "albedo": random(3, seed=2),
         "texture": random(16, 16, 3, seed=3),
     }
@@ -176,13 +176,13 @@ def stages(device: str, runs: int = 10) -> list[dict[str, float | str]]:
     floors = {stage.name: stage for stage in kernel_floor.stages(size, rising, reached)}
     items = kernel_floor.counts(size)
     renderer = TorchRenderer(scene, device="cpu" if device == "cpu" else device)
-    renderer.renderer.clock.waits = True
+    renderer.warp.clock.waits = True
     rotations, translations, scales = renderer.scene_poses()
     translations.requires_grad_()
     times: dict[str, list[tuple[float, float]]] = {}
     for _ in range(runs + 1):
         renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
-        for name, timing in renderer.renderer.clock.timings.items():
+        for name, timing in renderer.warp.clock.timings.items():
             times.setdefault(name, []).append((1e3 * timing.forward, 1e3 * (timing.backward or 0.0)))
     rows: list[dict[str, float | str]] = []
     for name, each in times.items():

@@ -67,7 +67,7 @@ def renderer_of(scene: ws.Scene, size: int, across: int) -> TorchRenderer:
 
 def step_of(renderer: TorchRenderer) -> float:
     """How far a difference reaches to each side [scene units, radians]: half a sample or so."""
-    scene = renderer.renderer.scene
+    scene = renderer.scene
     return 1.8 / (scene.camera.width * scene.supersampling)
 
 
@@ -82,7 +82,7 @@ def pose_image(renderer: TorchRenderer, values: torch.Tensor) -> torch.Tensor:
 
 def camera_image(renderer: TorchRenderer, values: torch.Tensor) -> torch.Tensor:
     """The image for a turn and a shift [6] of the camera."""
-    camera = renderer.renderer.scene.camera
+    camera = renderer.scene.camera
     matrix, turn, shift = (
         torch.tensor(array, dtype=torch.float32) for array in (camera.intrinsics, camera.rotation, camera.translation)
     )

@@ -57,7 +57,7 @@ def time_stages(runs: int = RUNS) -> dict[str, float]:
     ws.quiet()
     ws.set_thread_count(1)
     renderer = Renderer(bunny_scene(), device="cpu")
-    positions, centers, radii = renderer.geometry
+    positions, centers, radii = renderer.geometry().arrays().values()
     order = renderer.assembly.vertex_order
     normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (positions.numpy()[:, order], normals))

@@ -38,7 +38,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene, on_ground, shipped_mesh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.assembly import Geometry
 from warpshadow.spheres import fit_spheres
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.torch import TorchRenderer
@@ -94,14 +93,13 @@ def shading(scene: ws.Scene) -> Timed:
     """Visibility and shading of all vertices, by themselves and with all gradients."""
     renderer = ws.Renderer(scene)
     order = renderer.assembly.vertex_order  # in which renderers light them
-    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces)
-    points, normals = (
-        wp.array(array.numpy()[:, order], dtype=wp.vec3) for array in (renderer.geometry.positions, normals)
-    )
-    free = [wp.clone(array, requires_grad=True) for array in (points, normals, *renderer.geometry[1:])]
+    own = renderer.geometry()
+    normals = vertex_normals(own.positions, renderer.assembly.faces)
+    points, normals = (wp.array(array.numpy()[:, order], dtype=wp.vec3) for array in (own.positions, normals))
+    free = [wp.clone(array, requires_grad=True) for array in (points, normals, own.centers, own.radii)]
 
     def forward_and_backward() -> None:
-        geometry = Geometry(renderer.geometry.positions, *free[2:])
+        geometry = ws.Geometry(own.positions, *free[2:])
         with wp.Tape() as tape:
             result = renderer.shade(view=renderer.at_points(*free[:2], geometry))
         result.grad.fill_(1.0)
@@ -259,7 +257,7 @@ def million(subdivisions: int = 8, ground_segments: int = 587, sphere_count: int
         step()
         seconds = time.perf_counter() - start
         print(f"  {name:12}{seconds:8.1f} s{_peak_gibibytes():8.2f} GiB at most so far", flush=True)
-    print(f"  shaded were the {renderer.scene_view.receivers.points.shape[1]} vertices of faces that are seen")
+    print(f"  shaded were the {renderer.view().receivers.points.shape[1]} vertices of faces that are seen")
 
 
 def _peak_gibibytes() -> float:

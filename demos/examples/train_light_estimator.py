@@ -314,7 +314,7 @@ class Relighting:
 
     def in_map(self, light: ws.EnvironmentMap) -> np.ndarray:
         """The image in known light, [height, width, 4]."""
-        return self.renderer.renderer.render(light)
+        return self.renderer(light).cpu().numpy()
 
     def in_harmonics(self, lights: torch.Tensor) -> np.ndarray:
         """Images in lights [light, order², 3], shape [light, height, width, 4]."""

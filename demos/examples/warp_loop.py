@@ -72,15 +72,14 @@ class FreePose:
 
     def draw(self) -> wp.array:
         """Draw the image, vec4 of shape [1, height, width]."""
-        assembly = self.renderer.assembly
-        fixed = assembly.poses
+        fixed = self.renderer.scene_poses()
         counts = [1, fixed.scales.shape[1] - 1]
         poses = Poses(
             concatenate([self.rotation(), fixed.rotations[:, 1:]], counts),
             concatenate([self.translation.reshape((1, 1)), fixed.translations[:, 1:]], counts),
             fixed.scales,
         )
-        return self.renderer.draw(view=self.renderer.view(assembly.placed(poses)))
+        return self.renderer.draw(view=self.renderer.view(self.renderer.placed(poses)))
 
     def rotation(self) -> wp.array:
         """The rotation as a matrix, mat33 of shape [1, 1]."""

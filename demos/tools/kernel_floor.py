@@ -188,8 +188,9 @@ def needed(
 def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     """A scene in numbers, and what culling leaves of its visibility."""
     renderer = ws.Renderer(scene)
-    normals = vertex_normals(renderer.geometry.positions, renderer.assembly.faces)
-    arrays = [renderer.geometry.positions, normals, renderer.geometry.centers, renderer.geometry.radii]
+    geometry = renderer.geometry()
+    normals = vertex_normals(geometry.positions, renderer.assembly.faces)
+    arrays = [geometry.positions, normals, geometry.centers, geometry.radii]
     directions = fibonacci(scene.visibility.directions)
     width = edge_width(scene.visibility.softness, len(directions))
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)

@@ -1,12 +1,14 @@
 """Assembly: bodies as one mesh and one set of spheres, placed, deformed, and their arguments checked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
-from warpshadow.pipeline.assembly import Assembly, Geometry
+from warpshadow.pipeline.assembly import Assembly
 from warpshadow.stages.poses import Poses
 
 # Rotated float32 positions of size 2.
@@ -34,7 +36,7 @@ def two_bodies(device) -> Assembly:
 def test_placed_bodies_are_where_the_scene_has_them(device):
     assembly = two_bodies(device)
     bodies = assembly.scene.bodies
-    geometry = Geometry(*(array.numpy()[0] for array in assembly.placed()))
+    geometry = assembly.placed().map(lambda array: array.numpy()[0])
     expected = np.concatenate([body.world_mesh().positions for body in bodies])
     assert np.abs(geometry.positions - expected).max() < FLOAT32
     placed = [
@@ -62,7 +64,8 @@ def test_bodies_that_do_not_move_stand_where_the_scene_has_them(device, moving, 
         placed = assembly.placed(poses, moving=moving)
     assert placed.moving == tuple(sorted(moving))
     starts = assembly.first_vertex, assembly.first_sphere, assembly.first_sphere
-    for got, all_moved, still, start in zip(placed, assembly.placed(poses), assembly.placed(), starts, strict=True):
+    geometries = (each.arrays().values() for each in (placed, assembly.placed(poses), assembly.placed()))
+    for got, all_moved, still, start in zip(*geometries, starts, strict=True):
         for number in range(2):
             place = np.s_[:, start[number] : start[number + 1]]
             expected = all_moved if number in moving else still
@@ -81,14 +84,16 @@ def test_bodies_that_do_not_move_stand_where_the_scene_has_them(device, moving, 
 
 def test_a_geometry_with_other_positions_remembers_what_moves(device):
     geometry = two_bodies(device).placed(moving=[1])
-    assert geometry._replace(positions=None).moving == (1,)
-    assert geometry._replace(moving=[0, 1]).moving == (0, 1)
-    assert geometry._replace(radii=None)[:2] == geometry[:2]
+    assert replace(geometry, positions=None).moving == (1,)
+    assert replace(geometry, moving=[1, 0]).moving == (0, 1)
+    other = replace(geometry, radii=None)
+    assert other.positions is geometry.positions and other.centers is geometry.centers
 
 
 def test_what_is_handed_out_is_not_the_assemblys_own_memory(device):
     assembly = two_bodies(device)
-    kept = [[array.numpy().copy() for array in own] for own in (assembly.rest, assembly.scene_geometry)]
+    own = assembly.rest, assembly.scene_geometry
+    kept = [each.map(lambda array: array.numpy().copy()) for each in own]
     handed_out = [
         assembly.placed(),
         assembly.placed(moving=[]),
@@ -97,11 +102,11 @@ def test_what_is_handed_out_is_not_the_assemblys_own_memory(device):
         assembly.deformed(0, centers=wp.clone(assembly.rest.centers[:, : assembly.first_sphere[1]])),
     ]
     for geometry in handed_out:
-        for array in geometry:
+        for array in geometry.arrays().values():
             array.fill_(-7.0)
-    for before, own in zip(kept, (assembly.rest, assembly.scene_geometry), strict=True):
-        for values, array in zip(before, own, strict=True):
-            np.testing.assert_array_equal(array.numpy(), values)
+    for before, each in zip(kept, own, strict=True):
+        for name, array in each.arrays().items():
+            np.testing.assert_array_equal(array.numpy(), getattr(before, name))
 
 
 def test_a_body_alone_is_not_deformed_in_the_memory_of_the_argument(device):
@@ -149,19 +154,20 @@ def test_deforming_a_body_leaves_the_other_as_it_is(device, number, verified_tap
 
 def test_a_graph_that_does_not_move_leaves_its_body_as_it_is(device):
     assembly = two_bodies(device)
-    graph = assembly.graph(1, count=3)
+    graph = assembly.deformation_graph(1, count=3)
     count = len(assembly.scene.bodies[1].blockers)
     still = wp.zeros((1, count), dtype=wp.vec3, device=device)
     matrices = wp.full((1, count), wp.mat33(np.eye(3)), dtype=wp.mat33, device=device)
     rest = assembly.deformed(1, graph.points(matrices, still), graph.centers(still))
-    for got, expected in zip(assembly.placed(rest=rest), assembly.placed(), strict=True):
-        assert np.abs(got.numpy() - expected.numpy()).max() < 4 * FLOAT32
+    expected = assembly.placed()
+    for name, got in assembly.placed(rest=rest).arrays().items():
+        assert np.abs(got.numpy() - getattr(expected, name).numpy()).max() < 4 * FLOAT32
 
 
 def test_what_does_not_fit_is_refused(device):
     assembly = two_bodies(device)
-    with pytest.raises(ValueError, match="^number: got 2, expected the number of a body, from 0 to 1"):
-        assembly.graph(2)
+    with pytest.raises(ValueError, match="^body: got 2, expected the number of a body, from 0 to 1"):
+        assembly.deformation_graph(2)
     wrong = wp.zeros((1, 7), dtype=wp.vec3, device=device)
     with pytest.raises(ValueError, match=r"^positions: got shape \(1, 7\), expected \[batch, 12\]"):
         assembly.deformed(0, wrong)

@@ -62,7 +62,7 @@ def scene_of(method: str = "directional", *, still_blocks: bool = True, size: in
 
 def poses_of(renderer: Renderer, shift=(0.0, 0.0, 0.0), requires_grad: bool = False) -> Poses:
     """The scene's, the first body shifted."""
-    poses = renderer.assembly.poses
+    poses = renderer.scene_poses()
     translations = poses.translations.numpy().copy()
     translations[:, 0] += shift
     moved = wp.array(translations, dtype=wp.vec3, device=renderer.device, requires_grad=requires_grad)
@@ -73,7 +73,7 @@ def gradient_and_image(renderer: Renderer, moving, *, light=None, shift=(0.1, -0
     """Of a weighted sum of the image to translations of all bodies, and the image."""
     poses = poses_of(renderer, shift, requires_grad=True)
     with wp.Tape() as tape:
-        image = renderer.draw(light, view=renderer.view(renderer.assembly.placed(poses, moving=moving)))
+        image = renderer.draw(light, view=renderer.view(renderer.placed(poses, moving=moving)))
     weights = np.random.default_rng(1).normal(size=(*image.shape, 4)).astype(np.float32)
     tape.backward(grads={image: wp.array(weights, dtype=wp.vec4, device=renderer.device)})
     return poses.translations.grad.numpy()[0], image.numpy()
@@ -97,7 +97,7 @@ def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
     renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
     light = free_light(renderer)
     for _ in range(2):
-        geometry = renderer.assembly.placed(poses_of(renderer, (0.2, 0.1, 0)))
+        geometry = renderer.placed(poses_of(renderer, (0.2, 0.1, 0)))
         view = renderer.view(geometry)
         known, free = renderer.draw(view=view).numpy(), renderer.draw(light, view=view).numpy()
     assert renderer.view(geometry) is view
@@ -126,7 +126,7 @@ def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch
 @pytest.mark.parametrize("name", ["positions", "centers", "radii", "clip_matrices"])
 def test_what_is_mutated_in_place_is_seen_anew(name):
     renderer = Renderer(scene_of())
-    geometry = renderer.assembly.placed(poses_of(renderer))
+    geometry = renderer.placed(poses_of(renderer))
     clip_matrices = wp.clone(renderer.clip_matrices)
     before = renderer.view(geometry, clip_matrices)
     first = renderer.draw(view=before).numpy().copy()
@@ -142,11 +142,11 @@ def test_what_is_mutated_in_place_is_seen_anew(name):
 def test_a_view_is_of_its_geometry_as_it_was():
     """The arrays change before anything is computed from the view."""
     renderer = Renderer(scene_of())
-    geometry = renderer.assembly.placed(poses_of(renderer, (0.1, 0, 0)))
+    geometry = renderer.placed(poses_of(renderer, (0.1, 0, 0)))
     expected = renderer.draw(view=renderer.view(geometry)).numpy().copy()
     other = Renderer(scene_of())
     view = other.view(geometry)
-    for array in geometry:
+    for array in geometry.arrays().values():
         array.zero_()
     np.testing.assert_array_equal(other.draw(view=view).numpy(), expected)
 
@@ -173,13 +173,13 @@ def test_tensors_that_are_not_written_to_are_known_again_without_a_look_at_them(
         if factor is not None:
             geometry.positions.mul_(factor)
         renderer(geometry=geometry)
-        seen.append(renderer.renderer._last_view)
+        seen.append(renderer.warp._last_view)
     assert seen[0] is seen[1] and seen[1] is not seen[2]
 
 
 def test_free_light_over_a_given_geometry_has_the_gradient_that_it_has_over_the_scenes():
     renderer = TorchRenderer(scene_of())
-    light = torch.ones(renderer.renderer.basis.size, 3, requires_grad=True)
+    light = torch.ones(renderer.basis.size, 3, requires_grad=True)
     geometry = renderer.placed(*renderer.scene_poses())
     gradients = []
     for given in (None, geometry, geometry):
@@ -194,8 +194,8 @@ def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_b
         torch.tensor(random.uniform(size=shape), dtype=torch.float32) for shape in ((8, 8, 3), (162, 3), (24, 24, 4))
     )
     texture.requires_grad_(), colors.requires_grad_()
-    cameras = torch.tensor(renderer.renderer.clip_matrices.numpy()[0], requires_grad=True)
-    coefficients = torch.tensor(free_light(renderer.renderer).numpy()[0])
+    cameras = torch.tensor(renderer.warp.clip_matrices.numpy()[0], requires_grad=True)
+    coefficients = torch.tensor(free_light(renderer.warp).numpy()[0])
     other = ws.synthetic_sky((0.4, 0.8, 0.1), height=32, sun_radius=8)
     for light in (None, other, None, coefficients, 2 * coefficients, other):
         results = []
@@ -243,10 +243,10 @@ def mesh_of(body: ws.Body) -> wp.Mesh:
 
 def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.ndarray]:
     """Of the receivers on still bodies, where the moving one is too far away to matter: as rendered, and by rays."""
-    view = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
+    view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
     shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.still)]
-    vertices = renderer.assembly.scene_geometry.positions.numpy()[0]
-    normals = vertex_normals(renderer.assembly.scene_geometry.positions, renderer.assembly.faces).numpy()[0]
+    vertices = renderer.geometry().positions.numpy()[0]
+    normals = vertex_normals(renderer.geometry().positions, renderer.assembly.faces).numpy()[0]
     points, normals = (wp.array(values[view.receivers.still], dtype=wp.vec3) for values in (vertices, normals))
     mesh = mesh_of(renderer.scene.bodies[1])
     if light is None:
@@ -265,9 +265,9 @@ def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
     shading, truth = shading_and_truth(renderer, light, 8192)
     assert len(shading) > 200
     assert np.linalg.norm(shading - truth) < RAY_NOISE * np.linalg.norm(truth)
-    view = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0))))  # any body may move
+    view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0))))  # any body may move
     rows = view.receivers.of_vertices.numpy()[renderer.view(None).receivers.of_vertices.numpy() >= -1]
-    still = renderer.view(renderer.assembly.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.still
+    still = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.still
     by_spheres = renderer.shade(light, view).numpy()[0, rows[still]]
     assert np.linalg.norm(by_spheres - truth) > 3 * np.linalg.norm(shading - truth)
 
@@ -281,7 +281,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
     weight_of_vertex = np.random.default_rng(3).uniform(0.5, 1, (len(renderer.assembly.body_of_vertex), 3))
 
     def view_of(poses: Poses) -> View:
-        return renderer.view(renderer.assembly.placed(poses, moving=[0]))
+        return renderer.view(renderer.placed(poses, moving=[0]))
 
     def weights_of(view: View) -> np.ndarray:
         weights = np.zeros((1, (view.receivers.of_vertices.numpy() >= 0).sum(), 3), np.float32)
@@ -309,7 +309,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
 @pytest.mark.parametrize("method", METHODS)
 def test_instances_share_what_stands_still(method):
     renderer = Renderer(scene_of(method))
-    poses = renderer.assembly.poses
+    poses = renderer.scene_poses()
     shifts = np.zeros((3, 3, 3))
     shifts[:, 0] = np.random.default_rng(4).normal(size=(3, 3)) * [0.2, 0.1, 0.2]
     translations = poses.translations.numpy() + shifts
@@ -319,7 +319,7 @@ def test_instances_share_what_stands_still(method):
         rotations, scales = (expand(array, count) for array in (poses.rotations, poses.scales))
         moved = wp.array(values, dtype=wp.vec3, device=renderer.device, requires_grad=True)
         with wp.Tape() as tape:
-            geometry = renderer.assembly.placed(Poses(rotations, moved, scales), moving=[0])
+            geometry = renderer.placed(Poses(rotations, moved, scales), moving=[0])
             image = renderer.draw(view=renderer.view(geometry))
         tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0, 2.0, 3.0, 4.0), dtype=wp.vec4)})
         return image.numpy().copy(), moved.grad.numpy()
@@ -370,7 +370,7 @@ def test_light_of_few_bands_gives_the_image_that_it_gives_with_all_of_them(metho
     assert_near(gradient, expected_gradient, 5 * FLOAT32)
     for got, whole in ((values, padded), (light, same)):
         assert_near(few.draw(got).numpy(), all_.draw(whole).numpy())
-    assert few.transfer.shape[-1] == 4 and "4 coefficients" in str(few.explain(2 * values))
+    assert few.transfer().shape[-1] == 4 and "4 coefficients" in str(few.explain(2 * values))
 
 
 # ---------------------------------------------------------------------------------------------- what no longer stands
@@ -383,7 +383,7 @@ def test_other_bodies_that_move_are_noticed(method):
     for moving in ([0], [1], [0, 1], [2], [], [0]):
         fresh = Renderer(scene_of(method))
         image, expected = (
-            each.draw(view=each.view(each.assembly.placed(poses_of(each, (0.1, 0, 0)), moving=moving))).numpy()
+            each.draw(view=each.view(each.placed(poses_of(each, (0.1, 0, 0)), moving=moving))).numpy()
             for each in (renderer, fresh)
         )
         np.testing.assert_array_equal(image, expected)
@@ -394,10 +394,10 @@ def test_other_bodies_that_move_are_noticed(method):
 def test_bodies_that_stand_elsewhere_are_noticed(method):
     """A geometry that was not placed, in which what is said to stand still stands somewhere else."""
     renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
-    image = renderer.draw(view=renderer.view(renderer.assembly.placed(moving=[0]))).numpy().copy()
-    poses = renderer.assembly.poses
+    image = renderer.draw(view=renderer.view(renderer.placed(moving=[0]))).numpy().copy()
+    poses = renderer.scene_poses()
     shift = wp.array(poses.translations.numpy() + np.array([[[0, 0, 0], [0.3, 0.1, 0.2], [0, 0, 0]]]), dtype=wp.vec3)
-    elsewhere = Geometry(*renderer.assembly.placed(Poses(poses.rotations, shift, poses.scales)), moving=[0])
+    elsewhere = dataclasses.replace(renderer.placed(Poses(poses.rotations, shift, poses.scales)), moving=[0])
     moved = renderer.draw(view=renderer.view(elsewhere)).numpy()
     assert (moved != image).any()
     np.testing.assert_array_equal(moved, fresh.draw(view=fresh.view(elsewhere)).numpy())
@@ -412,9 +412,7 @@ def test_another_camera_sees_what_stands_still_anew(method):
         clip_matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44)
         fresh = Renderer(scene_of(method))
         image, expected = (
-            each.draw(
-                view=each.view(each.assembly.placed(poses_of(each, (0.1, 0, 0)), moving=[0]), clip_matrices)
-            ).numpy()
+            each.draw(view=each.view(each.placed(poses_of(each, (0.1, 0, 0)), moving=[0]), clip_matrices)).numpy()
             for each in (renderer, fresh)
         )
         assert_near(image, expected)
@@ -424,7 +422,7 @@ def test_another_camera_sees_what_stands_still_anew(method):
 
 def test_instances_that_differ_in_what_stands_still_are_refused():
     renderer = Renderer(scene_of("none"))
-    positions, centers, radii = renderer.geometry
+    positions, centers, radii = renderer.geometry().arrays().values()
     two = wp.array(positions.numpy() * np.array([1, 1.1])[:, None, None], dtype=wp.vec3)
     with pytest.raises(ValueError, match=r"geometry: got instances that differ in more than the bodies \(0,\)"):
         renderer.view(Geometry(two, centers, radii, moving=[0]))
@@ -433,19 +431,20 @@ def test_instances_that_differ_in_what_stands_still_are_refused():
 def test_a_body_that_moves_is_one_of_the_scenes():
     renderer = Renderer(scene_of("none"))
     with pytest.raises(ValueError, match="moving: got 3, expected the number of a body, from 0 to 2"):
-        renderer.assembly.placed(moving=[3])
+        renderer.placed(moving=[3])
 
 
 def test_what_is_deformed_moves():
     renderer = TorchRenderer(scene_of())
-    points = torch.tensor(renderer.renderer.scene.bodies[1].mesh.positions)[None] * 1.1
+    points = torch.tensor(renderer.scene.bodies[1].mesh.positions)[None] * 1.1
     rest = renderer.deformed(1, points)
     assert rest.moving == (1,)
     poses = renderer.scene_poses()
     assert renderer.placed(*poses, rest=rest, moving=[0]).moving == (0, 1)
     assert renderer.placed(*poses, rest=rest).moving is None
     whole = renderer.placed(*poses, rest=rest)
-    for part, expected in zip(renderer.placed(*poses, rest=rest, moving=[0]), whole, strict=True):
+    for name, part in renderer.placed(*poses, rest=rest, moving=[0]).arrays().items():
+        expected = getattr(whole, name)
         assert torch.equal(part, expected)
 
 
@@ -538,7 +537,7 @@ def pose_fit(renderer, moving=None, **given):
     poses = poses_of(renderer, (0.1, 0, 0), requires_grad=True)
 
     def geometry():
-        return renderer.assembly.placed(poses, moving=moving)
+        return renderer.placed(poses, moving=moving)
 
     return (
         lambda: renderer.draw(view=renderer.view(geometry()), **given),
@@ -556,7 +555,7 @@ def light_over_one_of_three(renderer):
 
 
 def radii_fit(renderer):
-    positions, centers, radii = renderer.geometry
+    positions, centers, radii = renderer.geometry().arrays().values()
     radii = wp.clone(radii, requires_grad=True) if radii.size else radii
     geometry = Geometry(positions, centers, radii)
     variables = [radii] if radii.size else []
@@ -661,14 +660,14 @@ def test_tensors_explain_themselves():
     renderer = TorchRenderer(scene_of())
     rotations, translations, scales = renderer.scene_poses()
     geometry = renderer.placed(rotations, translations.requires_grad_(), scales, moving=[1])
-    explanation = renderer.renderer.explain(geometry=geometry)
+    explanation = renderer.explain(geometry=geometry)
     assert explanation["visibility"].backward and "a gradient to vertices" in explanation["normals"].forward.why
     light = torch.ones(32, 3, requires_grad=True)
     colors = torch.ones(3), torch.ones(162, 3, requires_grad=True), None
-    explanation = renderer.renderer.explain(light, albedo=colors, textures=[None, None, torch.ones(4, 4, 3)])
+    explanation = renderer.explain(light, albedo=colors, textures=[None, None, torch.ones(4, 4, 3)])
     assert explanation["shading"].backward.why == "a gradient to light is asked for"
     assert explanation["reflectance"].backward.why == "a gradient to albedo is asked for"
     assert not explanation["mip pyramids"].backward
-    matrix = torch.tensor(renderer.renderer.scene.camera.clip_matrix(), dtype=torch.float32, requires_grad=True)
-    assert renderer.renderer.explain(clip_matrices=matrix)["clip positions"].backward
-    assert not renderer.renderer.explain(clip_matrices=matrix)["visibility"].backward
+    matrix = torch.tensor(renderer.scene.camera.clip_matrix(), dtype=torch.float32, requires_grad=True)
+    assert renderer.explain(clip_matrices=matrix)["clip positions"].backward
+    assert not renderer.explain(clip_matrices=matrix)["visibility"].backward

@@ -97,7 +97,7 @@ def test_the_ground_under_a_ball_gets_what_the_form_factor_leaves(device):
     """A ball of radius r at height h above a point, θ off its normal, blocks cos θ r²/h² of a constant dome."""
     grazing = ws.Camera.look_at((3.5, 0.4, 0), (0, 0, 0), fov_y=10, size=(32, 32))
     renderer = Renderer(scene_of("ray-traced", camera=grazing, samples=8192, supersampling=1), device=device)
-    shading, points = (array.numpy()[0] for array in (renderer.scene_shading, renderer.scene_view.receivers.points))
+    shading, points = (array.numpy()[0] for array in (renderer.shade(), renderer.view().receivers.points))
     body_ids = renderer.body_ids()[0]
     on_ground = body_ids[body_ids >= 0] == 1
     toward = np.array([0, 1, 0]) - points[on_ground]
@@ -139,7 +139,7 @@ def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, b
     for bodies in ((ball(), ground()), (ball(), ground(), canopy)):
         scene = scene_of(method, *bodies, samples=64)
         renderer = Renderer(scene, device=device)
-        moved = renderer.view(renderer.assembly.placed(moving=[0]))
+        moved = renderer.view(renderer.placed(moving=[0]))
         results.append((renderer.render(), renderer.draw(view=moved).numpy(), PointSample(scene, count=99).truth))
     for without, with_canopy in zip(*results, strict=True):
         np.testing.assert_array_equal(with_canopy, without)
@@ -260,7 +260,7 @@ def test_an_image_that_shows_nothing_says_why_once(device, options, reason):
     renderer = Renderer(scene_of("none", camera=camera), device=device)
     with pytest.warns(UserWarning, match=f"camera: the image shows nothing of the scene: .*{reason}") as caught:
         renderer.render()
-        renderer.draw(view=renderer.view(renderer.assembly.placed()))
+        renderer.draw(view=renderer.view(renderer.placed()))
     assert len(caught) == 1
 
 
@@ -272,7 +272,7 @@ def test_a_view_of_several_that_shows_nothing_is_named(device):
 
 def test_moving_geometry_that_leaves_the_image_is_remarked_on():
     renderer = Renderer(scene_of("none"))
-    positions, *spheres = renderer.geometry
+    positions, *spheres = renderer.geometry().arrays().values()
     away = wp.array(positions.numpy() + (0, 0, 100), dtype=wp.vec3)
     with pytest.warns(UserWarning, match="camera: the image shows nothing of the scene: .* behind the camera"):
         renderer.view(Geometry(away, *spheres))
@@ -307,7 +307,7 @@ def test_what_is_no_light_is_refused(light, message):
 
 
 def test_the_texels_of_a_body_without_a_texture_are_refused():
-    with pytest.raises(ValueError, match="number: got 0, a body without a texture"):
+    with pytest.raises(ValueError, match="body: got 0, a body without a texture"):
         Renderer(scene_of("none")).seen_texels(0)
 
 
@@ -372,7 +372,7 @@ def test_bodies_with_and_without_uvs_keep_their_own_reflectance(device):
     bodies = (ball(albedo=red), ground(texture=texture), ball(albedo=gray, translation=(1.5, 1, -1)))
     for order in (1, -1):
         renderer = Renderer(scene_of("none", *bodies[::order]), device=device)
-        albedo = renderer.albedo.numpy()[0]
+        albedo = renderer.reflect().numpy()[0]
         body_ids = renderer.body_ids()[0]
         for number, color in enumerate([red, (0.1, 0.2, 0.9), gray][::order]):
             shown = body_ids == number
@@ -386,7 +386,7 @@ def test_albedo_of_vertices_is_interpolated(device):
     colors = 0.5 + body.mesh.positions / 6  # linear in x and z, so exact between vertices
     scene = scene_of("none", ground(4, albedo=colors), supersampling=1, camera=FROM_ABOVE)
     renderer = Renderer(scene, device=device)
-    points = renderer.albedo.numpy()[0]
+    points = renderer.reflect().numpy()[0]
     rows, columns = np.mgrid[0.5:16, 0.5:16] / 16 - 0.5
     scale = 2 * 5 * np.tan(np.radians(20)) / 6  # of the plane that the image shows
     expected = np.stack([0.5 + columns * scale, np.full_like(rows, 0.5), 0.5 + rows * scale], axis=-1)
@@ -418,7 +418,7 @@ def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, metho
     light = np.random.default_rng(3).normal(size=(9, 3)) * 0.2
     light[0] = 3
     renderer = Renderer(scene_of(method, samples=2048), device=device, basis=basis)
-    transfer = renderer.transfer.numpy()[0]
+    transfer = renderer.transfer().numpy()[0]
     free = transfer @ basis.coefficients(light)
     expected = renderer.shade(light).numpy()[0]
     assert transfer.shape == (len(expected), basis.size)
@@ -431,13 +431,13 @@ def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, metho
 def test_no_light_is_lost_between_cells_of_different_size(device, count):
     """One cell of light after the other gives all that the method's own 128 cells give."""
     scene = scene_of("directional", directions=128)
-    own = Renderer(scene, device=device).transfer.numpy()[0]
+    own = Renderer(scene, device=device).transfer().numpy()[0]
     renderer = Renderer(scene, device=device, basis=CellBasis(fibonacci(count)))
-    transfer = renderer.transfer.numpy()[0]
+    transfer = renderer.transfer().numpy()[0]
     assert np.abs(transfer.sum(axis=1) - own.sum(axis=1)).max() < FLOAT32
     upward = fibonacci(count)[:, 1] > 0.3
     body_of_vertex = np.repeat([0, 1], np.diff(renderer.assembly.first_vertex))
-    on_ground = renderer.scene_view.receivers.of_vertices.numpy()[body_of_vertex == 1]
+    on_ground = renderer.view().receivers.of_vertices.numpy()[body_of_vertex == 1]
     on_ground = on_ground[on_ground >= 0]  # the ground sees every cell above it somewhere
     assert (transfer[on_ground].max(axis=0)[upward] > 0).all()
     if count == 128:
@@ -495,7 +495,7 @@ def test_one_camera_that_is_given_makes_a_batch_of_one(device):
 
 def test_cameras_share_the_visibility_of_moving_geometry(device):
     renderer = Renderer(textured_scene("directional", "vertex"), cameras=cameras(), device=device)
-    view = renderer.view(renderer.assembly.placed())
+    view = renderer.view(renderer.placed())
     assert view.fragments.face_ids.shape[0] == 2 and view.receivers.points.shape[0] == 1
     np.testing.assert_array_equal(renderer.draw(view=view).numpy(), renderer.render())
 
@@ -569,7 +569,7 @@ def test_a_view_of_another_renderer_is_refused(device):
 
 def test_a_plain_tuple_is_a_geometry(device):
     renderer = Renderer(scene_of("directional", ball(), light=dome()), device=device)
-    plain = tuple(renderer.assembly.placed())
+    plain = tuple(renderer.placed().arrays().values())
     image = renderer.draw().numpy()
     np.testing.assert_array_equal(renderer.draw(view=renderer.view(plain)).numpy(), image)
     for wrong in (plain[:2], plain[0], "ball"):

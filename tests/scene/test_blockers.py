@@ -30,7 +30,7 @@ def scene_of(
 
 
 def spheres_of(*bodies: ws.Body, device="cpu") -> tuple[np.ndarray, np.ndarray]:
-    _, centers, radii = Renderer(scene_of(*bodies), device=device).geometry
+    _, centers, radii = Renderer(scene_of(*bodies), device=device).geometry().arrays().values()
     assert centers.shape == radii.shape and str(centers.device) == str(radii.device) == device
     return centers.numpy()[0], radii.numpy()[0]
 
@@ -166,8 +166,8 @@ def test_the_ground_shadows_a_body_above_it_nearly_as_the_plane_does(device):
     for number, blocker_count in (("one sphere", 1), ("none", 0)):
         scene = scene_of(ws.Body(ws.plane(6.0, 2), blockers=blocker_count), ball(), directions=256)
         renderer = Renderer(scene, device=device)
-        shading = renderer.scene_shading.numpy()[0, 9:]
-        points, normals = (array.numpy()[0, 9:] for array in renderer.scene_view.receivers[:2])
+        shading = renderer.shade().numpy()[0, 9:]
+        points, normals = (array.numpy()[0, 9:] for array in renderer.view().receivers[:2])
         expected = traced_shading(points, normals)
         errors[number] = np.linalg.norm(shading - expected) / np.linalg.norm(expected)
     assert errors["one sphere"] < 0.05

@@ -187,7 +187,7 @@ def test_backs_that_stand_among_moving_bodies_are_lit_as_fronts_that_do(method, 
             light = wp.array(values, dtype=wp.vec3)
         for camera in (BELOW, ABOVE):
             matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44)
-            view = renderer.view(renderer.assembly.placed(moving=moving), matrices)
+            view = renderer.view(renderer.placed(moving=moving), matrices)
             images.append(renderer.draw(light, view=view).numpy())
     assert_near(images[0], images[2])
     assert_near(images[1], images[3])
@@ -206,12 +206,12 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     expected = Renderer(scene).render()
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)
     renderer = Renderer(scene)
-    view = renderer.view(renderer.assembly.placed(moving=moving))
+    view = renderer.view(renderer.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
     assert view.receivers.points.shape[1] + len(view.receivers.still) == 2 * vertex_counts[0] + vertex_counts[1]
     assert_near(renderer.draw(view=view).numpy()[0], expected)
     front = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
-    assert front.scene_view.receivers.points.shape[1] == vertex_counts[0]
+    assert front.view().receivers.points.shape[1] == vertex_counts[0]
 
 
 def test_points_that_are_compared_with_rays_are_on_the_side_that_is_seen():
@@ -235,10 +235,10 @@ class Motion:
     def __init__(self, scene: ws.Scene, moving=None):
         self.renderer = TorchRenderer(scene)
         self.moving = moving
-        self.radii = torch.from_numpy(self.renderer.renderer.assembly.rest.radii.numpy().copy())[:, :3]
+        self.radii = torch.from_numpy(self.renderer.warp.rest().radii.numpy().copy())[:, :3]
         self.poses = self.renderer.scene_poses()
         self.camera = torch.tensor(scene.camera.clip_matrix(), dtype=torch.float32)[None]
-        light = torch.rand(self.renderer.renderer.basis.size, 3, generator=torch.Generator().manual_seed(4))
+        light = torch.rand(self.renderer.basis.size, 3, generator=torch.Generator().manual_seed(4))
         self.values = {
             "turn": torch.zeros(3),
             "shift": torch.zeros(3),
@@ -306,7 +306,7 @@ def test_how_an_open_mesh_winds_does_not_matter_to_gradients(method, receivers, 
 def test_gradients_of_backs_are_central_differences_of_the_image(method, receivers):
     """Where no silhouette is in view, of a body of one color: between the texels of a texture differences bend."""
     motion = Motion(bowl_scene(method, receivers, camera=INSIDE))
-    fragments = motion.renderer.renderer.scene_view.fragments
+    fragments = motion.renderer.warp.view().fragments
     assert (fragments.sides.numpy() > fragments.face_ids.numpy()).all()
     motion.values["texture"][:] = 0.5
     gradients = motion.gradients()
@@ -342,7 +342,7 @@ def test_closed_bodies_are_not_asked_which_side_is_seen(monkeypatch):
     scene = bowl_scene("directional")
     renderer = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=ws.icosphere(1.0, 3), texture=None),)))
     monkeypatch.setattr(view_module, "find_sides", None)
-    view = renderer.scene_view
+    view = renderer.view()
     vertex_count = len(renderer.assembly.body_of_vertex)
     assert view.receivers.of_vertices.shape == (vertex_count,) and view.fragments.sides is None
     assert view.receivers.faces.shape == renderer.assembly.faces.shape

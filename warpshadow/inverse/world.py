@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.assembly import Geometry
@@ -109,13 +108,11 @@ class World:
     def __init__(self, renderer: TorchRenderer, cameras: Sequence[Camera]):
         self.renderer = renderer
         self.cameras = tuple(cameras)
-        count = len(renderer.renderer.scene.bodies)
+        count = len(renderer.scene.bodies)
         self.light: torch.Tensor | None = None
         self.albedo: list[torch.Tensor | None] = [None] * count
         self.textures: list[torch.Tensor | None] = [None] * count
-        poses = renderer.renderer.assembly.poses
-        arrays = poses.rotations, poses.translations, poses.scales
-        self.rotations, self.translations, self.scales = (list(wp.to_torch(array)[0].unbind()) for array in arrays)
+        self.rotations, self.translations, self.scales = (list(poses.unbind()) for poses in renderer.scene_poses())
         self.rest: Geometry | None = None
         self.moving: set[int] = set()
         self.clip_matrices: torch.Tensor | None = None

@@ -2,7 +2,8 @@
 
 import functools
 from collections.abc import Callable, Collection, Iterable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 import warp as wp
@@ -12,18 +13,18 @@ from warpshadow.device.batch import common_batch, concatenate
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import SPHERE_METHODS, Scene
+from warpshadow.scene.scene import SPHERE_METHODS, BodyLike, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 
+Array = TypeVar("Array")
+"""Of what a geometry's arrays are: Warp's arrays, or tensors."""
 
-class _GeometryArrays(NamedTuple):
-    positions: Any  # [batch, vertex] vec3
-    centers: Any  # [batch, sphere] vec3
-    radii: Any  # [batch, sphere] float32
+Other = TypeVar("Other")
 
 
-class Geometry(_GeometryArrays):
+@dataclass(frozen=True, eq=False)
+class Geometry(Generic[Array]):
     """What can move: the vertices of all bodies, and the spheres that stand in for them.
 
     Args:
@@ -34,21 +35,30 @@ class Geometry(_GeometryArrays):
             instance, and no gradient to them is asked for.
     """
 
-    moving: tuple[int, ...] | None = None
+    positions: Array
+    centers: Array
+    radii: Array
+    moving: tuple[int, ...] | None = field(default=None, kw_only=True)
 
-    def __new__(cls, positions: Any, centers: Any, radii: Any, *, moving: Iterable[int] | None = None) -> "Geometry":
-        """Make a tuple of the three arrays that remembers what moves."""
-        self = super().__new__(cls, positions, centers, radii)
-        self.moving = None if moving is None else tuple(sorted(set(moving)))
-        return self
+    def __post_init__(self) -> None:
+        """Hold the bodies that move in order."""
+        if self.moving is not None:
+            object.__setattr__(self, "moving", tuple(sorted(set(self.moving))))
 
-    def _replace(self, **parts: Any) -> "Geometry":
-        """Exchange some of the arrays, or ``moving``, which else stays as it is."""
-        moving = parts.pop("moving", self.moving)
-        return Geometry(*super()._replace(**parts), moving=moving)
+    def arrays(self) -> dict[str, Array]:
+        """The three arrays by their names."""
+        return {"positions": self.positions, "centers": self.centers, "radii": self.radii}
+
+    def map(self, function: Callable[[Array], Other]) -> "Geometry[Other]":
+        """The geometry of what a function makes of each array."""
+        return Geometry(*map(function, self.arrays().values()), moving=self.moving)
 
 
-def as_geometry(name: str, given: Any) -> Geometry:
+GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32}
+"""Dtypes of a geometry's arrays, by their names."""
+
+
+def as_geometry(name: str, given: object) -> Geometry:
     """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
 
     Raises:
@@ -56,11 +66,11 @@ def as_geometry(name: str, given: Any) -> Geometry:
     """
     if isinstance(given, Geometry):
         return given
-    if not isinstance(given, (tuple, list)) or len(given) != len(Geometry._fields):
+    if not isinstance(given, (tuple, list)) or len(given) != len(GEOMETRY_DTYPES):
         count = f" of {len(given)}" if isinstance(given, (tuple, list)) else ""
         raise ValueError(
             f"{name}: got {type(given).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
-            f"tuple of {', '.join(Geometry._fields)}"
+            f"tuple of {', '.join(GEOMETRY_DTYPES)}"
         )
     return Geometry(*given)
 
@@ -187,36 +197,20 @@ class Assembly:
 
     @one_at_a_time
     def placed(
-        self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[int] | None = None
-    ) -> Geometry:
-        """Place the bodies in the world, in arrays of their own.
-
-        Args:
-            poses: Of each body, by default the scene's.
-            rest: The bodies in their own spaces, by default as their meshes are.
-                Either batch may be 1 and then serves every instance of the other.
-            moving: Bodies that ``poses`` move, from 0; None for any. The others stand where the scene has them, without
-                a gradient, unless ``rest`` is that of :meth:`deformed`: what it deforms is among those that move.
-
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
-        Differentiable: poses, rest.
-        """
+        self, poses: Poses | None = None, rest: Geometry | None = None, *, moving: Iterable[BodyLike] | None = None
+    ) -> Geometry[wp.array]:
+        """Place the bodies in the world; see :meth:`Renderer.placed`. Differentiable: poses, rest."""
         poses = self.poses if poses is None else poses
         rest = self.rest if rest is None else as_geometry("rest", rest)
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
-        if moving is not None:
-            check.instance("moving", moving, Iterable, "a list of the numbers of bodies, such as [0]")
-        if moving is None or rest.moving is None:
+        numbers = None if moving is None else self.scene.body_numbers(moving, "moving")
+        if numbers is None or rest.moving is None:
             return Geometry(
                 poses.points(rest.positions, self._vertex_bodies),
                 poses.points(rest.centers, self._sphere_bodies),
                 poses.radii(rest.radii, self._sphere_bodies),
             )
-        bodies = {*moving, *rest.moving}
-        for number in bodies:
-            check.index("moving", number, len(self.scene.bodies), "body")
+        bodies = {*numbers, *rest.moving}
         vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
         still = self.scene_geometry
         return Geometry(
@@ -227,7 +221,7 @@ class Assembly:
                 still.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])
             ),
             exchanged(still.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
-            moving=bodies,
+            moving=tuple(bodies),
         )
 
     @staticmethod
@@ -248,58 +242,31 @@ class Assembly:
         return runs
 
     @one_at_a_time
-    def graph(self, number: int, *, count: int = 4) -> DeformationGraph:
-        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
-
-        Args:
-            number: The body, from 0.
-            count: Nodes that carry a vertex.
-
-        Raises:
-            ValueError: when the body has too few spheres.
-        """
-        check.index("number", number, len(self.scene.bodies), "body")
-        body = self.scene.bodies[number]
-        return DeformationGraph.bind(
-            body.mesh.positions, self._spheres[number].centers, count=count, device=self.device
-        )
+    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres; see :meth:`Renderer.deformation_graph`."""
+        number = self.scene.body_number(body)
+        points = self.scene.bodies[number].mesh.positions
+        return DeformationGraph.bind(points, self._spheres[number].centers, count=count, device=self.device)
 
     @one_at_a_time
     def deformed(
         self,
-        number: int,
+        body: BodyLike,
         positions: wp.array | None = None,
         centers: wp.array | None = None,
         radii: wp.array | None = None,
         *,
-        rest: Geometry | None = None,
-    ) -> Geometry:
-        """Exchange the shape of one body at rest.
-
-        Args:
-            number: The body, from 0.
-            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
-            centers: Its spheres' centers, vec3 of shape [batch, sphere].
-            radii: Its spheres' radii, float32 of shape [batch, sphere].
-                What is None stays as it is in ``rest``.
-            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
-
-        Returns:
-            All bodies at rest, for :meth:`placed`, in arrays of their own.
-
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
-        Differentiable: positions, centers, radii, rest.
-        """
-        check.index("number", number, len(self.scene.bodies), "body")
+        rest: Geometry[wp.array] | None = None,
+    ) -> Geometry[wp.array]:
+        """Exchange the shape of one body at rest; see :meth:`Renderer.deformed`. Differentiable: all arrays."""
+        number = self.scene.body_number(body)
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         return Geometry(
             _spliced("positions", rest.positions, positions, first_vertex),
             _spliced("centers", rest.centers, centers, first_sphere),
             _spliced("radii", rest.radii, radii, first_sphere),
-            moving=None if rest.moving is None else {*rest.moving, number},
+            moving=None if rest.moving is None else (*rest.moving, number),
         )
 
     @property

@@ -59,8 +59,6 @@ class Materials:
     def replaced(self, albedo: Given, textures: Given) -> "Materials":
         """Those with what is given in place of some, checked; the same where nothing is given."""
         bodies = self.assembly.scene.bodies
-        check.per_body("albedo", albedo, len(bodies))
-        check.per_body("textures", textures, len(bodies))
         colors, images, news = list(self.albedo.value()), list(self.textures.value()), {}
         for number, color in enumerate(albedo or ()):
             if color is not None:
@@ -180,9 +178,8 @@ class SeenSurfaces:
     def seen_texels(self, number: int) -> np.ndarray:
         """What each texel of the texture of a body weighs in the samples, float32 of shape [height, width]."""
         has_texture = [size is not None for size in self._materials.sizes]
-        check.index("number", number, len(has_texture), "body")
         if not has_texture[number]:
-            raise ValueError(f"number: got {number}, a body without a texture, expected one that has one")
+            raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
         reflection = self.reflect(None, None)
         textures, footprints = (node.value(self._call) for node in (reflection.pyramids, reflection.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)

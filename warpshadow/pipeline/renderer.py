@@ -5,8 +5,8 @@ What a call leaves out, and why, :meth:`Renderer.explain` says.
 
 import functools
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -19,7 +19,6 @@ from warpshadow.device.batch import common_batch
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
@@ -30,12 +29,16 @@ from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
 from warpshadow.pipeline.view import View
-from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
+from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.poses import Poses
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers
 
 METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
 """How light is blocked."""
+
+Own = TypeVar("Own", bound="Renderer")
 
 COARSE_FACE = 400
 """Pixels of an average face beyond which shading at its corners draws a warning."""
@@ -100,8 +103,8 @@ class Renderer:
         self._method = METHODS[scene.visibility.method](self.assembly, basis, progress=progress)
         self._materials = Materials.of_scene(self.assembly)
         self.basis = self._method.basis
-        self._vertices = Source("vertices", lambda: self.geometry.positions)
-        self._spheres = Source("spheres", lambda: (self.geometry.centers, self.geometry.radii))
+        self._vertices = Source("vertices", lambda: self.geometry().positions)
+        self._spheres = Source("spheres", lambda: (self.geometry().centers, self.geometry().radii))
         clip_matrices = [camera.clip_matrix() for camera in self.cameras]
         self._cameras = Source("cameras", lambda: wp.array(clip_matrices, dtype=wp.mat44, device=where))
         self._scene_view: View | None = None
@@ -109,6 +112,10 @@ class Renderer:
         self._last_cameras: Source | None = None
         self._statics: dict[tuple[int, ...], Static] = {}  # by what moves
         self._has_warned = False
+
+    def moved(self: Own, device: wp.DeviceLike) -> Own:
+        """Make the same renderer on another device; it computes all anew there."""
+        return type(self)(**self._arguments | {"device": device})
 
     def __getstate__(self) -> dict[str, Any]:
         """What it was made of."""
@@ -120,11 +127,78 @@ class Renderer:
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
-    @property
     @one_at_a_time
-    def geometry(self) -> Geometry:
+    def geometry(self) -> Geometry[wp.array]:
         """Where the scene has its bodies and their spheres; the batch is 1. Not to be written to."""
         return self.assembly.scene_geometry
+
+    @one_at_a_time
+    def rest(self) -> Geometry[wp.array]:
+        """The bodies and their spheres at rest, each body in its own space; the batch is 1. Not to be written to."""
+        return self.assembly.rest
+
+    def scene_poses(self) -> Poses:
+        """Where the scene has its bodies; the batch is 1. Not to be written to."""
+        return self.assembly.poses
+
+    def placed(
+        self,
+        poses: Poses | None = None,
+        rest: Geometry[wp.array] | None = None,
+        *,
+        moving: Iterable[BodyLike] | None = None,
+    ) -> Geometry[wp.array]:
+        """Place the bodies in the world, in arrays of their own.
+
+        Args:
+            poses: Of each body, by default the scene's.
+            rest: The bodies in their own spaces, by default as their meshes are.
+                Either batch may be 1 and then serves every instance of the other.
+            moving: Bodies that ``poses`` move, by number or name; None for any. The others stand where the scene has
+                them, without a gradient, unless ``rest`` is that of :meth:`deformed`: what it deforms is among those
+                that move.
+
+        Differentiable: poses, rest.
+        """
+        return self.assembly.placed(poses, rest, moving=moving)
+
+    def deformed(
+        self,
+        body: BodyLike,
+        positions: wp.array | None = None,
+        centers: wp.array | None = None,
+        radii: wp.array | None = None,
+        *,
+        rest: Geometry[wp.array] | None = None,
+    ) -> Geometry[wp.array]:
+        """Exchange the shape of one body at rest.
+
+        Args:
+            body: The body, its number or name.
+            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
+            centers: Its spheres' centers, vec3 of shape [batch, sphere].
+            radii: Its spheres' radii, float32 of shape [batch, sphere].
+                What is None stays as it is in ``rest``.
+            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
+
+        Returns:
+            All bodies at rest, for :meth:`placed`, in arrays of their own.
+
+        Differentiable: positions, centers, radii, rest.
+        """
+        return self.assembly.deformed(body, positions, centers, radii, rest=rest)
+
+    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
+
+        Args:
+            body: The body, its number or name.
+            count: Nodes that carry a vertex.
+
+        Raises:
+            ValueError: for a body with too few spheres.
+        """
+        return self.assembly.deformation_graph(body, count=count)
 
     @property
     def clip_matrices(self) -> wp.array:
@@ -132,7 +206,7 @@ class Renderer:
         return self._cameras.value()
 
     @one_at_a_time
-    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+    def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
         A view sees what it is given as it is now: arrays may change afterwards, unless they require a gradient. A
@@ -172,8 +246,9 @@ class Renderer:
         vertices, spheres, cameras, static = self._vertices, self._spheres, self._cameras, None
         last, poses, matrices = self._last_view, [None], self.cameras
         if geometry is not None:
-            for name, array, own in zip(Geometry._fields, geometry, self.assembly.rest, strict=True):
-                check.shape(f"geometry.{name}", array.shape, ("batch", *own.shape[1:]))
+            own = self.assembly.rest.arrays()
+            for name, array in geometry.arrays().items():
+                check.shape(f"geometry.{name}", array.shape, ("batch", *own[name].shape[1:]))
             poses = geometry.positions
             vertices = Source.renewed("vertices", poses, last.vertices if last else None)
             spheres = Source.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
@@ -215,13 +290,14 @@ class Renderer:
         receivers = Source("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
         vertices, spheres = self._vertices, self._spheres
         if geometry is not None:
-            vertices, spheres = Source("vertices", geometry.positions), Source("spheres", tuple(geometry[1:]))
+            vertices = Source("vertices", geometry.positions)
+            spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
         return LitPoints(self._method, vertices, spheres, node, self._call())
 
     @functools.cached_property
-    def scene_view(self) -> View:
-        """What the cameras see of the scene."""
+    def _own_view(self) -> View:
+        """What the cameras see of the scene; a warning tells of coarse faces."""
         view = self.view()
         self._warn_of_coarse_faces(view.fragments)
         return view
@@ -236,7 +312,7 @@ class Renderer:
     def _own(self, view: Any) -> Any:
         """A view of this renderer, by default the scene's; those of others keep what others computed."""
         if view is None:
-            return self.scene_view
+            return self._own_view
         if view.assembly is not self.assembly:
             raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
         return view
@@ -262,20 +338,14 @@ class Renderer:
 
     # ------------------------------------------------------------------------------------------ light and reflectance
 
-    @functools.cached_property
     @one_at_a_time
     def transfer(self) -> wp.array:
         """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
         Cameras share the receivers at vertices, for which there is one view.
         """
-        view = self.scene_view
+        view = self._own_view
         return view.transfers.value(self._call(view))[-1]
-
-    @property
-    def scene_shading(self) -> wp.array:
-        """The scene's receivers in the scene's light, each as a white surface: vec3 of shape [view, receiver]."""
-        return self.shade()
 
     @one_at_a_time
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
@@ -288,7 +358,7 @@ class Renderer:
             view: From :meth:`view` or :meth:`at_points`, by default the scene's own.
 
         Returns:
-            Shading, vec3 of shape [batch, receiver].
+            What each receiver, as a white surface, reflects: vec3 of shape [batch, receiver].
 
         Raises:
             ValueError: naming the argument; so where rays are asked for a gradient to geometry.
@@ -298,23 +368,19 @@ class Renderer:
         view = self._own(view)
         return view.shading(light).value(self._call(view))
 
-    @property
-    def albedo(self) -> wp.array:
-        """Reflectance that the scene's samples see, vec3 of shape [camera, height, width]."""
-        return self.reflect()
-
     @one_at_a_time
     def reflect(
         self,
-        albedo: Sequence[wp.array | None] | None = None,
-        textures: Sequence[wp.array | None] | None = None,
+        albedo: PerBody[wp.array] | None = None,
+        textures: PerBody[wp.array] | None = None,
         view: View | None = None,
     ) -> wp.array:
         """Find the reflectance that samples see.
 
         Args:
-            albedo: For each body, vec3 of shape [batch, 1] or [batch, vertex]; None for what the scene has.
-            textures: For each body, vec3 of shape [batch, height, width], which needs uvs; None for what the scene has.
+            albedo: Of bodies, vec3 of shape [batch, 1] or [batch, vertex]: a list for all, None for what the scene has,
+                or a mapping for some, by their numbers or names.
+            textures: Likewise, vec3 of shape [batch, height, width], which needs uvs.
             view: By default the scene's own.
 
         Returns:
@@ -326,14 +392,15 @@ class Renderer:
         Differentiable: albedo, textures, view.
         """
         view = self._own(view)
+        albedo, textures = self._per_body(albedo, textures)
         return view.surfaces.reflect(albedo, textures).samples.value(self._call(view))
 
     @one_at_a_time
-    def seen_texels(self, number: int) -> np.ndarray:
+    def seen_texels(self, body: BodyLike) -> np.ndarray:
         """What each texel of the texture of a body weighs in the samples that the scene's cameras take.
 
         Args:
-            number: The body, from 0; it needs a texture.
+            body: The body, its number or name; it needs a texture.
 
         Returns:
             Float32 of shape [height, width]: 0 where no sample sees the texel; see
@@ -342,7 +409,12 @@ class Renderer:
         Raises:
             ValueError: for a body without a texture.
         """
-        return self.scene_view.surfaces.seen_texels(number)
+        return self._own_view.surfaces.seen_texels(self.scene.body_number(body))
+
+    def _per_body(
+        self, albedo: PerBody[wp.array] | None, textures: PerBody[wp.array] | None
+    ) -> tuple[list[wp.array | None], list[wp.array | None]]:
+        return self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
 
     # ------------------------------------------------------------------------------------------ image
 
@@ -351,8 +423,8 @@ class Renderer:
         self,
         light: Light | None = None,
         *,
-        albedo: Sequence[wp.array | None] | None = None,
-        textures: Sequence[wp.array | None] | None = None,
+        albedo: PerBody[wp.array] | None = None,
+        textures: PerBody[wp.array] | None = None,
         view: View | None = None,
     ) -> wp.array:
         """Draw images.
@@ -373,7 +445,7 @@ class Renderer:
         Differentiable: light, albedo, textures, view.
         """
         view = self._own(view)
-        return view.image(light, albedo, textures).value(self._call(view))
+        return view.image(light, *self._per_body(albedo, textures)).value(self._call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -394,18 +466,18 @@ class Renderer:
     @one_at_a_time
     def explain(
         self,
-        light: Any = None,
+        light: Light | None = None,
         *,
-        albedo: Sequence[Any] | None = None,
-        textures: Sequence[Any] | None = None,
+        albedo: PerBody[wp.array] | None = None,
+        textures: PerBody[wp.array] | None = None,
         view: View | None = None,
-        geometry: Geometry | None = None,
-        clip_matrices: Any = None,
+        geometry: Geometry[wp.array] | None = None,
+        clip_matrices: wp.array | None = None,
     ) -> Explanation:
         """Say what the next call computes, stage by stage, and what it leaves out, and why.
 
         Args:
-            light: As for :meth:`draw`, or a tensor, as for :class:`warpshadow.torch.TorchRenderer`; so all others.
+            light: As for :meth:`draw`.
             albedo: As for :meth:`draw`.
             textures: As for :meth:`draw`.
             view: As for :meth:`draw`: then only what comes after it is explained.
@@ -416,38 +488,15 @@ class Renderer:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.
         """
-        if not isinstance(light, EnvironmentMap | np.ndarray):
-            light = _as_array(light, wp.vec3, 2)
-        colors, images = (
-            None if given is None else [_as_array(item, wp.vec3, ndim) for item in given]
-            for given, ndim in ((albedo, 2), (textures, 3))
-        )
         hidden: set[Node] = set()
         if view is not None:
             view = self._own(view)
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
-            if geometry is not None:
-                geometry = as_geometry("geometry", geometry)
-                dtypes = wp.vec3, wp.vec3, wp.float32
-                arrays = (_as_array(array, dtype, 2) for array, dtype in zip(geometry, dtypes, strict=True))
-                geometry = Geometry(*arrays, moving=geometry.moving)
-            view = self._wired(geometry, _as_array(clip_matrices, wp.mat44, 1))
-        image = view.preview().image(light, colors, images)
+            view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        image = view.preview().image(light, *self._per_body(albedo, textures))
         is_host = self.device.is_cpu or self.clock.waits
         return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden)
-
-
-def _as_array(given: Any, dtype: type, ndim: int) -> wp.array | None:
-    """An array, or a tensor as one, with the batch dimension that it may lack; None stays None."""
-    if given is None or isinstance(given, wp.array):
-        return given
-    tensor = given.detach()
-    while tensor.ndim < ndim + len(item_shape(dtype)):
-        tensor = tensor[None]
-    array = wp.from_torch(tensor.contiguous(), dtype=dtype, requires_grad=given.requires_grad)
-    array.version = given._version
-    return array
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

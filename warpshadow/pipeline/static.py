@@ -46,7 +46,7 @@ class Static:
         self.bodies = [number for number in range(len(assembly.scene.bodies)) if number not in geometry.moving]
         self.has_vertex = np.isin(assembly.body_of_vertex, self.bodies)
         self._assembly = assembly
-        self._geometry = Geometry(*map(_first_instance, geometry))
+        self._geometry = geometry.map(_first_instance)
         if not self.are_those_of(geometry):
             raise ValueError(
                 f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
@@ -68,7 +68,9 @@ class Static:
         starts = self._assembly.first_vertex, self._assembly.first_sphere, self._assembly.first_sphere
         return all(
             (array.numpy()[:, first:end] == own.numpy()[:, first:end]).all()
-            for array, own, start in zip(geometry, self._geometry, starts, strict=True)
+            for array, own, start in zip(
+                geometry.arrays().values(), self._geometry.arrays().values(), starts, strict=True
+            )
             for first, end in self._assembly.runs(start, self.bodies)
         )
 

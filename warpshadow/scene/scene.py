@@ -1,9 +1,9 @@
 """Scenes: bodies, light, camera and how visibility is computed."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,14 @@ COLORS = ".npy"
 """What a file of colors for each vertex is called; other text is no albedo."""
 
 _SPHERES = ".npz"
+
+
+BodyLike = int | str
+"""A body of a scene: its number, from 0, or its name."""
+
+Item = TypeVar("Item")
+PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item | None]
+"""Something for each body of a scene, a list of them all; or for some, by their numbers or names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +104,7 @@ class Body:
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow.
+        name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
     """
 
     mesh: Mesh
@@ -106,6 +115,7 @@ class Body:
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
     receivers: str = "vertex"
+    name: str | None = None
 
     def __post_init__(self) -> None:
         """Read files, validate, and hold arrays as float32."""
@@ -131,6 +141,13 @@ class Body:
                 "axes; mesh.transformed(scale=(x, y, z)) stretches a mesh"
             )
         check.choice("receivers", self.receivers, RECEIVERS)
+        if self.name is not None and not (isinstance(self.name, str) and self.name):
+            raise ValueError(f"name: got {check.described(self.name)}, expected a name, or None for the mesh's")
+
+    @property
+    def called(self) -> str:
+        """Its name, or else its mesh's."""
+        return self.name or self.mesh.name
 
     @property
     def casts_shadow(self) -> bool:
@@ -241,6 +258,8 @@ class Scene:
             raise ValueError("bodies: got none, expected one or more")
         for number, body in enumerate(self.bodies):
             check.instance(f"bodies[{number}]", body, Body, "a Body, as Body(mesh) makes it of a mesh")
+            if body.name is not None and body.name in [other.name for other in self.bodies[:number]]:
+                raise ValueError(f"bodies[{number}]: name: got {body.name!r}, as another has, expected one of its own")
         check.instance("camera", self.camera, Camera, "a Camera; several go to Renderer(scene, cameras=[…])")
         check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
         given: Any = self.light
@@ -260,3 +279,60 @@ class Scene:
             light.setflags(write=False)
             object.__setattr__(self, "light", light)
         check_supersampling(self.supersampling)
+
+    def body_number(self, body: BodyLike, argument: str = "body") -> int:
+        """Number of a body, from 0, given that or its name.
+
+        Args:
+            body: The number or the name.
+            argument: What messages call it.
+
+        Raises:
+            ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
+        """
+        if not isinstance(body, str):
+            check.index(argument, body, len(self.bodies), "body")
+            return int(body)
+        names = [each.called for each in self.bodies]
+        check.choice(argument, body, names)
+        if names.count(body) > 1:
+            numbers = [number for number, name in enumerate(names) if name == body]
+            raise ValueError(f"{argument}: got {body!r}, as bodies {numbers} are called, expected a number, or names")
+        return names.index(body)
+
+    def body_numbers(self, bodies: Iterable[BodyLike], argument: str = "bodies") -> tuple[int, ...]:
+        """Numbers of some bodies, given those or names."""
+        if not isinstance(bodies, Iterable) or isinstance(bodies, str):
+            got = check.described(bodies)
+            raise ValueError(f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as [0]")
+        return tuple(self.body_number(body, argument) for body in bodies)
+
+    def per_body(self, given: PerBody[Item] | None, argument: str) -> list[Item | None]:
+        """What is given for each body, None for those for which nothing is.
+
+        Args:
+            given: A list of as many as there are bodies; or a mapping of some of them, by numbers or names.
+            argument: What messages call it.
+
+        Raises:
+            ValueError: for a list of another length, and for bodies that there are not, or that come twice.
+        """
+        count = len(self.bodies)
+        if given is None:
+            return [None] * count
+        if isinstance(given, Mapping):
+            items: dict[int, Item | None] = {}
+            for body, item in given.items():
+                number = self.body_number(body, argument)
+                if number in items:
+                    raise ValueError(f"{argument}: got {body!r} beside the same body's number, expected one of them")
+                items[number] = item
+            return [items.get(number) for number in range(count)]
+        if not isinstance(given, Sequence) or isinstance(given, str):
+            raise ValueError(
+                f"{argument}: got {check.described(given)}, expected a list of {count} items, one for each body, None "
+                "for what the scene has; or some by their bodies, such as {0: …}"
+            )
+        if len(given) != count:
+            raise ValueError(f"{argument}: got {len(given)} items, expected {count}, one for each body")
+        return list(given)

@@ -69,8 +69,8 @@ class PointSample:
             raise ValueError("scene: the camera sees no body, expected one in the image")
         face_ids = face_ids.ravel()
         faces = stage.assembly.faces
-        self._positions = stage.geometry.positions.numpy()[0]
-        self._normals = vertex_normals(stage.geometry.positions, faces).numpy()[0]
+        self._positions = stage.geometry().positions.numpy()[0]
+        self._normals = vertex_normals(stage.geometry().positions, faces).numpy()[0]
         self._vertices = faces.numpy()[face_ids[chosen]]
         if self._view.fragments.sides is not None:  # the backs of vertices are numbered after them
             sides = self._view.fragments.sides.numpy().ravel()

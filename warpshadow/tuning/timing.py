@@ -112,8 +112,8 @@ def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
 
     Each call has the bodies in another of two places, a hair's breadth from where the scene has them.
     """
-    poses = renderer.assembly.poses
-    extent = np.abs(renderer.geometry.positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
+    poses = renderer.scene_poses()
+    extent = np.abs(renderer.geometry().positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
     places = itertools.cycle(
         replace(
             poses,
@@ -121,4 +121,4 @@ def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
         )
         for shift in (1e-5, 2e-5)
     )
-    return lambda: renderer.draw(view=renderer.view(renderer.assembly.placed(next(places))))
+    return lambda: renderer.draw(view=renderer.view(renderer.placed(next(places))))
