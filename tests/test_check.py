@@ -191,16 +191,6 @@ def test_a_missing_file_is_named_with_the_folder_that_it_is_looked_for_in(tmp_pa
         check.file("mesh", tmp_path / "b.obj")
 
 
-@pytest.mark.parametrize("given", [np.ones(2), torch.ones(2, 3), {0: None}, "ab", 3])
-def test_what_is_given_for_each_body_is_a_list(given):
-    check.per_body("albedo", None, 2)
-    check.per_body("albedo", (None, 1), 2)
-    with pytest.raises(ValueError, match="^albedo: got .*, expected a list of 2 items, one for each body"):
-        check.per_body("albedo", given, 2)
-    with pytest.raises(ValueError, match="^albedo: got 1 items, expected 2, one for each body"):
-        check.per_body("albedo", [None], 2)
-
-
 def test_a_string_in_an_expected_shape_stands_for_any_length():
     check.shape("positions", (2, 3, 3), (2, "vertex", 3))
     check.shape("positions", (2, 0, 3), (2, "vertex", 3))

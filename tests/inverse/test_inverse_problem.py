@@ -249,7 +249,7 @@ def test_what_the_scene_does_not_have_cannot_be_free(free, message):
 
 
 @pytest.mark.parametrize("make", [Albedo, Texture, Pose, Deformation, Radii])
-@pytest.mark.parametrize("body", [-1, 0.0, 1.5, True, "bunny", None])
+@pytest.mark.parametrize("body", [-1, 0.0, 1.5, True, b"bunny", None])
 def test_what_is_no_number_of_a_body_is_refused_by_whatever_is_free_of_one(make, body):
     with pytest.raises(ValueError, match=f"body: got {body!r}, expected the number of a body, from 0"):
         make(body)

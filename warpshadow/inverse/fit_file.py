@@ -165,7 +165,7 @@ def _free(table: Table, scene: Scene) -> list[Free]:
     for key, kind in _FREE_OF_BODIES.items():
         for where, value in toml_tables.numbered({key: []} | table, key, "free."):
             with check.located(where):
-                free.append(toml_tables.make(kind, value))
+                free.append(toml_tables.make(kind, value).numbered(scene))
                 free[-1].check_scene(scene)
     return free
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -58,6 +58,7 @@ class Problem:
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it")
         for number, each in enumerate(self.free):
             check.instance(f"free[{number}]", each, Free, "what is free, such as Pose(0) or Light()")
+        object.__setattr__(self, "free", tuple(self._numbered()))
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:
             raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")
@@ -80,6 +81,11 @@ class Problem:
             with check.located(f"free[{number}]"):
                 each.check_scene(self.scene)
         self.cameras()  # raises for an image of other proportions
+
+    def _numbered(self) -> Iterator[Free]:
+        for number, each in enumerate(self.free):
+            with check.located(f"free[{number}]"):
+                yield each.numbered(self.scene)
 
     @property
     def moves(self) -> bool:

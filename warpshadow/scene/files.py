@@ -161,8 +161,11 @@ def write_scene(scene: Scene, folder: str | Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     bodies = []
+    names = [body.called for body in scene.bodies]
     for number, body in enumerate(scene.bodies):
         table, files = _write_body(body, folder / f"body_{number}")
+        if body.name is not None or names.count(body.called) == 1:
+            table["name"] = body.called
         bodies.append(table)
         written += files
     if isinstance(scene.light, EnvironmentMap):

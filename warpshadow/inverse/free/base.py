@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 
 from warpshadow import check
 from warpshadow.inverse.world import Found, Setting, World
-from warpshadow.scene.scene import Scene
+from warpshadow.scene.scene import BodyLike, Scene
 
 Values = dict[str, torch.Tensor]
 
@@ -29,8 +29,12 @@ class Free(abc.ABC):
         """What values and messages call it."""
         return self.key
 
+    def numbered(self, scene: Scene) -> Free:
+        """The same, its body by number where it was by name; ValueError where a scene has no such body."""
+        return self
+
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError where a scene has no such thing; the message names the argument."""
+        """Raise ValueError where what a scene has of it cannot be free; the message names the argument."""
         return
 
     @abc.abstractmethod
@@ -69,20 +73,27 @@ class FreeOfBody(Free):
     """A free parameter of a body.
 
     Args:
-        body: The body, from 0.
+        body: The body, its number or name.
     """
 
-    body: int
+    body: BodyLike
 
     def __post_init__(self) -> None:
-        if not check.is_integer(self.body) or self.body < 0:
-            raise ValueError(f"body: got {check.described(self.body)}, expected the number of a body, from 0")
+        if not isinstance(self.body, str) and (not check.is_integer(self.body) or self.body < 0):
+            got = check.described(self.body)
+            raise ValueError(f"body: got {got}, expected the number of a body, from 0, or its name")
+
+    @property
+    def number(self) -> int:
+        """The body, from 0; a problem puts numbers in place of names."""
+        assert isinstance(self.body, int)
+        return self.body
 
     @property
     def name(self) -> str:
         """What values and messages call it."""
         return f"{self.key}[{self.body}]"
 
-    def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError where a scene has no such body."""
-        check.index("body", self.body, len(scene.bodies), "body")
+    def numbered(self, scene: Scene) -> FreeOfBody:
+        """The same of the body's number."""
+        return replace(self, body=scene.body_number(self.body))

@@ -29,7 +29,7 @@ class Pose(FreeOfBody):
     """The pose of a body: a rotation about the middle of its bounding box, a translation, and maybe a scale.
 
     Args:
-        body: The body, from 0.
+        body: The body, its number or name.
         rotation: Parameters: "axis-angle" [radians], "quaternion" or "6d" (two columns).
         scale: Whether the size is free, too.
         spread: By what angle candidates are turned [radians]: about each axis, either way, then about the eight
@@ -74,21 +74,21 @@ class Pose(FreeOfBody):
 
     def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
-        body = setting.scene.bodies[self.body]
-        at_start, middle = setting.tensor(body.rotation_matrix()), setting.tensor(setting.middle(self.body))
+        body = setting.scene.bodies[self.number]
+        at_start, middle = setting.tensor(body.rotation_matrix()), setting.tensor(setting.middle(self.number))
         rotation = rotation_matrices(values["turn"]) @ at_start
         scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
         moved = body.scale * at_start @ middle + setting.tensor(body.translation)
-        moved = moved + body.scale * setting.extent(self.body) * values["shift"]
+        moved = moved + body.scale * setting.extent(self.number) * values["shift"]
         return rotation, moved - scale * rotation @ middle, scale
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Move the body."""
         rotation, translation, scale = self._posed(values, setting)
-        world.rotations[self.body] = rotation
-        world.translations[self.body] = translation
-        world.scales[self.body] = scale
-        world.moving.add(self.body)
+        world.rotations[self.number] = rotation
+        world.translations[self.number] = translation
+        world.scales[self.number] = scale
+        world.moving.add(self.number)
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Move the body."""
@@ -96,4 +96,4 @@ class Pose(FreeOfBody):
 
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
         vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
-        found.change_body(self.body, rotation=vector, translation=translation, scale=float(scale))
+        found.change_body(self.number, rotation=vector, translation=translation, scale=float(scale))

@@ -21,7 +21,7 @@ class Albedo(FreeOfBody):
     """The reflectance of a body: one color, or one for each vertex.
 
     Args:
-        body: The body, from 0.
+        body: The body, its number or name.
         per_vertex: A color for each vertex.
     """
 
@@ -35,16 +35,15 @@ class Albedo(FreeOfBody):
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body whose reflectance is of another kind."""
-        super().check_scene(scene)
-        body = scene.bodies[self.body]
+        body = scene.bodies[self.number]
         if body.texture is not None:
-            raise ValueError(f"body: got {self.body}, which has a texture; expected one without, or Texture")
+            raise ValueError(f"body: got {self.number}, which has a texture; expected one without, or Texture")
         if np.ndim(body.albedo) > 1 and not self.per_vertex:
-            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected per_vertex=True")
+            raise ValueError(f"body: got {self.number}, which has a color for each vertex; expected per_vertex=True")
 
     def start(self, setting: Setting) -> Values:
         """The body's albedo."""
-        body = setting.scene.bodies[self.body]
+        body = setting.scene.bodies[self.number]
         colors = np.atleast_2d(body.albedo)
         if self.per_vertex:
             colors = np.broadcast_to(colors, (body.mesh.vertex_count, 3))
@@ -52,7 +51,7 @@ class Albedo(FreeOfBody):
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Color the body."""
-        world.albedo[self.body] = values["color"]
+        world.albedo[self.number] = values["color"]
 
     def project(self, values: Values) -> None:
         """Reflectances are in [0, 1]."""
@@ -61,7 +60,7 @@ class Albedo(FreeOfBody):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Color the body."""
         color = values["color"].cpu().numpy()
-        found.change_body(self.body, albedo=color if self.per_vertex else color[0])
+        found.change_body(self.number, albedo=color if self.per_vertex else color[0])
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Texture(FreeOfBody):
     """The reflectance of a body as an image, which needs uvs.
 
     Args:
-        body: The body, from 0.
+        body: The body, its number or name.
         size: Height and width [texels]; by default those of the body's texture, or 256 × 256.
         smoothness: Weight of the mean square of differences between neighboring texels.
     """
@@ -90,19 +89,18 @@ class Texture(FreeOfBody):
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that cannot have a texture."""
-        super().check_scene(scene)
-        body = scene.bodies[self.body]
+        body = scene.bodies[self.number]
         if body.mesh.uvs is None:
             raise ValueError(
-                f"body: got {self.body}, whose mesh has no uvs; expected uvs, as "
+                f"body: got {self.number}, whose mesh has no uvs; expected uvs, as "
                 "warpshadow.assets.unwrap.unwrap makes them"
             )
         if body.texture is None and np.ndim(body.albedo) > 1:
-            raise ValueError(f"body: got {self.body}, which has a color for each vertex; expected one color")
+            raise ValueError(f"body: got {self.number}, which has a color for each vertex; expected one color")
 
     def start(self, setting: Setting) -> Values:
         """The body's texture, or its color."""
-        body = setting.scene.bodies[self.body]
+        body = setting.scene.bodies[self.number]
         image = np.reshape(body.albedo, (1, 1, 3)) if body.texture is None else body.texture
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
         planes = setting.tensor(image).permute(2, 0, 1)[None]
@@ -111,7 +109,7 @@ class Texture(FreeOfBody):
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Cover the body."""
-        world.textures[self.body] = values["texels"]
+        world.textures[self.number] = values["texels"]
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Differences of neighbors."""
@@ -128,7 +126,7 @@ class Texture(FreeOfBody):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
         texels = values["texels"].cpu().numpy()
-        found.change_body(self.body, texture=texels)
+        found.change_body(self.number, texture=texels)
         unshadowed = replace(found.scene, visibility=Visibility(method="none"))
         renderer = Renderer(unshadowed, cameras=found.cameras, device=str(setting.device))
-        found.change_body(self.body, texture=fill_unseen(texels, renderer.seen_texels(self.body)))
+        found.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))

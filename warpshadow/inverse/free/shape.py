@@ -33,7 +33,7 @@ class Deformation(FreeOfBody):
     descent moves parts of the body, and not nodes one by one (Nicolet et al. 2021, section 3.2).
 
     Args:
-        body: The body, from 0; it needs more spheres than ``count``.
+        body: The body, its number or name; it needs more spheres than ``count``.
         rigidity: Weight of the as-rigid-as-possible energy, the mean over pairs of neighboring nodes
             [squares of half the diagonal].
         firmness: Weight of the mean square of the nodes' stretches.
@@ -57,28 +57,27 @@ class Deformation(FreeOfBody):
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body with too few spheres."""
-        super().check_scene(scene)
-        nodes = _sphere_count(scene.bodies[self.body])
+        nodes = _sphere_count(scene.bodies[self.number])
         if self.count >= nodes:
             raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
 
     def start(self, setting: Setting) -> Values:
         """The shape as it is."""
-        nodes = setting.graph(self.body, self.count).node_positions.shape[0]
+        nodes = setting.graph(self.number, self.count).node_positions.shape[0]
         sizes = {"turns": 3, "shifts": 3, "stretches": 6}
         return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
 
     def _moved_nodes(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Matrices [node, 3, 3] and translations [node, 3] in the body's own space, and stretches [node, 3, 3]."""
-        smoothing = setting.smoothing(self.body, self.count, self.smoothness)
+        smoothing = setting.smoothing(self.number, self.count, self.smoothness)
         turns, shifts, entries = (smoothing @ values[key] for key in ("turns", "shifts", "stretches"))
         stretches = (_STRETCH * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
         rotations = rotation_matrices(turns)
-        return rotations + rotations @ stretches, setting.extent(self.body) * shifts, stretches
+        return rotations + rotations @ stretches, setting.extent(self.number) * shifts, stretches
 
     def _deformed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
         """Vertices and centers in the body's own space, with a batch of 1."""
-        graph = setting.graph(self.body, self.count)
+        graph = setting.graph(self.number, self.count)
         matrices, shifts, _ = self._moved_nodes(values, setting)
         points = apply(graph.points, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))
         return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
@@ -86,25 +85,25 @@ class Deformation(FreeOfBody):
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Bend the body."""
         points, centers = self._deformed(values, setting)
-        has_spheres = len(setting.spheres(self.body)) > 0  # without shadows there are nodes, but no spheres
-        world.rest = world.renderer.deformed(self.body, points, centers if has_spheres else None, rest=world.rest)
-        world.moving.add(self.body)
+        has_spheres = len(setting.spheres(self.number)) > 0  # without shadows there are nodes, but no spheres
+        world.rest = world.renderer.deformed(self.number, points, centers if has_spheres else None, rest=world.rest)
+        world.moving.add(self.number)
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Differences between where neighboring nodes take each other, and stretches."""
-        graph = setting.graph(self.body, self.count)
+        graph = setting.graph(self.number, self.count)
         matrices, shifts, stretches = self._moved_nodes(values, setting)
         gaps = apply(graph.rigidity, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))[0]
-        gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.body) ** 2)
+        gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.number) ** 2)
         return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Bend the body, mesh and spheres."""
         points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
-        found.change_body(self.body, mesh=replace(found.scene.bodies[self.body].mesh, positions=points))
-        spheres = found.spheres(self.body)
+        found.change_body(self.number, mesh=replace(found.scene.bodies[self.number].mesh, positions=points))
+        spheres = found.spheres(self.number)
         if len(spheres):
-            found.change_body(self.body, blockers=Spheres(centers, spheres.radii))
+            found.change_body(self.number, blockers=Spheres(centers, spheres.radii))
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class Radii(FreeOfBody):
     """The radii of a body's spheres, as factors.
 
     Args:
-        body: The body, from 0.
+        body: The body, its number or name.
         persistence: Weight of the mean square of the factors' logarithms.
     """
 
@@ -127,19 +126,18 @@ class Radii(FreeOfBody):
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body without spheres."""
-        super().check_scene(scene)
-        if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.body]):
-            raise ValueError(f"body: got {self.body}, which has no spheres; expected one that casts a shadow")
+        if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.number]):
+            raise ValueError(f"body: got {self.number}, which has no spheres; expected one that casts a shadow")
 
     def start(self, setting: Setting) -> Values:
         """The radii as they are."""
-        return {"log": setting.tensor(np.zeros(len(setting.spheres(self.body))))}
+        return {"log": setting.tensor(np.zeros(len(setting.spheres(self.number))))}
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Swell and shrink the spheres."""
-        radii = setting.tensor(setting.spheres(self.body).radii) * values["log"].exp()
-        world.rest = world.renderer.deformed(self.body, radii=radii, rest=world.rest)
-        world.moving.add(self.body)
+        radii = setting.tensor(setting.spheres(self.number).radii) * values["log"].exp()
+        world.rest = world.renderer.deformed(self.number, radii=radii, rest=world.rest)
+        world.moving.add(self.number)
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Logarithms of the factors."""
@@ -147,7 +145,7 @@ class Radii(FreeOfBody):
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Swell and shrink the spheres."""
-        spheres = found.spheres(self.body)
+        spheres = found.spheres(self.number)
         found.change_body(
-            self.body, blockers=Spheres(spheres.centers, spheres.radii * values["log"].exp().cpu().numpy())
+            self.number, blockers=Spheres(spheres.centers, spheres.radii * values["log"].exp().cpu().numpy())
         )
