@@ -370,7 +370,7 @@ def make_renderer(double, device):
             double("scene.scene").Body(ground, blockers=0, receivers=receivers),
             double("scene.scene").Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
         ]
-        visibility = double("scene.scene").Visibility(method=method, directions=16, order=3)
+        visibility = double("scene.scene").Visibility.of({"method": method, "directions": 16, "order": 3})
         whole = double("scene.scene").Scene(
             bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1
         )

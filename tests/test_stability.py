@@ -442,7 +442,9 @@ def small_scene(method, *, scale=1.0, light=1.0):
     eye, target = np.array([0.3, 2, 3.5]) * scale, np.array([0, 0.4, 0]) * scale
     camera = ws.Camera.look_at(eye, target, size=(12, 8), near=0.01 * scale)
     light = ws.EnvironmentMap.constant(light, height=8) if np.isscalar(light) else light
-    return ws.Scene(bodies, light, camera, ws.Visibility(method, directions=32, order=4, samples=32))
+    return ws.Scene(
+        bodies, light, camera, ws.Visibility.of({"method": method, "directions": 32, "order": 4, "samples": 32})
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)

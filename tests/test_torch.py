@@ -35,9 +35,9 @@ def small_scene(method: str = "directional", *, size: int = 12, supersampling: i
     texture = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3))
     ground = ws.Body(ws.plane(3.0, 12), texture=texture, blockers=0)
     camera = ws.Camera.look_at((0, 2.5, 5), (0, 0.6, 0), size=(size, size))
-    visibility = ws.Visibility(method, samples=64, directions=32, order=4)
+    visibility = ws.Visibility.of({"method": method, "samples": 64, "directions": 32, "order": 4} | options)
     sky = ws.synthetic_sky(height=16, sun_radius=12)
-    return ws.Scene((ball, ground), sky, camera, dataclasses.replace(visibility, **options), supersampling)
+    return ws.Scene((ball, ground), sky, camera, visibility, supersampling)
 
 
 def random(*shape: int, device: str = "cpu", seed: int = 0, low: float = 0.1) -> torch.Tensor:

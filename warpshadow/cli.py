@@ -1,7 +1,6 @@
 """The command line: render a scene, explain images, fit spheres to a mesh, look into a light, compile ahead."""
 
 import contextlib
-import dataclasses
 import math
 import time
 import warnings
@@ -109,14 +108,11 @@ def render(
             _check_output(png, *_PICTURES)
         if exposure is not None and not abs(exposure) <= _MOST_STOPS:
             raise ValueError(f"--exposure: got {exposure:g}, expected {-_MOST_STOPS} to {_MOST_STOPS} stops")
-        loaded = load_scene(scene)
-        visibility = loaded.visibility
-        visibility = dataclasses.replace(
-            visibility, method=method or visibility.method, samples=samples or visibility.samples
-        )
+        given = {"method": method, "samples": samples}
+        parsed = load_scene(scene, **{name: value for name, value in given.items() if value is not None})
         where = _device(device)
-        loaded = resolved(dataclasses.replace(loaded, visibility=visibility), device=where, progress=True)
-        if visibility.method == AUTO:
+        loaded = resolved(parsed, device=where, progress=True)
+        if parsed.visibility.method == AUTO:
             typer.echo(f"auto: {describe(loaded)}")
         start = time.perf_counter()
         image = Renderer(loaded, device=where, progress=True).render()
@@ -362,7 +358,7 @@ def warmup(device: Device = "cpu") -> None:
                     (Body(mesh, blockers=1),),
                     EnvironmentMap.constant(1.0),
                     Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8)),
-                    Visibility(method=method, samples=16),
+                    Visibility.of({"method": method, "samples": 16}),
                 )
                 Renderer(scene, device=where).render()
                 bar.update()

@@ -84,7 +84,7 @@ def small_scene(method: str, receivers: str) -> ws.Scene:
 
     ground = ws.Body(ws.plane(4.0, 24), texture=rng.uniform(0.1, 0.9, (16, 16, 3)), blockers=0, receivers=receivers)
     camera = ws.Camera.look_at((0.3, 2.0, 3.5), (0, 0.4, 0), size=(48, 40))
-    visibility = ws.Visibility(method, samples=64)
+    visibility = ws.Visibility.of({"method": method, "samples": 64})
     return ws.Scene(
         (body(-0.6, (0.8, 0.5, 0.3)), body(0.6, (0.2, 0.6, 0.7)), ground), ws.synthetic_sky(), camera, visibility
     )

@@ -122,7 +122,9 @@ def squared_difference(image, target):
 def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, scene, device, monkeypatch):
     """As on a GPU, all vertices are receivers."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
-    scene = ws.Scene(scene.bodies, scene.light, scene.camera, ws.Visibility(method, directions=32, order=3))
+    scene = ws.Scene(
+        scene.bodies, scene.light, scene.camera, ws.Visibility.of({"method": method, "directions": 32, "order": 3})
+    )
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
     target = wp.clone(pose.draw(), requires_grad=False).flatten()
     evaluate = with_gradients(lambda: squared_difference(pose.draw(), target), [pose.turn, pose.translation])
@@ -145,7 +147,7 @@ def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, sc
     """A graph would copy from memory that the host has long given to others."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
     ground = ws.Body(ws.plane(4, 8), texture=np.full((4, 4, 3), 0.5))
-    visibility = ws.Visibility(method, directions=32, order=3)
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
     pose = warp_loop.FreePose(
         ws.Renderer(ws.Scene((scene.bodies[0], ground), scene.light, scene.camera, visibility), device="cpu")
     )
@@ -169,7 +171,7 @@ def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, sc
 @pytest.mark.usefixtures("captures")
 @pytest.mark.parametrize("method", ["directional", "ray-traced"])
 def test_a_captured_fit_of_light_and_texture_has_the_gradients_of_a_plain_one(method, scene, device):
-    visibility = ws.Visibility(method, directions=32, samples=64)
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "samples": 64})
     basis = CellBasis(fibonacci(32))
     still = ws.Renderer(ws.Scene(scene.bodies, scene.light, scene.camera, visibility), basis=basis, device=device)
     free = [

@@ -103,13 +103,26 @@ def test_light_of_cells_takes_the_place_of_harmonics_and_what_is_false_is_not_fr
 def test_loss_still_tolerance_seed_and_stages_are_read(load):
     fit = load(
         "tolerance = 0\nseed = 7\n" + MINIMAL + '[loss]\nkind = "huber"\ndelta = 1\ncoverage = 0\nreduction = "sum"\n'
-        "[still]\nsamples = 64\n[[stage]]\niterations = 3\nlearning_rate = 1\nscale = 0.5\nsoftness = 2\n"
+        "[still]\nmethod = 'directional'\nmerging = 0\n"
+        "[[stage]]\niterations = 3\nlearning_rate = 1\nscale = 0.5\nsoftness = 2\n"
         "directions = 32\nsupersampling = 1\ncandidates = 4\n[[stage]]\n"
     )
     assert fit.problem.loss == inverse.Loss("huber", 1.0, 0.0, "sum")
-    assert (fit.problem.still.method, fit.problem.still.samples) == ("ray-traced", 64)
+    assert (fit.problem.still.method, fit.problem.still.merging) == ("directional", 0)
     assert fit.stages == (inverse.Stage(3, 1.0, 0.5, 2.0, 32, 1, 4), inverse.Stage())
     assert (fit.tolerance, fit.seed) == (0, 7)
+
+
+def test_what_stands_still_is_seen_by_rays_unless_another_method_is_named(load):
+    still = load(MINIMAL + "[still]\nsamples = 64\n").problem.still
+    assert (still.method, still.samples) == ("ray-traced", 64)
+
+
+def test_softness_where_no_shadow_has_any_is_refused(load):
+    with pytest.raises(FitFileError, match=r"stages\[0\]: softness: got 2, which 'ray-traced' does not read"):
+        load(MINIMAL + "[[stage]]\nsoftness = 2\n")
+    with pytest.raises(FitFileError, match=r"\[still\]: softness: got 2, which 'ray-traced' does not read"):
+        load(MINIMAL + "[still]\nsoftness = 2\n")
 
 
 @pytest.mark.parametrize("name", ["pose", "deformation"])

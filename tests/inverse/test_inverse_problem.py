@@ -42,7 +42,7 @@ def small_scene(*, size: tuple[int, int] = (24, 24), **visibility) -> ws.Scene:
     camera = ws.Camera.look_at((0, 2.5, 5), (0, 0.6, 0), size=size)
     light = np.zeros((4, 3))
     light[:2] = [[3, 3, 3], [1, 1, 0.5]]
-    return ws.Scene((ball, ground), light, camera, ws.Visibility(**{"directions": 64} | visibility), supersampling=1)
+    return ws.Scene((ball, ground), light, camera, ws.Visibility.of({"directions": 64} | visibility), supersampling=1)
 
 
 def noise(*shape: int, seed: int = 0) -> np.ndarray:

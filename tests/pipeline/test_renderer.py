@@ -60,7 +60,7 @@ def scene_of(method: str, *bodies: ws.Body, light=None, camera=CAMERA, samples=1
         bodies or (ball(), ground()),
         dome() if light is None else light,
         camera,
-        ws.Visibility(method=method, samples=samples, **visibility),
+        ws.Visibility.of({"method": method, "samples": samples} | visibility),
         supersampling,
     )
 

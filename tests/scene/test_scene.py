@@ -1,5 +1,6 @@
 """Scene files: every key, its default, and the message for everything that can be wrong with it."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -72,14 +73,29 @@ def test_every_key_of_the_camera_is_read(load):
     assert (scene.camera.width, scene.camera.height, scene.supersampling) == (12, 8, 3)
 
 
-def test_every_key_of_visibility_is_read(load):
-    visibility = load(
-        MINIMAL + '[visibility]\nmethod = "log-sh"\ndirections = 64\nsoftness = 1\norder = 4\nlog = "cap"\n'
-        'base = "optimal_linear"\nsamples = 33\nmerging = 0.5\nerror = 0.02\n'
-    ).visibility
-    assert (visibility.method, visibility.directions, visibility.softness, visibility.order) == ("log-sh", 64, 1, 4)
-    assert (visibility.log, visibility.base, visibility.samples) == ("cap", "optimal_linear", 33)
-    assert (visibility.merging, visibility.error) == (0.5, 0.02)
+SETTINGS = (
+    'directions = 64\nsoftness = 1\norder = 4\nlog = "cap"\nbase = "optimal_linear"\nsamples = 33\nmerging = 0.5\n'
+    "error = 0.02\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("method", "read"),
+    [
+        ("directional", {"directions": 64, "softness": 1, "merging": 0.5}),
+        ("log-sh", {"order": 4, "log": "cap", "base": "optimal_linear", "merging": 0.5}),
+        ("none", {"order": 4}),
+        ("ray-traced", {"order": 4, "samples": 33}),
+        ("auto", {"softness": 1, "order": 4, "merging": 0.5, "error": 0.02}),
+    ],
+)
+def test_of_the_settings_in_a_file_those_that_the_method_reads_count(load, tmp_path, method, read):
+    """A file may hold some for each method, of which --method chooses one."""
+    load(MINIMAL + f"[visibility]\n{SETTINGS}")
+    expected = dataclasses.asdict(ws.Visibility(method, **read))
+    assert dataclasses.asdict(ws.load_scene(tmp_path / "scene.toml", method=method).visibility) == expected
+    (tmp_path / "scene.toml").write_text(MINIMAL + f'[visibility]\nmethod = "{method}"\n{SETTINGS}')
+    assert dataclasses.asdict(ws.load_scene(tmp_path / "scene.toml").visibility) == expected
 
 
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none", "ray-traced"])
@@ -467,3 +483,41 @@ def test_a_bad_argument_of_visibility_is_named(options):
     ((name, value),) = options.items()
     with pytest.raises(ValueError, match=f"^{name}: got {value!r}.*, expected"):
         ws.Visibility(**options)
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "value", "readers"),
+    [
+        ("log-sh", "softness", 0.5, "'directional' or 'auto'"),
+        ("none", "directions", 64, "'directional'"),
+        ("ray-traced", "merging", 0.0, "'directional' or 'log-sh' or 'auto'"),
+        ("directional", "order", 4, "'log-sh' or 'none' or 'ray-traced' or 'auto'"),
+        ("directional", "log", "cap", "'log-sh'"),
+        ("none", "base", "linear", "'log-sh'"),
+        ("log-sh", "samples", 64, "'ray-traced'"),
+        ("auto", "directions", 64, "'directional'"),
+        ("directional", "error", 0.1, "'auto'"),
+    ],
+)
+def test_a_setting_that_a_method_does_not_read_is_refused_with_those_that_do(method, name, value, readers):
+    with pytest.raises(ValueError, match=f"^{name}: got {value!r}, which '{method}' .* or method = {readers};"):
+        ws.Visibility(method, **{name: value})
+    default = getattr(ws.Visibility(), name)
+    assert getattr(ws.Visibility(method, **{name: default}), name) == default
+
+
+def test_another_method_takes_along_the_settings_that_it_reads():
+    directional = ws.Visibility(directions=64, softness=0.5, merging=0.25)
+    with pytest.raises(ValueError, match=r"^directions: got 64, which 'log-sh' does not read.*\.by\('log-sh'\)"):
+        dataclasses.replace(directional, method="log-sh")
+    harmonic = directional.by("log-sh")
+    assert dataclasses.asdict(harmonic) == dataclasses.asdict(ws.Visibility("log-sh", merging=0.25))
+    assert dataclasses.replace(ws.Visibility(), method="none").method == "none"
+
+
+@pytest.mark.parametrize(
+    "settings", [{"order": 9}, {"method": "rays"}, {"method": "none", "softness": -1}, {"ordre": 8}]
+)
+def test_settings_that_are_not_read_are_checked(settings):
+    with pytest.raises(ValueError, match="order: got 9|method: got 'rays'|softness: got -1|did you mean 'order'"):
+        ws.Visibility.of(settings)

@@ -83,7 +83,7 @@ def bowl_scene(method: str, receivers: str = "vertex", *, mesh: ws.Mesh | None =
         ),
     )
     bodies = bodies[0], replace(bodies[1], translation=(-0.2, 0.6, -0.2))
-    visibility = ws.Visibility(method, directions=32, order=4, samples=256)
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4, "samples": 256})
     return ws.Scene(bodies, SKY, camera, visibility)
 
 
@@ -101,7 +101,7 @@ def half_lit(method: str, receivers: str, eye, mesh: ws.Mesh) -> ws.Scene:
     sky = np.zeros((32, 64, 3), np.float32)
     sky[:16] = 1
     camera = ws.Camera.look_at(eye, (0, 0, 0), fov_y=30, size=(8, 8))
-    visibility = ws.Visibility(method, directions=128, order=8, samples=1024)
+    visibility = ws.Visibility(method)
     return ws.Scene((ws.Body(mesh, blockers=0, receivers=receivers),), ws.EnvironmentMap(sky), camera, visibility)
 
 

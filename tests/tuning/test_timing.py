@@ -31,9 +31,9 @@ def test_each_image_is_of_bodies_that_have_moved_by_nothing_to_speak_of(monkeypa
     scene = make_scene()
     placed, geometries = Assembly.placed, []
 
-    def noted(assembly, *poses, **options):
-        geometry = placed(assembly, *poses, **options)
-        geometries.extend([geometry] * len(poses))  # where none are given the bodies are where the scene has them
+    def noted(assembly, poses=None, rest=None, **options):
+        geometry = placed(assembly, poses, rest, **options)
+        geometries.extend([geometry] * (poses is not None))  # or the bodies are where the scene has them
         return geometry
 
     monkeypatch.setattr(Assembly, "placed", noted)

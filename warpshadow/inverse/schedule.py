@@ -63,9 +63,8 @@ class Stage:
 
     def visibility(self, visibility: Visibility) -> Visibility:
         """A scene's visibility with what the stage says of it."""
-        softness = visibility.softness if self.softness is None else self.softness
-        directions = visibility.directions if self.directions is None else self.directions
-        return replace(visibility, softness=softness, directions=directions)
+        given: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
+        return replace(visibility, **{name: value for name, value in given.items() if value is not None})
 
 
 def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
@@ -92,11 +91,11 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     as it is and turned by 30° fourteen ways, on images of some 32 pixels, and the best five, two and one go on.
     """
     small, middle, large = (_scale(problem, size) for size in (32, 64, 128))
-    coarse: dict[str, Any] = {"directions": 64, "supersampling": 1}
+    soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
     return (
-        Stage(25, 0.05, small, softness=1.0, candidates=15, **coarse),
-        Stage(25, 0.03, small, softness=0.5, candidates=5, **coarse),
-        Stage(30, 0.03, middle, softness=0.5, candidates=2, **coarse),
+        Stage(25, 0.05, small, supersampling=1, candidates=15, **soft),
+        Stage(25, 0.03, small, supersampling=1, candidates=5, **firm),
+        Stage(30, 0.03, middle, supersampling=1, candidates=2, **firm),
         Stage(30, 0.015, large),
     )
 
@@ -105,10 +104,15 @@ def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
     """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones."""
     middle, large = (_scale(problem, size) for size in (64, 128))
     return (
-        Stage(50, 0.06, middle, softness=0.7, directions=64, supersampling=1, regularization=4.0),
+        Stage(50, 0.06, middle, supersampling=1, regularization=4.0, **_soft(problem, 0.7)),
         Stage(100, 0.04, middle, supersampling=1, regularization=2.0),
         Stage(40, 0.02, large),
     )
+
+
+def _soft(problem: Problem, softness: float) -> dict[str, Any]:
+    """Settings of a stage that sees softer shadows, of few directions, where the method has any."""
+    return {"softness": softness, "directions": 64} if problem.visibility.method == "directional" else {}
 
 
 def _scale(problem: Problem, size: int) -> float:

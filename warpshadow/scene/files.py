@@ -1,6 +1,7 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
 import inspect
+import os
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -32,11 +33,13 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | os.PathLike[str], **settings: object) -> Scene:
     """Read a scene file.
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
+        settings: Settings of visibility in place of the file's, such as ``method="log-sh"``. A file may hold settings
+            for several methods; those that the method does not read are left out.
 
     Raises:
         SceneError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
@@ -44,10 +47,10 @@ def load_scene(path: str | Path) -> Scene:
     """
     path = check.path("path", path)
     with check.located(str(path), SceneError):
-        return _scene(toml_tables.read(path, "scene file"), path.parent)
+        return _scene(toml_tables.read(path, "scene file"), path.parent, settings)
 
 
-def _scene(scene: Table, folder: Path) -> Scene:
+def _scene(scene: Table, folder: Path, settings: Table) -> Scene:
     with check.located("the scene"):
         check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
     for name in ("camera", "light", "body"):
@@ -67,7 +70,9 @@ def _scene(scene: Table, folder: Path) -> Scene:
         check_supersampling(supersampling)
         camera = parse_camera(placed)
     with check.located("[visibility]"):
-        visibility = toml_tables.make(Visibility, scene.get("visibility", {}))
+        given = scene.get("visibility", {})
+        toml_tables.check_table(given)
+        visibility = Visibility.of(given | settings)  # a file may hold settings for what --method chooses
     with check.located("the scene"):
         return Scene(tuple(bodies), light, camera, visibility, supersampling)
 

@@ -24,6 +24,18 @@ from warpshadow.stages.visibility.zonal_logs import LOGS
 SPHERE_METHODS = ("directional", "log-sh")
 METHODS = (*SPHERE_METHODS, "none", "ray-traced")
 AUTO = "auto"
+READ_BY = {
+    "directions": ("directional",),
+    "softness": ("directional", AUTO),
+    "merging": (*SPHERE_METHODS, AUTO),
+    "order": ("log-sh", "none", "ray-traced", AUTO),
+    "log": ("log-sh",),
+    "base": ("log-sh",),
+    "samples": ("ray-traced",),
+    "error": (AUTO,),
+}
+"""The methods that read each setting of a :class:`Visibility`; "auto" leaves some to what it chooses."""
+
 RECEIVERS = ("vertex", "pixel")
 
 SCENE = "a Scene; load_scene(path) reads one"
@@ -45,7 +57,7 @@ PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item 
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """How visibility is computed.
+    """How visibility is computed. A setting that the method does not read is refused unless it is the default.
 
     Args:
         method: "directional" transmittance of spheres, "log-sh" of spheres, "none" (no shadows), or "ray-traced"
@@ -55,7 +67,8 @@ class Visibility:
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
             ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
-        order: Number of SH bands, 2 to 8: of "log-sh", and of the light that "none" shades with.
+        order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by
+            "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
         samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
@@ -73,6 +86,17 @@ class Visibility:
     error: float = 0.05
 
     def __post_init__(self) -> None:
+        self._check_values()
+        for name, methods in READ_BY.items():
+            value, default = getattr(self, name), getattr(Visibility, name)
+            if value != default and self.method not in methods:
+                readers = " or ".join(map(repr, methods))
+                raise ValueError(
+                    f"{name}: got {value!r}, which {self.method!r} does not read, expected the default, {default!r}, "
+                    f"or method = {readers}; visibility.by({self.method!r}) leaves behind what a method does not read"
+                )
+
+    def _check_values(self) -> None:
         check.choice("method", self.method, (*METHODS, AUTO))
         check_count("directions", self.directions)
         sh.check_order(self.order)
@@ -83,6 +107,19 @@ class Visibility:
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
         edge_width(self.softness, self.directions)
         check_merging(self.merging)
+
+    @classmethod
+    def of(cls, settings: Mapping[str, object]) -> "Visibility":
+        """Make one of settings for any methods, by their names: all are checked, and those that its own reads count."""
+        check.known_keys("key", settings, ("method", *READ_BY))
+        every = object.__new__(cls)
+        vars(every).update(settings)
+        every._check_values()
+        return cls(every.method, **{name: getattr(every, name) for name in READ_BY if every.method in READ_BY[name]})
+
+    def by(self, method: str) -> "Visibility":
+        """The same by another method, with the settings that both read."""
+        return Visibility.of(vars(self) | {"method": method})
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,7 +81,7 @@ class _Stage:
     """
 
     def __init__(self, scene: Scene, device: wp.DeviceLike):
-        self.scene = replace(scene, visibility=replace(scene.visibility, method="none"))
+        self.scene = replace(scene, visibility=scene.visibility.by("none"))
         self._renderer = Renderer(self.scene, device=device)
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
