@@ -22,6 +22,9 @@ from warpshadow.maths import sh
 
 # Half a step of 8-bit sRGB where it is steepest.
 EIGHT_BITS = 0.006
+PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
+"""What the command that is installed runs."""
+
 COMMANDS = ("render", "tune", "fit", "spheres", "envmap", "warmup")
 
 SCENE = """
@@ -449,7 +452,7 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
 def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_path):
     fit_file.write_text(FIT.replace("iterations = 60", "iterations = 400"))
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "warpshadow", "fit", str(fit_file), "-o", str(folder), "--checkpoint-seconds", "0"]
+    command = [*PROGRAM, "fit", str(fit_file), "-o", str(folder), "--checkpoint-seconds", "0"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
         while not (folder / "checkpoint.previous").exists() and process.poll() is None:
@@ -665,14 +668,13 @@ def test_help_lists_every_option(command):
 
 
 @pytest.mark.slow
-def test_the_module_runs_as_a_program(tmp_path):
+def test_the_command_runs_as_a_program(tmp_path):
     """A process of its own: help and a mistake, without a traceback and without Warp's messages."""
-    program = [sys.executable, "-m", "warpshadow"]
-    result = subprocess.run([*program, "--help"], capture_output=True, text=True, timeout=60)
+    result = subprocess.run([*PROGRAM, "--help"], capture_output=True, text=True, timeout=60)
     assert result.returncode == 0
     for command in COMMANDS:
         assert command in result.stdout
-    missing = [*program, "render", str(tmp_path / "no.toml"), "-o", str(tmp_path / "x.exr")]
+    missing = [*PROGRAM, "render", str(tmp_path / "no.toml"), "-o", str(tmp_path / "x.exr")]
     result = subprocess.run(missing, capture_output=True, text=True, timeout=60)
     assert result.returncode == 1
     assert result.stdout == "" and result.stderr.startswith("error: ") and "no.toml" in result.stderr

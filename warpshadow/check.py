@@ -11,6 +11,9 @@ from typing import TypeGuard
 import numpy as np
 import warp as wp
 
+AnyPath = str | os.PathLike[str]
+"""A path as it may be given."""
+
 LARGEST = 1.0e18
 """The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
 
@@ -74,7 +77,7 @@ def is_integer(value: object) -> TypeGuard[int]:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def is_path(value: object) -> TypeGuard[str | os.PathLike[str]]:
+def is_path(value: object) -> TypeGuard[AnyPath]:
     """Whether a value may name a file."""
     return isinstance(value, (str, os.PathLike))
 
@@ -98,7 +101,7 @@ def instance(name: str, value: object, kind: type | tuple[type, ...], expected: 
         raise ValueError(f"{name}: got {described(value)}, expected {expected}")
 
 
-def file(name: str, value: str | os.PathLike) -> Path:
+def file(name: str, value: AnyPath) -> Path:
     """The path of a file, relative to the current folder; FileNotFoundError if there is none."""
     found = Path(value)
     if not found.is_file():

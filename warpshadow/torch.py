@@ -36,6 +36,9 @@ from warpshadow.tuning.renderer import Renderer
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 
 
+__all__ = ["TorchRenderer", "apply", "rotation_matrices"]
+
+
 class TorchRenderer(torch.nn.Module):
     """Render a scene whose light, reflectance, geometry and camera are tensors.
 

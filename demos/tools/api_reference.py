@@ -23,7 +23,6 @@ def main(output: Path) -> None:
         if isinstance(value, type) and value.__module__.startswith("warp."):
             value.__module__ = "warp"  # where users find it, in place of where it is defined
     names = [module.name for module in pkgutil.walk_packages(warpshadow.__path__, "warpshadow.")]
-    names.remove("warpshadow.__main__")
     # pdoc shows an annotation that it cannot evaluate as it is written, which is fine
     warnings.filterwarnings("ignore", message="Error parsing type annotation")
     pdoc.render.configure(docformat="google", show_source=False)

@@ -69,8 +69,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
 def import_package() -> None:
     """Import all files of the package, so that Warp knows their kernels."""
     for info in pkgutil.walk_packages(warpshadow.__path__, "warpshadow."):
-        if not info.name.endswith("__main__"):
-            importlib.import_module(info.name)
+        importlib.import_module(info.name)
 
 
 def file_modules() -> dict[str, wp.Module]:

@@ -8,9 +8,11 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+from warpshadow.check import AnyPath
+
 
 @contextlib.contextmanager
-def whole(path: str | Path) -> Iterator[Path]:
+def whole(path: AnyPath) -> Iterator[Path]:
     """Give a new empty file beside ``path`` to write to, which takes its place if the block ends without an error.
 
     Otherwise it is removed, and what was at ``path`` stays. It has the suffix of ``path``, by which libraries tell

@@ -16,13 +16,14 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.assets.radiance import read_radiance
+from warpshadow.check import AnyPath
 
 
 class ImageError(ValueError):
     """A picture, or a file of one, that cannot be used; the message says what was found and is accepted."""
 
 
-def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
+def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
     """Read a picture as linear values.
 
     OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
@@ -55,13 +56,13 @@ def read_image(path: str | Path, *, part: str | int | None = None, max_pixels: i
         raise ImageError(f"{path}: {error}") from error
 
 
-def read_rgb(path: str | Path, *, part: str | int | None = None) -> np.ndarray:
+def read_rgb(path: AnyPath, *, part: str | int | None = None) -> np.ndarray:
     """Read a picture as :func:`read_image` does, as RGB: gray is repeated, alpha dropped."""
     pixels = read_image(path, part=part)
     return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
 
 
-def write_image(path: str | Path, pixels: np.ndarray) -> None:
+def write_image(path: AnyPath, pixels: np.ndarray) -> None:
     """Write a picture of linear values; the file appears complete or not at all.
 
     Args:

@@ -20,6 +20,7 @@ from warpshadow import check
 from warpshadow.assets.cells import CellLight, gather_cells
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.image import ImageError, read_rgb, write_image
+from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 
 # Degrees about +y that turn a map of the convention into ours, and so what its center shows.
@@ -58,7 +59,7 @@ class EnvironmentMap:
     @classmethod
     def read(
         cls,
-        path: str | Path,
+        path: AnyPath,
         *,
         sanitize: str | None = None,
         part: str | int | None = None,
@@ -96,7 +97,7 @@ class EnvironmentMap:
         check.whole("height", height, what="rows")
         return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
 
-    def write(self, path: str | Path) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write an OpenEXR file of float32 RGB."""
         if Path(path).suffix.lower() != ".exr":
             raise ImageError(

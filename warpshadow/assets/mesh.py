@@ -18,6 +18,7 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.topology import Surface, join_faces
+from warpshadow.check import AnyPath
 
 
 class MeshError(ValueError):
@@ -116,7 +117,7 @@ class Mesh:
         moved = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
         return replace(self, positions=moved.positions, faces=moved.faces, uv_faces=moved.uv_faces)
 
-    def write(self, path: str | Path) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""
         path = Path(path)
         if path.suffix.lower() != ".obj":

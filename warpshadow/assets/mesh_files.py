@@ -11,9 +11,10 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError, MeshPart, moved_part, turned_over
+from warpshadow.check import AnyPath
 
 
-def load_mesh(path: str | Path) -> Mesh:
+def load_mesh(path: AnyPath) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file as one mesh.
 
     Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from warpshadow.assets import files
+from warpshadow.check import AnyPath
 
 OTHERWISE = "choose another file, which on the command line is another folder by -o"
 """What to do where a checkpoint cannot be used."""
@@ -28,7 +29,7 @@ class CheckpointError(ValueError):
 
 
 @contextlib.contextmanager
-def alone(path: str | Path | None) -> Iterator[None]:
+def alone(path: AnyPath | None) -> Iterator[None]:
     """Refuse a second fit that would write the same file; without a file nothing is refused.
 
     Raises:
@@ -47,7 +48,7 @@ def alone(path: str | Path | None) -> Iterator[None]:
         raise CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHERWISE}") from error
 
 
-def save(path: str | Path, state: Mapping[str, object]) -> None:
+def save(path: AnyPath, state: Mapping[str, object]) -> None:
     """Write a state, atomically; the checkpoint before it stays as FILE.previous.
 
     Args:
@@ -67,7 +68,7 @@ def save(path: str | Path, state: Mapping[str, object]) -> None:
             os.replace(path, previous_path(path))
 
 
-def load(path: str | Path) -> dict[str, Any] | None:
+def load(path: AnyPath) -> dict[str, Any] | None:
     """Read the last whole state.
 
     Args:

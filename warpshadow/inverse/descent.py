@@ -18,6 +18,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
+from warpshadow.check import AnyPath
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
@@ -298,9 +299,9 @@ def fit(
     tolerance: float = 1e-4,
     seed: int = 0,
     device: str | torch.device = "cpu",
-    checkpoint: str | Path | None = None,
+    checkpoint: AnyPath | None = None,
     checkpoint_seconds: float = 10.0,
-    preview: str | Path | None = None,
+    preview: AnyPath | None = None,
     preview_seconds: float = 2.0,
     progress: bool = False,
 ) -> Result:
@@ -358,9 +359,9 @@ def fit(
 
 def _descend(
     descent: _Descent,
-    checkpoint: str | Path | None,
+    checkpoint: AnyPath | None,
     checkpoint_seconds: float,
-    preview: str | Path | None,
+    preview: AnyPath | None,
     preview_seconds: float,
     progress: bool,
 ) -> list[float]:

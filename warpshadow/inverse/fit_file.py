@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from warpshadow import check
+from warpshadow.check import AnyPath
 from warpshadow.inverse import (
     Albedo,
     CameraPose,
@@ -90,7 +91,7 @@ class Fit:
         return functools.partial(run, tolerance=self.tolerance, seed=self.seed)
 
 
-def load_fit(path: str | Path) -> Fit:
+def load_fit(path: AnyPath) -> Fit:
     """Read a fit file.
 
     Args:

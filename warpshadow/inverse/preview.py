@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.image import write_image
+from warpshadow.check import AnyPath
 
 
-def write_preview(path: str | Path, targets: torch.Tensor, images: torch.Tensor) -> None:
+def write_preview(path: AnyPath, targets: torch.Tensor, images: torch.Tensor) -> None:
     """Write a picture of targets, images and how they differ (gray is alike), a row for each view."""
     wanted, got = targets[..., :3].cpu().numpy(), images[..., :3].cpu().numpy()
     white = white_of(wanted)

@@ -13,6 +13,7 @@ import torch
 from warpshadow.assets import files
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
@@ -25,7 +26,7 @@ from warpshadow.scene.files import camera_table, write_scene
 _MAP_HEIGHT = 64  # of a map of spherical harmonics [pixels]
 
 
-def write_result(result: Result, folder: str | Path) -> list[Path]:
+def write_result(result: Result, folder: AnyPath) -> list[Path]:
     """Write what a fit found; see :meth:`Report.write`."""
     return Report(result).write(folder)
 
@@ -47,7 +48,7 @@ class Report:
         self.loss_before, self.before = _evaluated(model, result.problem.start(result.setting))
         self.loss_after, self.after = _evaluated(model, result.values)
 
-    def write(self, folder: str | Path) -> list[Path]:
+    def write(self, folder: AnyPath) -> list[Path]:
         """Write it.
 
         Args:
@@ -109,7 +110,7 @@ def _evaluated(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarr
     return float(loss), images.cpu().numpy()
 
 
-def plot_losses(result: Result, path: str | Path) -> list[Path]:
+def plot_losses(result: Result, path: AnyPath) -> list[Path]:
     """Plot the loss of each iteration, a color for each descent; nothing, with a warning, without matplotlib."""
     try:
         import matplotlib

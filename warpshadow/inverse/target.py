@@ -13,6 +13,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import linear_to_srgb
 from warpshadow.assets.image import read_image
+from warpshadow.check import AnyPath
 
 _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 
@@ -81,7 +82,7 @@ class Target:
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
 
 
-def read_target(path: str | Path) -> np.ndarray:
+def read_target(path: AnyPath) -> np.ndarray:
     """Linear RGB, or premultiplied RGB with coverage where the file has alpha, which is straight in PNG alone."""
     pixels = read_image(path)
     if pixels.shape[2] < 3:
@@ -91,7 +92,7 @@ def read_target(path: str | Path) -> np.ndarray:
     return pixels
 
 
-def read_mask(path: str | Path) -> np.ndarray:
+def read_mask(path: AnyPath) -> np.ndarray:
     """Gray as it is stored, 0 to 1: a mask is no light, so that half gray is half."""
     pixels = read_image(path)
     has_alpha = pixels.shape[2] in (2, 4)

@@ -1,7 +1,6 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
 import inspect
-import os
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,6 +15,7 @@ from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_supersampling
@@ -33,7 +33,7 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: str | os.PathLike[str], **settings: object) -> Scene:
+def load_scene(path: AnyPath, **settings: object) -> Scene:
     """Read a scene file.
 
     Args:
@@ -149,7 +149,7 @@ def _body(table: Table, folder: Path) -> Body:
 # ---------------------------------------------------------------------------------------------- writing
 
 
-def write_scene(scene: Scene, folder: str | Path) -> list[Path]:
+def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
     """Write a scene file and all that it names; :func:`load_scene` reads back the same scene, bit for bit.
 
     Args:

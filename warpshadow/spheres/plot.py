@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from warpshadow.assets import files
 from warpshadow.assets.mesh import Mesh
+from warpshadow.check import AnyPath
 from warpshadow.spheres.sphere_set import Spheres
 
 
@@ -19,7 +18,7 @@ def check_matplotlib() -> None:
         raise ImportError('a picture of spheres needs the package matplotlib: pip install "warpshadow[plot]"') from None
 
 
-def plot_spheres(mesh: Mesh, spheres: Spheres, path: str | Path) -> None:
+def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:
     """Draw the spheres inside the translucent mesh, from two sides.
 
     Args:

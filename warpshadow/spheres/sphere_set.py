@@ -5,12 +5,12 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from warpshadow import check
 from warpshadow.assets import files
+from warpshadow.check import AnyPath
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Spheres:
             raise ValueError(f"radii: got {self.radii.min()}, expected radii that are not negative")
 
     @classmethod
-    def read(cls, path: str | Path) -> Spheres:
+    def read(cls, path: AnyPath) -> Spheres:
         """Read an .npz file of the arrays ``centers`` and ``radii``, as ``warpshadow spheres -o`` writes it.
 
         Raises:
@@ -52,7 +52,7 @@ class Spheres:
             raise ValueError(f"got {path} ({error}), expected an .npz file of centers and radii") from error
         return cls(centers, radii)
 
-    def write(self, path: str | Path) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write an .npz file of ``centers`` and ``radii``, which a scene file's ``spheres`` reads."""
         with files.whole(path) as unfinished:
             np.savez(unfinished, centers=self.centers, radii=self.radii)

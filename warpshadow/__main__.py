@@ -1,5 +1,0 @@
-"""``python -m warpshadow``."""
-
-from warpshadow.cli import app
-
-app(prog_name="warpshadow")
