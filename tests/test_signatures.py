@@ -4,11 +4,18 @@ import dataclasses
 import importlib
 import inspect
 import os
+import subprocess
+import sys
 import typing
 from collections import abc
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy.typing
 import pytest
+
+ROOT = Path(__file__).parents[1]
+CACHE = ROOT / ".mypy_cache" / "users"
 
 FACADES = ("warpshadow", "warpshadow.torch", "warpshadow.inverse", "warpshadow.stages")
 
@@ -23,7 +30,8 @@ def functions_of(name: str, value: object) -> Iterator[tuple[str, object]]:
         if not base.__module__.startswith("warpshadow"):
             continue
         for key, member in vars(base).items():
-            is_made = key == "__init__" and dataclasses.is_dataclass(base)  # of fields, which have a test of their own
+            parameters = vars(base).get("__dataclass_params__")
+            is_made = key == "__init__" and getattr(parameters, "init", False)  # of fields, which have a test
             if is_made or (key.startswith("_") and key not in ("__init__", "__call__")):
                 continue
             member = getattr(member, "__func__", member)
@@ -31,6 +39,9 @@ def functions_of(name: str, value: object) -> Iterator[tuple[str, object]]:
             if inspect.isfunction(member):
                 yield f"{name}.{key}", member
 
+
+ARRAY_LIKE = {numpy.typing.ArrayLike, *typing.get_args(numpy.typing.ArrayLike)}
+"""Types of what NumPy makes arrays of, which hold an Any of NumPy's."""
 
 BARE = {dict, list, tuple, set, os.PathLike, *(getattr(abc, name) for name in abc.__all__)}
 """What has items of any type where it is not said of which."""
@@ -40,8 +51,9 @@ def is_any(hint: object) -> bool:
     """Whether a type is Any somewhere, said or meant."""
     if isinstance(hint, list):  # arguments of a callable
         return any(map(is_any, hint))
-    is_bare = isinstance(hint, abc.Hashable) and hint in BARE
-    return hint is typing.Any or is_bare or any(map(is_any, typing.get_args(hint)))
+    if hint in ARRAY_LIKE:
+        return False
+    return hint is typing.Any or hint in BARE or any(map(is_any, typing.get_args(hint)))
 
 
 def faults(name: str, function) -> list[str]:
@@ -77,3 +89,53 @@ def test_a_facade_lists_what_it_exports_in_order(facade):
     module = importlib.import_module(facade)
     assert list(module.__all__) == sorted(set(module.__all__))
     assert all(hasattr(module, name) for name in module.__all__)
+
+
+USER = """
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import warpshadow as ws
+from warpshadow import inverse
+from warpshadow.torch import TorchRenderer
+
+path: os.PathLike[str] = Path("bunny.obj")
+bunny = ws.Body(path, albedo=[0.8, 0.6, 0.5], rotation=(0, 30, 0))
+ground = ws.Body(ws.plane(4.0), texture="tile.png", name="ground")
+camera = ws.Camera.look_at(np.array([0.0, 2.0, 4.0]), [0, 0, 0], size=(64, 48))
+scene = ws.Scene([bunny, ground], "sky.exr", camera, ws.Visibility("log-sh", order=4))
+image: np.ndarray = ws.Renderer(scene).render()
+ws.write_image(path, image)
+renderer = TorchRenderer(scene, device=torch.device("cpu"))
+rotations, translations, scales = renderer.scene_poses()
+geometry = renderer.placed(rotations, translations, moving=["bunny"])
+points: torch.Tensor = geometry.positions
+textures = {"ground": torch.ones(4, 4, 3)}
+drawn: torch.Tensor = renderer(textures=textures, geometry=geometry)
+print(renderer.explain(textures=textures, geometry=geometry), renderer.forward(albedo={0: torch.ones(3)}).shape)
+target = inverse.Target("photo.png", mask=image[..., 3])
+problem = inverse.Problem(scene, target, [inverse.Texture(body="ground"), inverse.Pose(0)])
+found: ws.Scene = inverse.fit(problem, inverse.pose_stages(problem), checkpoint=path).scene
+
+ws.Body(3)  # type: ignore[arg-type]
+ws.Visibility("none", softnes=1.0)  # type: ignore[call-arg]
+renderer.deformed(1.5)  # type: ignore[arg-type]
+renderer.forward(textures=torch.ones(4, 4, 3))  # type: ignore[arg-type]
+inverse.Pose(None)  # type: ignore[arg-type]
+ws.render(camera)  # type: ignore[arg-type]
+"""
+"""What a user's type checker is to accept, and, where it says to ignore it, to refuse."""
+
+
+@pytest.mark.slow
+def test_types_are_visible_to_users(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(USER, encoding="utf-8")
+    options = ["--config-file=", "--strict", "--allow-any-generics", "--allow-untyped-calls", "--cache-dir", str(CACHE)]
+    command = [sys.executable, "-m", "mypy", *options, str(script)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    run = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert run.returncode == 0, run.stdout + run.stderr

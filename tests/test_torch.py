@@ -294,7 +294,7 @@ def test_texels_that_no_pixel_sees_have_a_zero_gradient():
     [
         (torch.ones(32, 3, dtype=torch.float64), r"light: got torch.float64, .*: .float\(\) converts it"),
         (torch.ones(9, 3), r"got shape \(9, 3\), .* cells of 32 directions; for 9 .* basis=HarmonicBasis\(3\)$"),
-        (torch.ones(48, 3), r"for 48 .* basis=CellBasis\(warpshadow.maths.directions.fibonacci\(48\)\)$"),
+        (torch.ones(48, 3), r"for 48 .* basis=CellBasis\(warpshadow.fibonacci\(48\)\)$"),
         ("park.exr", "light: got 'park.exr', expected an EnvironmentMap"),
         (torch.ones(32, 3, dtype=torch.int32), "light: got torch.int32"),
         (torch.ones(31, 3), r"light: got shape \(31, 3\), expected \[32, 3\]"),

@@ -4,13 +4,16 @@ import warp as _wp
 
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.assets.image import ImageError, read_image, write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
+from warpshadow.assets.unwrap import unwrap
 from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
@@ -36,8 +39,10 @@ __all__ = [
     "Spheres",
     "Tuning",
     "Visibility",
+    "fibonacci",
     "fit_spheres",
     "icosphere",
+    "linear_to_srgb",
     "load_mesh",
     "load_scene",
     "plane",
@@ -45,9 +50,11 @@ __all__ = [
     "read_image",
     "render",
     "set_thread_count",
+    "srgb_to_linear",
     "synthetic_sky",
     "thread_count",
     "tune",
+    "unwrap",
     "write_image",
     "write_scene",
 ]

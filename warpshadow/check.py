@@ -225,7 +225,7 @@ def pixels(name: str, values: object, *, expected: str, error: type[ValueError] 
     if dtype.kind != "f":
         raise error(
             f"{name}: got values of {dtype}, expected linear ones as floats: those of an 8-bit picture are "
-            "warpshadow.assets.color.srgb_to_linear(values / 255), and read_image(path) reads one"
+            "warpshadow.srgb_to_linear(values / 255), and read_image(path) reads one"
         )
     return copied
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
@@ -39,22 +40,21 @@ class HarmonicBasis:
         return coefficients
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class CellBasis:
     """Cells around directions [direction, 3], one for those nearest to it; the coefficients are their mean radiance."""
 
     directions: np.ndarray
 
-    def __post_init__(self) -> None:
-        expected = "unit vectors [direction, 3]; warpshadow.maths.directions.fibonacci(128) makes 128"
-        directions = check.numbers("directions", self.directions, expected=expected, dtype=np.float64)
-        check.shape(
-            "directions", directions.shape, ("direction", 3), "warpshadow.maths.directions.fibonacci(128) makes 128"
-        )
-        if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+    def __init__(self, directions: npt.ArrayLike):
+        remedy = "warpshadow.fibonacci(128) makes 128"
+        expected = f"unit vectors [direction, 3]; {remedy}"
+        vectors = check.numbers("directions", directions, expected=expected, dtype=np.float64)
+        check.shape("directions", vectors.shape, ("direction", 3), remedy)
+        if not len(vectors) or not np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-3):
             raise ValueError(f"directions: got others than {expected}")
-        directions.setflags(write=False)
-        object.__setattr__(self, "directions", directions)
+        vectors.setflags(write=False)
+        object.__setattr__(self, "directions", vectors)
 
     @property
     def size(self) -> int:
@@ -83,7 +83,7 @@ def check_basis(basis: object) -> None:
         order = basis if check.is_integer(basis) and basis in sh.ORDERS else 5
         raise ValueError(
             f"basis: got {check.described(basis)}, expected HarmonicBasis({order}) for {order} bands of spherical "
-            "harmonics, CellBasis(warpshadow.maths.directions.fibonacci(128)) for cells of 128 directions, or None for "
+            "harmonics, CellBasis(warpshadow.fibonacci(128)) for cells of 128 directions, or None for "
             "what the method computes in"
         )
 
@@ -93,7 +93,7 @@ def describe_coefficients(basis: Basis, count: int) -> str:
     what = f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
     order = int(round(np.sqrt(count)))
     others = [f"HarmonicBasis({order})"] if order in sh.ORDERS and order**2 == count else []
-    others += [f"CellBasis(warpshadow.maths.directions.fibonacci({count}))"] if count and not count % CHUNK else []
+    others += [f"CellBasis(warpshadow.fibonacci({count}))"] if count and not count % CHUNK else []
     remedy = f"; for {count} make the renderer with basis={' or '.join(others)}" if others else ""
     return f"coefficients in renderer.basis, {what}{remedy}"
 

@@ -14,10 +14,10 @@ Conventions (OpenCV, with pixel centers at +0.5):
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 
@@ -28,7 +28,7 @@ _ROTATION_TOLERANCE = 1e-4
 _NARROW = 1.6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Camera:
     """A pinhole camera (conventions: see the module).
 
@@ -46,14 +46,25 @@ class Camera:
     translation: np.ndarray
     width: int
     height: int
-    near: float = 0.01
+    near: float
 
-    def __post_init__(self) -> None:
-        for name, shape in (("intrinsics", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
-            object.__setattr__(self, name, check.array(name, getattr(self, name), shape))
-        for name in ("width", "height"):
-            object.__setattr__(self, name, check.whole(name, getattr(self, name), what="pixels"))
-        object.__setattr__(self, "near", check.positive("near", self.near))
+    def __init__(
+        self,
+        intrinsics: npt.ArrayLike,
+        rotation: npt.ArrayLike,
+        translation: npt.ArrayLike,
+        width: int,
+        height: int,
+        near: float = 0.01,
+    ):
+        vars(self).update(
+            intrinsics=check.array("intrinsics", intrinsics, (3, 3)),
+            rotation=check.array("rotation", rotation, (3, 3)),
+            translation=check.array("translation", translation, (3,)),
+            width=check.whole("width", width, what="pixels"),
+            height=check.whole("height", height, what="pixels"),
+            near=check.positive("near", near),
+        )
         if not np.array_equal(self.intrinsics[2], (0.0, 0.0, 1.0)):
             raise ValueError(f"intrinsics: got last row {self.intrinsics[2].tolist()}, expected [0, 0, 1]")
         focal = self.intrinsics[:2, :2]
@@ -64,10 +75,10 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        eye: Sequence[float],
-        target: Sequence[float],
+        eye: npt.ArrayLike,
+        target: npt.ArrayLike,
         *,
-        up: Sequence[float] = (0.0, 1.0, 0.0),
+        up: npt.ArrayLike = (0.0, 1.0, 0.0),
         fov_y: float = 40.0,
         size: tuple[int, int] = (256, 256),
         near: float = 0.01,
@@ -104,8 +115,8 @@ class Camera:
     @classmethod
     def from_opengl(
         cls,
-        view: np.ndarray,
-        projection: np.ndarray | None = None,
+        view: npt.ArrayLike,
+        projection: npt.ArrayLike | None = None,
         *,
         fov_y: float | None = None,
         size: tuple[int, int] = (256, 256),

@@ -10,11 +10,11 @@ in a right-handed world with y up (Mitsuba's convention): the center of the map 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.cells import CellLight, gather_cells
@@ -27,7 +27,7 @@ from warpshadow.maths import sh
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class EnvironmentMap:
     """Light from infinitely far away, as an equirectangular map, validated; the array is a read-only copy.
 
@@ -40,21 +40,20 @@ class EnvironmentMap:
 
     radiance: np.ndarray = field(repr=False)
 
-    def __post_init__(self) -> None:
-        """Copy, convert and validate the pixels."""
+    def __init__(self, radiance: npt.ArrayLike):
         expected = "an array [height, 2·height, 3]; EnvironmentMap.read(path) reads a file"
-        radiance = check.pixels("radiance", self.radiance, expected=expected, error=ImageError)
-        _check_aspect(radiance)
-        bad = _bad_values(radiance)
+        pixels = check.pixels("radiance", radiance, expected=expected, error=ImageError)
+        _check_aspect(pixels)
+        bad = _bad_values(pixels)
         if bad.any():
             row, col, channel = np.argwhere(bad)[0]
             raise ImageError(
                 f"radiance: got {bad.sum()} NaN, Inf or negative values or such beyond {check.LARGEST:g} (first at row "
-                f"{row}, column {col}, channel {channel}: {radiance[row, col, channel]}), expected finite values of 0 "
+                f"{row}, column {col}, channel {channel}: {pixels[row, col, channel]}), expected finite values of 0 "
                 "or more; sanitize='zero' or 'neighbors' repairs them on reading"
             )
-        radiance.setflags(write=False)
-        object.__setattr__(self, "radiance", radiance)
+        pixels.setflags(write=False)
+        object.__setattr__(self, "radiance", pixels)
 
     @classmethod
     def read(
@@ -92,7 +91,7 @@ class EnvironmentMap:
             raise ImageError(f"{path}: {error}") from error
 
     @classmethod
-    def constant(cls, rgb: float | Sequence[float] = 1.0, height: int = 16) -> EnvironmentMap:
+    def constant(cls, rgb: npt.ArrayLike = 1.0, height: int = 16) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB."""
         check.whole("height", height, what="rows")
         return cls(np.broadcast_to(_color("rgb", rgb), (height, 2 * height, 3)))
@@ -123,7 +122,7 @@ class EnvironmentMap:
             rolled = (1 - fraction) * rolled + fraction * np.roll(rolled, 1, axis=1)
         return EnvironmentMap(rolled)
 
-    def scaled(self, factor: float | Sequence[float]) -> EnvironmentMap:
+    def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
         return EnvironmentMap(self.radiance * _color("factor", factor))
 
@@ -211,7 +210,7 @@ def _check_aspect(pixels: np.ndarray) -> None:
         )
 
 
-def _color(name: str, values: float | Sequence[float]) -> np.ndarray:
+def _color(name: str, values: npt.ArrayLike) -> np.ndarray:
     """One number, or one for each of R, G, B; not negative."""
     expected = "one number, or one for each of R, G, B"
     color = check.numbers(name, values, expected=expected, error=ImageError)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
@@ -25,7 +26,7 @@ class MeshError(ValueError):
     """A mesh, or a mesh file, that cannot be used; the message says what is wrong and where."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A triangle mesh on the host, validated; its arrays are read-only copies.
 
@@ -42,26 +43,33 @@ class Mesh:
 
     positions: np.ndarray = field(repr=False)
     faces: np.ndarray = field(repr=False)
-    uvs: np.ndarray | None = field(default=None, repr=False)
-    uv_faces: np.ndarray | None = field(default=None, repr=False)
-    name: str = "mesh"
+    uvs: np.ndarray | None = field(repr=False)
+    uv_faces: np.ndarray | None = field(repr=False)
+    name: str
 
-    def __post_init__(self) -> None:
-        """Copy, convert and validate the arrays."""
-        self._set("positions", _coordinates("positions", self.positions, 3, "vertex"))
-        self._set("faces", _indices("faces", self.faces, len(self.positions), "vertex"))
-        if self.uvs is not None and self.uv_faces is not None:
-            self._set("uvs", _coordinates("uvs", self.uvs, 2, "uv"))
-            self._set("uv_faces", _indices("uv_faces", self.uv_faces, len(self.uvs), "uv"))
-            if len(self.uv_faces) != self.face_count:
-                raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
-        elif self.uvs is not self.uv_faces:
-            missing = "uvs" if self.uvs is None else "uv_faces"
+    def __init__(
+        self,
+        positions: npt.ArrayLike,
+        faces: npt.ArrayLike,
+        uvs: npt.ArrayLike | None = None,
+        uv_faces: npt.ArrayLike | None = None,
+        name: str = "mesh",
+    ):
+        if (uvs is None) != (uv_faces is None):
+            missing = "uvs" if uvs is None else "uv_faces"
             raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
-
-    def _set(self, name: str, array: np.ndarray) -> None:
-        array.setflags(write=False)
-        object.__setattr__(self, name, array)
+        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None}
+        held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
+        held["faces"] = _indices("faces", faces, len(vertices), "vertex")
+        if uvs is not None and uv_faces is not None:
+            held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
+            held["uv_faces"] = _indices("uv_faces", uv_faces, len(corners), "uv")
+        for array in held.values():
+            if array is not None:
+                array.setflags(write=False)
+        vars(self).update(held, name=name)
+        if self.uv_faces is not None and len(self.uv_faces) != self.face_count:
+            raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
 
     @property
     def vertex_count(self) -> int:
@@ -95,9 +103,9 @@ class Mesh:
     def transformed(
         self,
         *,
-        rotation: np.ndarray | None = None,
-        translation: np.ndarray | None = None,
-        scale: float | np.ndarray = 1.0,
+        rotation: npt.ArrayLike | None = None,
+        translation: npt.ArrayLike | None = None,
+        scale: npt.ArrayLike = 1.0,
     ) -> Mesh:
         """Scale, then rotate, then translate; a transform that mirrors also turns the faces over.
 
@@ -133,10 +141,10 @@ class Mesh:
             unfinished.write_text("\n".join(lines) + "\n")
 
 
-def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.ndarray:
+def _coordinates(name: str, given: npt.ArrayLike, width: int, item: str) -> np.ndarray:
     """Copy to float32 [item, width]; MeshError when empty, of another shape, not finite or too large."""
     expected = f"an array [{item}, {width}]; load_mesh(path) reads a file"
-    values = check.numbers(name, values, expected=expected, error=MeshError)
+    values = check.numbers(name, given, expected=expected, error=MeshError)
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
         raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
     bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
@@ -148,10 +156,10 @@ def _coordinates(name: str, values: np.ndarray, width: int, item: str) -> np.nda
     return values
 
 
-def _indices(name: str, faces: np.ndarray, count: int, item: str) -> np.ndarray:
+def _indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarray:
     """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
-    check.numbers(name, faces, expected="integers [face, 3]", error=MeshError)
-    faces = np.asarray(faces)
+    check.numbers(name, given, expected="integers [face, 3]", error=MeshError)
+    faces = np.asarray(given)
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
         polygons = "; triangulate other polygons" if faces.ndim == 2 and faces.shape[1] > 3 else ""
         raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face{polygons}")

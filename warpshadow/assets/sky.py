@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.color import LUMINANCE, srgb_to_linear
@@ -44,7 +45,7 @@ def draw_test_map(height: int = 256) -> EnvironmentMap:
 
 
 def synthetic_sky(
-    sun_direction: Sequence[float] = (0.5, 0.7, 0.2),
+    sun_direction: npt.ArrayLike = (0.5, 0.7, 0.2),
     *,
     sun_strength: float = 3.0,
     sun_radius: float = 1.5,

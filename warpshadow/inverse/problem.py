@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,8 +23,10 @@ from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
 from warpshadow.tuning.tune import resolved
 
+_SQUARES, _RAYS = Loss(), Visibility("ray-traced")
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, init=False)
 class Problem:
     """What a fit solves.
 
@@ -40,10 +42,18 @@ class Problem:
     scene: Scene
     targets: Sequence[Target]
     free: Sequence[Free]
-    loss: Loss = field(default_factory=Loss)
-    still: Visibility | None = field(default_factory=lambda: Visibility(method="ray-traced"))
+    loss: Loss
+    still: Visibility | None
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        targets: Target | Sequence[Target],
+        free: Free | Sequence[Free],
+        loss: Loss = _SQUARES,
+        still: Visibility | None = _RAYS,
+    ):
+        vars(self).update(scene=scene, targets=targets, free=free, loss=loss, still=still)
         check.instance("scene", self.scene, Scene, SCENE)
         check.instance("loss", self.loss, Loss, "a Loss, such as Loss('huber')")
         rays = "a Visibility, such as Visibility('ray-traced'), or None for the scene's"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from warpshadow import check
@@ -18,7 +19,7 @@ from warpshadow.check import AnyPath
 _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Target:
     """An image that a fit explains.
 
@@ -33,11 +34,13 @@ class Target:
     """
 
     image: np.ndarray = field(repr=False)
-    mask: np.ndarray | None = field(default=None, repr=False)
-    camera: Camera | None = None
+    mask: np.ndarray | None = field(repr=False)
+    camera: Camera | None
 
-    def __post_init__(self) -> None:
-        """Read files, validate, and hold arrays as float32."""
+    def __init__(
+        self, image: npt.ArrayLike | AnyPath, mask: npt.ArrayLike | AnyPath | None = None, camera: Camera | None = None
+    ):
+        vars(self).update(image=image, mask=mask, camera=camera)
         for name, read in (("image", read_target), ("mask", read_mask)):
             if check.is_path(getattr(self, name)):
                 path = check.file(name, getattr(self, name))

@@ -122,9 +122,7 @@ def _random_bodies(rng: np.random.Generator, prototypes: Sequence[Body]) -> list
     ring = 0.0 if count == 1 else rng.uniform(1.0, 1.3) * widest / np.sin(np.pi / count)
     angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count
     places = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
-    return [
-        replace(body, translation=tuple(body.translation + place)) for body, place in zip(bodies, places, strict=True)
-    ]
+    return [replace(body, translation=body.translation + place) for body, place in zip(bodies, places, strict=True)]
 
 
 def _random_body(rng: np.random.Generator, prototypes: Sequence[Body]) -> Body:
@@ -135,13 +133,13 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body]) -> Body:
     body = replace(
         prototype,
         albedo=rng.uniform(0.15, 0.9, 3),
-        rotation=tuple(rng.uniform(0, 360) * axis),
-        translation=(0.0, 0.0, 0.0),
+        rotation=rng.uniform(0, 360) * axis,
+        translation=np.zeros(3),
         scale=rng.uniform(0.8, 1.4) / (high - low).max(),
     )
     low, high = body.world_mesh().bounds
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    return replace(body, translation=tuple(-foot))
+    return replace(body, translation=-foot)
 
 
 def _footprint(body: Body) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
@@ -13,6 +14,7 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, edge_width
 from warpshadow.spheres import Spheres
@@ -122,7 +124,7 @@ class Visibility:
         return Visibility.of(vars(self) | {"method": method})
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
 
@@ -145,17 +147,29 @@ class Body:
     """
 
     mesh: Mesh
-    albedo: np.ndarray | tuple[float, float, float] = (0.8, 0.8, 0.8)
-    texture: np.ndarray | None = field(default=None, repr=False)
-    blockers: int | Spheres = 64
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: float = 1.0
-    receivers: str = "vertex"
-    name: str | None = None
+    albedo: np.ndarray
+    texture: np.ndarray | None = field(repr=False)
+    blockers: int | Spheres
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float
+    receivers: str
+    name: str | None
 
-    def __post_init__(self) -> None:
-        """Read files, validate, and hold arrays as float32."""
+    def __init__(
+        self,
+        mesh: Mesh | AnyPath,
+        albedo: npt.ArrayLike | AnyPath = (0.8, 0.8, 0.8),
+        texture: npt.ArrayLike | AnyPath | None = None,
+        blockers: int | Spheres | AnyPath = 64,
+        rotation: npt.ArrayLike = (0.0, 0.0, 0.0),
+        translation: npt.ArrayLike = (0.0, 0.0, 0.0),
+        scale: float = 1.0,
+        receivers: str = "vertex",
+        name: str | None = None,
+    ):
+        vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
+        vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
         self._read_files()
         expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
@@ -221,7 +235,7 @@ class Body:
         if self.mesh.uvs is None:
             raise ValueError(
                 f"texture: got an image, but mesh {self.mesh.name!r} has no uvs; expected none, or uvs, as "
-                "warpshadow.assets.unwrap.unwrap makes them"
+                "warpshadow.unwrap makes them"
             )
         texture = check.pixels("texture", image, expected="linear RGB [height, width, 3], or the path of a picture")
         check.shape("texture", texture.shape, ("height", "width", 3), check.channels_last(texture.shape))
@@ -246,6 +260,9 @@ class Body:
         )
 
 
+_DIRECTIONAL = Visibility()
+
+
 def _read_colors(path: Path) -> np.ndarray:
     try:
         return np.load(path, allow_pickle=False)
@@ -259,7 +276,7 @@ def _check_reflectance(name: str, values: np.ndarray) -> None:
     if (values < 0).any() or (values > 1).any():
         raise ValueError(
             f"{name}: got values from {values.min()} to {values.max()}, expected reflectances in [0, 1], linear: those "
-            "of sRGB colors from 0 to 255 are warpshadow.assets.color.srgb_to_linear(colors / 255)"
+            "of sRGB colors from 0 to 255 are warpshadow.srgb_to_linear(colors / 255)"
         )
     values.setflags(write=False)
 
@@ -270,7 +287,7 @@ def check_supersampling(count: object) -> None:
         raise ValueError(f"supersampling: got {check.described(count)}, expected a whole number from 1 to 16")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Scene:
     """What is rendered.
 
@@ -285,12 +302,20 @@ class Scene:
     bodies: tuple[Body, ...]
     light: EnvironmentMap | np.ndarray
     camera: Camera
-    visibility: Visibility = field(default_factory=Visibility)
+    visibility: Visibility
     supersampling: int = 2
 
-    def __post_init__(self) -> None:
-        check.instance("bodies", self.bodies, Iterable, "a list of one or more: [Body(mesh)]")
-        object.__setattr__(self, "bodies", tuple(self.bodies))
+    def __init__(
+        self,
+        bodies: Iterable[Body],
+        light: EnvironmentMap | npt.ArrayLike | AnyPath,
+        camera: Camera,
+        visibility: Visibility = _DIRECTIONAL,
+        supersampling: int = supersampling,
+    ):
+        check.instance("bodies", bodies, Iterable, "a list of one or more: [Body(mesh)]")
+        vars(self).update(bodies=tuple(bodies), light=light, camera=camera)
+        vars(self).update(visibility=visibility, supersampling=supersampling)
         if not self.bodies:
             raise ValueError("bodies: got none, expected one or more")
         for number, body in enumerate(self.bodies):

@@ -7,13 +7,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.check import AnyPath
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Spheres:
     """Spheres on the host, validated; the arrays are read-only copies.
 
@@ -25,10 +26,10 @@ class Spheres:
     centers: np.ndarray = field(repr=False)
     radii: np.ndarray = field(repr=False)
 
-    def __post_init__(self) -> None:
-        """Copy, convert and validate the arrays."""
-        for name, shape in (("centers", ("sphere", 3)), ("radii", ("sphere",))):
-            values = check.numbers(name, getattr(self, name), expected=f"an array [{', '.join(map(str, shape))}]")
+    def __init__(self, centers: npt.ArrayLike, radii: npt.ArrayLike):
+        shapes: tuple[tuple[int | str, ...], ...] = ("sphere", 3), ("sphere",)
+        for name, given, shape in zip(("centers", "radii"), (centers, radii), shapes, strict=True):
+            values = check.numbers(name, given, expected=f"an array [{', '.join(map(str, shape))}]")
             check.shape(name, values.shape, shape)
             check.finite(name, values)
             values.flags.writeable = False
@@ -68,8 +69,8 @@ class Spheres:
     def transformed(
         self,
         *,
-        rotation: np.ndarray | None = None,
-        translation: Iterable[float] = (0, 0, 0),
+        rotation: npt.ArrayLike | None = None,
+        translation: npt.ArrayLike = (0, 0, 0),
         scale: float = 1.0,
     ) -> Spheres:
         """Apply a similarity x → scale · R x + t.

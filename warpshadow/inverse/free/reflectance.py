@@ -92,8 +92,7 @@ class Texture(FreeOfBody):
         body = scene.bodies[self.number]
         if body.mesh.uvs is None:
             raise ValueError(
-                f"body: got {self.number}, whose mesh has no uvs; expected uvs, as "
-                "warpshadow.assets.unwrap.unwrap makes them"
+                f"body: got {self.number}, whose mesh has no uvs; expected uvs, as warpshadow.unwrap makes them"
             )
         if body.texture is None and np.ndim(body.albedo) > 1:
             raise ValueError(f"body: got {self.number}, which has a color for each vertex; expected one color")

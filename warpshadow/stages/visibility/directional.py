@@ -474,7 +474,7 @@ def transmittance(
             is zero, may be left at 1. None computes it all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
-        directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.maths.directions.fibonacci`.
+        directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness: κ, half-width of the soft edge in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
