@@ -9,8 +9,8 @@ import torch
 import twins
 import warp as wp
 
-import warpshadow.stages.rasterize
 from warpshadow.device.warp_internals import item_shape
+from warpshadow.stages import rasterize
 
 # Of every entry of a Jacobian. What differs is due to the differences, rounding of 1e-16/1e-6 and third derivatives:
 # measured is a relative L2 of 5e-11 (shading) to 7e-9 (held squarings).
@@ -73,9 +73,7 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device):
     """Depths are sorted by the bits of float32, and so they are here."""
     clip_positions = random(0, 1, 60, 4).astype(np.float32) + np.float32([0, 0, 1, 2])
     faces = put(np.arange(60).reshape(20, 3), wp.vec3i, device)
-    expected = warpshadow.stages.rasterize.rasterize(
-        put(clip_positions, wp.vec4, device), faces, 40, 30
-    ).face_ids.numpy()
+    expected = rasterize(put(clip_positions, wp.vec4, device), faces, 40, 30).face_ids.numpy()
     got = double("stages.rasterize").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
     assert len(np.unique(expected)) > 10
     np.testing.assert_array_equal(got, expected)

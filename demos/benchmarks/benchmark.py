@@ -29,18 +29,20 @@ import warpshadow as ws
 from demos.benchmarks.lane_choice import cpu_text
 from demos.scenes import bunny_scene
 from warpshadow import inverse
-from warpshadow.assets.basis import CellBasis, HarmonicBasis
-from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.renderer import Renderer
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import interpolate, rasterize
-from warpshadow.stages.shading import shade
-from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
-from warpshadow.stages.visibility import directional, log_sh
-from warpshadow.stages.visibility.exponential import exponentiate
+from warpshadow.stages import (
+    accumulate,
+    directional_transfer,
+    exponentiate,
+    find_silhouettes,
+    interpolate,
+    rasterize,
+    sh_transfer,
+    shade,
+    smooth_silhouettes,
+    to_clip,
+    transmittance,
+    vertex_normals,
+)
 from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import median_times, whole_image
 
@@ -48,25 +50,25 @@ from warpshadow.tuning.timing import median_times, whole_image
 def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     """The size of the scene in words, and functions that run its stages once, by what they do."""
     scene = bunny_scene()
-    renderer = Renderer(scene, device=device, progress=True)
+    renderer = ws.Renderer(scene, device=device, progress=True)
     positions, centers, radii = renderer.geometry().arrays().values()
     order = renderer.assembly.vertex_order  # in which renderers light them; all, also those that no sample sees
     normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device=device) for a in (positions.numpy()[:, order], normals))
-    cells = CellBasis(fibonacci(128))
+    cells = ws.CellBasis(ws.fibonacci(128))
     cell_light = wp.array(cells.coefficients(scene.light)[None], dtype=wp.vec3, device=device)
-    sh_light = wp.array(HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
+    sh_light = wp.array(ws.HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     clip_matrices = wp.array(scene.camera.clip_matrix()[None], dtype=wp.mat44, device=device)
     faces = renderer.assembly.faces
 
     def shade_directional() -> wp.array:
-        seen = directional.transmittance(points, normals, centers, radii, cells.directions)
+        seen = transmittance(points, normals, centers, radii, cells.directions)
         return shade(directional_transfer(seen, normals, cells.directions), cell_light)
 
     colors = shade_directional()
 
     def shade_log_sh() -> None:
-        log = log_sh.accumulate(points, normals, centers, radii, order=8)
+        log = accumulate(points, normals, centers, radii, order=8)
         shade(sh_transfer(exponentiate(log), normals, order=8), sh_light)
 
     variables = [wp.clone(array, requires_grad=True) for array in (points, normals, centers, radii)]
@@ -74,14 +76,14 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
 
     def shade_directional_and_back() -> None:
         with wp.Tape() as tape:
-            seen = directional.transmittance(*variables, cells.directions)
+            seen = transmittance(*variables, cells.directions)
             shaded = shade(directional_transfer(seen, variables[1], cells.directions), free_cells)
         shaded.grad.fill_(1.0)
         tape.backward()
 
     def shade_log_sh_and_back() -> None:
         with wp.Tape() as tape:
-            seen = exponentiate(log_sh.accumulate(*variables, order=8))
+            seen = exponentiate(accumulate(*variables, order=8))
             shaded = shade(sh_transfer(seen, variables[1], order=8), free_sh)
         shaded.grad.fill_(1.0)
         tape.backward()
@@ -91,7 +93,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         interpolate(rasterize(clip, faces, scene.camera.width, scene.camera.height), faces, colors)
 
     def from_scratch() -> None:
-        Renderer(scene, device=device).render()
+        ws.Renderer(scene, device=device).render()
 
     torch_renderer = TorchRenderer(scene, device=device)
     rotations, translations, scales = torch_renderer.scene_poses()
@@ -210,7 +212,7 @@ def time_busy(runs: int) -> None:
     ws.quiet()
     scene = bunny_scene()
     scene = dataclasses.replace(scene, camera=scene.camera.resized(0.5), supersampling=2)
-    renderer = TorchRenderer(scene, basis=HarmonicBasis(5))
+    renderer = TorchRenderer(scene, basis=ws.HarmonicBasis(5))
     light = torch.full((25, 3), 0.1, requires_grad=True)
     ground = torch.full((256, 256, 3), 0.5, requires_grad=True)
     with torch.no_grad():

@@ -35,12 +35,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.spheres import exact_occlusion
-from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.ray_tracing import trace_visibility
-from warpshadow.stages.shading import shade
-from warpshadow.stages.transfer import sh_transfer
-from warpshadow.stages.visibility import log_sh
-from warpshadow.stages.visibility.exponential import exponentiate
+from warpshadow.stages import accumulate, exponentiate, sample_map, sh_transfer, shade, trace_visibility
 from warpshadow.stages.visibility.merging import MERGED_FROM
 from warpshadow.tuning.point_sample import PointReceivers, PointSample
 from warpshadow.tuning.timing import median_times, whole_image
@@ -414,7 +409,7 @@ class Rays:
     def by_converged_log_sh(self, receivers: PointReceivers) -> np.ndarray:
         """Shading of points [point, 3] by log-SH of order 8 whose exponential has converged."""
         points, normals = self._arrays(receivers)
-        log = log_sh.accumulate(points, normals, self.geometry.centers, self.geometry.radii, order=8)
+        log = accumulate(points, normals, self.geometry.centers, self.geometry.radii, order=8)
         transfer = sh_transfer(exponentiate(log, threshold=CONVERGED), normals, order=8)
         return shade(transfer, wp.array(self.scene.light.sh(8)[None], dtype=wp.vec3)).numpy()[0]
 

@@ -24,11 +24,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene
 from warpshadow.device import lanes
-from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.renderer import Renderer
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.visibility import directional, log_sh
-from warpshadow.stages.visibility.exponential import exponentiate
+from warpshadow.stages import accumulate, exponentiate, transmittance, vertex_normals
 
 SLACK = 1.15
 """Times the best choice's time that the chosen one may take."""
@@ -56,16 +52,16 @@ def time_stages(runs: int = RUNS) -> dict[str, float]:
     """Processor time of each stage, forward and backward, at the lanes that the environment says [ms]."""
     ws.quiet()
     ws.set_thread_count(1)
-    renderer = Renderer(bunny_scene(), device="cpu")
+    renderer = ws.Renderer(bunny_scene(), device="cpu")
     positions, centers, radii = renderer.geometry().arrays().values()
     order = renderer.assembly.vertex_order
     normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (positions.numpy()[:, order], normals))
     scene = points, normals, centers, radii
-    log = log_sh.accumulate(*scene, order=8)
+    log = accumulate(*scene, order=8)
     stages: dict[str, tuple[Callable[..., wp.array], Sequence[wp.array]]] = {
-        "directional": (lambda *variables: directional.transmittance(*variables, fibonacci(128)), scene),
-        "log-SH": (lambda *variables: log_sh.accumulate(*variables, order=8), scene),
+        "directional": (lambda *variables: transmittance(*variables, ws.fibonacci(128)), scene),
+        "log-SH": (lambda *variables: accumulate(*variables, order=8), scene),
         "exponentiation": (exponentiate, [log]),
     }
     best = dict.fromkeys(stages, float("inf"))

@@ -37,9 +37,7 @@ import warp as wp
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene, on_ground, shipped_mesh
-from warpshadow.maths.directions import fibonacci
-from warpshadow.spheres import fit_spheres
-from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages import vertex_normals
 from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import median_times
 
@@ -52,7 +50,7 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 def ball(subdivisions: int, sphere_count: int, **place) -> ws.Body:
     """A ball of radius 1 that is filled by spheres of 0.35."""
-    spheres = ws.Spheres(0.65 * fibonacci(sphere_count), np.full(sphere_count, 0.35))
+    spheres = ws.Spheres(0.65 * ws.fibonacci(sphere_count), np.full(sphere_count, 0.35))
     return ws.Body(ws.icosphere(1.0, subdivisions), blockers=spheres, **place)
 
 
@@ -75,7 +73,7 @@ def crowded_scene(across: int) -> ws.Scene:
 
 def bunny_spheres(count: int) -> ws.Spheres:
     """Spheres that cover the bunny, unrefined: refining 1024 of them would take an hour."""
-    return fit_spheres(shipped_mesh("bunny"), count, refine=False).spheres
+    return ws.fit_spheres(shipped_mesh("bunny"), count, refine=False).spheres
 
 
 def bunny_with(spheres: ws.Spheres, size: int = 256) -> ws.Scene:

@@ -22,14 +22,19 @@ sys.path.append(str(Path(__file__).parents[2] / "tests"))
 import twins
 
 import warpshadow as ws
-from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.rasterize import interpolate, rasterize
-from warpshadow.stages.rotations import rotation_matrices
-from warpshadow.stages.shading import shade
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
-from warpshadow.stages.visibility import directional, exponential, log_sh
+from warpshadow.stages import (
+    Poses,
+    accumulate,
+    directional_transfer,
+    interpolate,
+    rasterize,
+    rotation_matrices,
+    sh_transfer,
+    shade,
+    transmittance,
+    vertex_normals,
+)
+from warpshadow.stages.visibility import exponential
 
 STEP = 1e-7
 """Of central differences, in sizes of the case: small, since curvature jumps where a receiver meets a sphere."""
@@ -125,7 +130,7 @@ def log_sh_stage(order: int, log: str, base: str = "quadratic") -> Stage:
     threshold = exponential.THRESHOLDS[base].default
 
     def run(points: wp.array, normals: wp.array | None, centers: wp.array, radii: wp.array) -> wp.array:
-        logs = log_sh.accumulate(points, normals, centers, radii, order=order, log=log)
+        logs = accumulate(points, normals, centers, radii, order=order, log=log)
         return exponential.exponentiate(logs, base=base)
 
     def twin(*scene: np.ndarray) -> np.ndarray:
@@ -136,10 +141,10 @@ def log_sh_stage(order: int, log: str, base: str = "quadratic") -> Stage:
 
 def directional_stage(count: int) -> Stage:
     """Transmittance of points, normals, centers and radii."""
-    directions = fibonacci(count)
+    directions = ws.fibonacci(count)
 
     def run(points: wp.array, normals: wp.array | None, centers: wp.array, radii: wp.array) -> wp.array:
-        return directional.transmittance(points, None, centers, radii, directions)
+        return transmittance(points, None, centers, radii, directions)
 
     def twin(points: np.ndarray, normals: np.ndarray, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         return twins.transmittance(points, centers, radii, directions)
@@ -171,7 +176,7 @@ def scene_displacements(scene: Arrays) -> Displacements:
 
 def lit_stage(order: int, light: ws.EnvironmentMap) -> Stage:
     """Shading of points, normals, centers and radii by light in spherical harmonics, or in cells where order is 0."""
-    directions = fibonacci(128)
+    directions = ws.fibonacci(128)
     coefficients = (light.sh(order) if order else light.cells(directions).radiance).astype(float)
     visibility = VISIBILITY[f"log-SH eigen {order}" if order else "directional 128"]
 
@@ -248,7 +253,7 @@ def descend(method: str, learning_rate: float, steps: int, device: str = "cpu") 
     Raises:
         ValueError: naming the first array that is out of range or not finite.
     """
-    directions, light = fibonacci(64), ws.synthetic_sky(height=32)
+    directions, light = ws.fibonacci(64), ws.synthetic_sky(height=32)
     ball = ws.icosphere(0.5, 2)
     _, _, centers, radii = twins.hard_scenes()["ordinary"]
 
@@ -273,10 +278,10 @@ def descend(method: str, learning_rate: float, steps: int, device: str = "cpu") 
             points, moved, sizes = poses.points(rest[0], whole), poses.points(rest[1], own), poses.radii(rest[2], own)
             normals = vertex_normals(points, faces)
             if method == "directional":
-                seen = directional.transmittance(points, normals, moved, sizes, directions)
+                seen = transmittance(points, normals, moved, sizes, directions)
                 transfer = directional_transfer(seen, normals, directions)
             else:
-                logs = log_sh.accumulate(points, normals, moved, sizes, order=4, log=method)
+                logs = accumulate(points, normals, moved, sizes, order=4, log=method)
                 transfer = sh_transfer(exponential.exponentiate(logs), normals, order=4)
             shading = shade(transfer, coefficients)
             wp.launch(_sum_squares, dim=shading.shape, inputs=[shading, 0.5], outputs=[loss], device=device)
@@ -303,7 +308,7 @@ def ambient(visibility: np.ndarray, normals: np.ndarray) -> np.ndarray:
     order = int(np.sqrt(visibility.shape[1]))
     if order**2 == visibility.shape[1]:
         return np.sum(visibility * twins.cosine_lobes(order, normals), axis=1)
-    return twins.directional_transfer(visibility, normals, fibonacci(visibility.shape[1])).sum(axis=1)
+    return twins.directional_transfer(visibility, normals, ws.fibonacci(visibility.shape[1])).sum(axis=1)
 
 
 def exact_ambient(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -389,7 +394,7 @@ def print_breakdown(overlap: dict[str, list[float]], thresholds: dict[str, list[
         rate = np.median(np.array(offset_errors(offsets, label)) / (offsets * np.finfo(np.float32).eps))
         print(f"  offset, {label}: an error of {rate:.2g} · 1.2e-7 · offset / radius")
     sun = hard_lights()["a sun of one pixel"]
-    radiance = twins.harmonics(8, fibonacci(4096)) @ sun.sh(8)[:, 0]
+    radiance = twins.harmonics(8, ws.fibonacci(4096)) @ sun.sh(8)[:, 0]
     print(f"  a sun in SH of order 8: as low as {radiance.min() / radiance.max():.0%} of its peak elsewhere")
 
 

@@ -20,7 +20,6 @@ from PIL import Image, ImageDraw, ImageFont
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import image_error, on_ground, shipped_mesh
-from warpshadow.assets.color import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 METHODS = {
@@ -118,7 +117,7 @@ def contact_sheet(rows: list[list[tuple[np.ndarray, str]]], margin: int = 44) ->
         white = np.percentile(truth[truth[..., 3] > 0, :3], 99.5)
         for left, (image, caption) in enumerate(row):
             color = np.clip(image[..., :3] / white, 0, 1) + (1 - image[..., 3:])
-            picture = Image.fromarray((255 * linear_to_srgb(np.minimum(color, 1)) + 0.5).astype(np.uint8))
+            picture = Image.fromarray((255 * ws.linear_to_srgb(np.minimum(color, 1)) + 0.5).astype(np.uint8))
             corner = (left * width, top * (height + margin))
             sheet.paste(picture, corner)
             draw.multiline_text((corner[0] + 6, corner[1] + height + 4), caption, fill="black", font=font)

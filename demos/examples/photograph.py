@@ -33,18 +33,15 @@ from demos.examples.bunny import checkers, contact_sheet
 from demos.problems import DIRECT, changed, displaced, placement, pose_errors, ray_traced
 from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow import inverse
-from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
-from warpshadow.inverse.fit_file import load_fit
 from warpshadow.inverse.world import Found
 from warpshadow.maths.sh import equirectangular_directions
-from warpshadow.scene.files import write_scene
 
 FOCAL_LENGTH, SENSOR_HEIGHT = 24.0, 15.6  # mm: as EXIF and the camera's data sheet have them
 SIZE = 256  # pixels across and down
 EXPOSURE = 0.32  # of the photograph, which the fits have to find
 CARD = 0.18  # reflectance of a gray card
 SUN, OTHER_SUN = (0.8, 0.65, -0.1), (-0.5, 0.6, 0.6)
-SATURATED = srgb_to_linear(np.float64(250 / 255))  # what a JPEG makes of white is not always 255
+SATURATED = ws.srgb_to_linear(np.float64(250 / 255))  # what a JPEG makes of white is not always 255
 BUNNY, GROUND = 0, 1
 PLAIN = ws.EnvironmentMap.constant(1.0)
 
@@ -129,7 +126,7 @@ class PhotoCamera:
         """Write an 8-bit JPEG of what falls on the sensor, linear RGB [height, width, 3], of which 1 is white."""
         blurred = ndimage.gaussian_filter(light.astype(np.float64), (self.blur, self.blur, 0))
         electrons = rng.poisson(self.full_well * blurred) + rng.normal(0, self.read_noise, blurred.shape)
-        encoded = linear_to_srgb(np.clip(electrons / self.full_well, 0, 1))
+        encoded = ws.linear_to_srgb(np.clip(electrons / self.full_well, 0, 1))
         Image.fromarray(np.round(255 * encoded).astype(np.uint8)).save(path, quality=self.quality)
 
 
@@ -179,7 +176,7 @@ def first_guess(truth: ws.Scene, seed: int) -> ws.Scene:
 
 def write_recipe(folder: Path, scene: ws.Scene, image: str) -> None:
     """Write scene.toml, pose.toml and reflectance.toml for an image and its mask in the folder above."""
-    write_scene(scene, folder)
+    ws.write_scene(scene, folder)
     method = "none" if scene.visibility.method == "none" else "ray-traced"
     (folder / "pose.toml").write_text(POSE.format(image=image))
     (folder / "reflectance.toml").write_text(REFLECTANCE.format(image=image, method=method))
@@ -188,7 +185,7 @@ def write_recipe(folder: Path, scene: ws.Scene, image: str) -> None:
 def follow_recipe(folder: Path) -> inverse.Result:
     """Do what ``warpshadow fit`` does, twice."""
     for step in ("pose", "reflectance"):
-        result = load_fit(folder / f"{step}.toml").run(progress=True)
+        result = inverse.load_fit(folder / f"{step}.toml").run(progress=True)
         inverse.write_result(result, folder / step)
     return result
 

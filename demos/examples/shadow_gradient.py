@@ -20,7 +20,6 @@ import torch
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.assets.color import linear_to_srgb
 from warpshadow.torch import TorchRenderer
 
 PARAMETERS = ("x", "z", "scale")
@@ -134,7 +133,7 @@ def plot(image: np.ndarray, got: np.ndarray, expected: np.ndarray, path: Path) -
     from matplotlib import pyplot
 
     figure, row = pyplot.subplots(1, 4, figsize=(16, 4), layout="constrained")
-    row[0].imshow(linear_to_srgb(np.minimum(image[..., :3] / image[..., :3].max(), 1)))
+    row[0].imshow(ws.linear_to_srgb(np.minimum(image[..., :3] / image[..., :3].max(), 1)))
     limit = np.abs(expected).max()
     panels = {"by the adjoint": got, "by differences": expected, "their difference × 10": 10 * (got - expected)}
     for axes, values in zip(row[1:], panels.values(), strict=True):

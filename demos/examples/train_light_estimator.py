@@ -37,7 +37,6 @@ from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow.inverse import checkpoint
 from warpshadow.maths import sh
 from warpshadow.scene.random_scenes import RandomScenes, primitives
-from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import TorchRenderer
 
 ORDER = 4
@@ -404,8 +403,8 @@ def fit_blockers(bodies: Sequence[ws.Body], team: Team) -> None:
     """Fit the spheres of bodies once, in the first process; the others find them in the cache."""
     if team.is_first:
         for body in bodies:
-            if not isinstance(body.blockers, Spheres):
-                fit_spheres(body.mesh, body.blockers, device=str(team.device))
+            if not isinstance(body.blockers, ws.Spheres):
+                ws.fit_spheres(body.mesh, body.blockers, device=str(team.device))
     team.wait()
 
 

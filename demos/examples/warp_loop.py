@@ -23,10 +23,8 @@ import warp.optim
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import on_ground, shipped_mesh
-from warpshadow.assets.color import linear_to_srgb
 from warpshadow.device.batch import concatenate
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.rotations import rotation_matrices
+from warpshadow.stages import Poses, rotation_matrices
 
 TURN = np.radians([0.0, 15.0, 0.0])
 SHIFT = np.array([0.16, 0.0, 0.12])
@@ -158,7 +156,7 @@ def plot(images: dict[str, wp.array], path: Path) -> None:
     for axes, (label, image) in zip(row, images.items(), strict=True):
         pixels = image.numpy()[0]
         color = np.minimum(pixels[..., :3] / white + (1 - pixels[..., 3:]), 1)
-        axes.imshow(linear_to_srgb(color))
+        axes.imshow(ws.linear_to_srgb(color))
         axes.set_title(label)
         axes.axis("off")
     figure.savefig(path, dpi=120)

@@ -11,7 +11,8 @@ import warp as wp
 import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
-from warpshadow.stages import rasterize, transfer
+from warpshadow.stages import transfer
+from warpshadow.stages.rasterize import _interpolation, _interpolation_adjoint
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -52,8 +53,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (
-            rasterize._interpolation,
-            rasterize._interpolation_adjoint,
+            _interpolation,
+            _interpolation_adjoint,
             batch._make_add,
             smooth._blend_kernel,
             smooth._blend_adjoint_kernel,

@@ -26,8 +26,8 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene
-from warpshadow.maths.directions import edge_width, fibonacci
-from warpshadow.stages.normals import vertex_normals
+from warpshadow.maths.directions import edge_width
+from warpshadow.stages import vertex_normals
 
 OPERATIONS_PER_SECOND = 67e12
 BYTES_PER_SECOND = 4.8e12
@@ -191,7 +191,7 @@ def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     geometry = renderer.geometry()
     normals = vertex_normals(geometry.positions, renderer.assembly.faces)
     arrays = [geometry.positions, normals, geometry.centers, geometry.radii]
-    directions = fibonacci(scene.visibility.directions)
+    directions = ws.fibonacci(scene.visibility.directions)
     width = edge_width(scene.visibility.softness, len(directions))
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)
     vertex_count, sphere_count = arrays[0].shape[1], arrays[3].shape[1]

@@ -1,5 +1,7 @@
 """Rasterization: a brute-force float64 twin, exactness of coverage, hostile triangles, and gradients."""
 
+import sys
+
 import numpy as np
 import pytest
 import warp as wp
@@ -8,7 +10,6 @@ from hypothesis import strategies as st
 from twins import central_differences
 
 from warpshadow.assets.camera import Camera
-from warpshadow.stages import rasterize as raster
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import Fragments, barycentrics, interpolate, rasterize
 
@@ -368,7 +369,7 @@ def test_each_instance_of_a_batch_equals_its_own_image(device):
 def test_dealing_the_rows_of_a_face_to_several_threads_gives_the_same_image(device, monkeypatch):
     clip, faces = random_triangles(np.random.default_rng(15), 30)
     expected, _ = draw(clip, faces, 40, 31, device)
-    monkeypatch.setattr(raster, "_strip_count", lambda device: 7)
+    monkeypatch.setattr(sys.modules[rasterize.__module__], "_strip_count", lambda device: 7)
     face_ids, _ = draw(clip, faces, 40, 31, device)
     np.testing.assert_array_equal(face_ids, expected)
 

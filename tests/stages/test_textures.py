@@ -7,9 +7,8 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import read_image, write_image
 from warpshadow.assets.primitives import plane
-from warpshadow.stages import rasterize
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterize import Fragments, barycentrics, interpolate, rasterize
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
 from warpshadow.stages.textures.sample import expose_albedo, fill_unseen, sample_albedo, seen_texels
@@ -139,7 +138,7 @@ class Bodies:
         positions = wp.array(self.positions[None], dtype=wp.vec3, device=device)
         self.clip_positions = to_clip(positions, matrices).numpy()
         clip = wp.array(self.clip_positions, dtype=wp.vec4, device=device)
-        self.face_ids = rasterize.rasterize(clip, self.topology(self.faces), *self.size).face_ids
+        self.face_ids = rasterize(clip, self.topology(self.faces), *self.size).face_ids
         random = np.random.default_rng(0)
         self.images = [random.uniform(size=shape).astype(np.float32) for shape in ((2, 27, 41, 3), (1, 16, 5, 3))]
         self.vertex_albedo = random.uniform(size=(2, len(self.positions), 3)).astype(np.float32)
@@ -161,7 +160,7 @@ class Bodies:
 
     def albedo(self, clip_positions, uvs, vertex_albedo, *images):
         faces = self.topology(self.faces)
-        fragments = Fragments(self.face_ids, rasterize.barycentrics(self.face_ids, faces, clip_positions))
+        fragments = Fragments(self.face_ids, barycentrics(self.face_ids, faces, clip_positions))
         return surface_albedo(
             fragments,
             faces,
@@ -229,7 +228,7 @@ def facing(device, texels_a_sample, *, size=24, tilt=0.0, mesh=None):
     faces = wp.array(mesh.faces, dtype=wp.vec3i, device=device)
     uvs = 1.5 * (mesh.uvs - 0.5) * texels_a_sample * size / 64
     return (
-        rasterize.rasterize(clip, faces, size, size),
+        rasterize(clip, faces, size, size),
         faces,
         wp.zeros((1, len(mesh.positions)), dtype=wp.vec3, device=device),
         clip,
@@ -364,7 +363,7 @@ def test_footprints_of_the_scene_are_of_all_kinds(device):
     bodies = Bodies(device)
     clip, uvs, _, *images = bodies.variables()
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, rasterize.barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
     found = find_footprints(
         fragments,
         faces,
@@ -404,7 +403,7 @@ def test_a_plane_seen_from_near_is_bilinear(device, tilt):
     arguments = facing(device, 0.3, tilt=tilt)
     fragments, _, _, _, uvs, uv_faces, _ = arguments
     got = surface_albedo(*arguments, mip_pyramids([wp.array(image[None], dtype=wp.vec3, device=device)])).numpy()
-    u, v = np.moveaxis(rasterize.interpolate(fragments, uv_faces, uvs).numpy().astype(np.float64), -1, 0)
+    u, v = np.moveaxis(interpolate(fragments, uv_faces, uvs).numpy().astype(np.float64), -1, 0)
     expected = np.where(fragments.face_ids.numpy()[..., None] >= 0, bilinear(image.astype(np.float64), u, v), 0)
     assert np.abs(got - expected).max() < SAMPLE
 
@@ -447,7 +446,7 @@ def test_a_grazing_ground_neither_blurs_nor_aliases(device):
     pyramids = mip_pyramids([wp.array(image[None], dtype=wp.vec3, device=device)])
     got = surface_albedo(*arguments, pyramids).numpy()[0]
     fine_covered, (fragments, _, _, _, uvs, uv_faces, _) = seen(size * fine)
-    u, v = np.moveaxis(rasterize.interpolate(fragments, uv_faces, uvs).numpy()[0], -1, 0)
+    u, v = np.moveaxis(interpolate(fragments, uv_faces, uvs).numpy()[0], -1, 0)
     points = bilinear(image, u, v)
     expected = points.reshape(size, fine, size, fine, 3).mean(axis=(1, 3))
     whole = covered & fine_covered.reshape(size, fine, size, fine).all(axis=(1, 3))
@@ -495,7 +494,7 @@ def test_a_batch_of_1_serves_every_instance(device, batched):
     random = np.random.default_rng(0)
     face_ids = bodies.face_ids.numpy()[:1]
     values = {
-        "fragments": rasterize.barycentrics(bodies.face_ids, faces, bodies.variables()[0]).numpy()[:1],
+        "fragments": barycentrics(bodies.face_ids, faces, bodies.variables()[0]).numpy()[:1],
         "clip_positions": bodies.clip_positions[:1],
         "uvs": bodies.uvs[None],
         "vertex_albedo": bodies.vertex_albedo[:1],
@@ -578,7 +577,7 @@ def test_samples_exposed_at_once_are_albedo_times_what_they_receive_both_ways(de
     clip, uvs, *reflecting = bodies.variables(requires_grad=True)
     clip.requires_grad = uvs.requires_grad = False
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, rasterize.barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
     texture_of_face = bodies.put(bodies.texture_of_face, wp.int32)
     uv_faces = bodies.topology(bodies.uv_faces)
     white = random.uniform(size=(lights, height, width, 4)).astype(np.float32)
@@ -621,11 +620,11 @@ def test_a_round_footprint_has_a_gradient(device):
     faces = wp.array([[0, 1, 2], [0, 2, 3]], dtype=wp.vec3i, device=device)
     variables = [wp.array(clip, dtype=wp.vec4, device=device, requires_grad=True)]
     image = np.random.default_rng(0).uniform(size=(1, 32, 32, 3))
-    face_ids = rasterize.rasterize(variables[0], faces, 16, 16).face_ids
+    face_ids = rasterize(variables[0], faces, 16, 16).face_ids
 
     def albedo(clip_positions):
         return surface_albedo(
-            Fragments(face_ids, rasterize.barycentrics(face_ids, faces, clip_positions)),
+            Fragments(face_ids, barycentrics(face_ids, faces, clip_positions)),
             faces,
             wp.zeros((1, 4), dtype=wp.vec3, device=device),
             clip_positions,
@@ -761,7 +760,7 @@ def test_weights_of_texels_are_the_gradient_of_the_images_sum(device):
     clip, uvs, vertex_albedo, *images = bodies.variables()
     images = [bodies.put(image, wp.vec3, requires_grad=True) for image in bodies.images]
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, rasterize.barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
     pyramids = mip_pyramids(images)
     uv_faces = bodies.topology(bodies.uv_faces)
     texture_of_face = bodies.put(bodies.texture_of_face, wp.int32)

@@ -6,6 +6,7 @@ to a :class:`Result`, whose scene can be rendered, relit and written. Needs torc
 
 from warpshadow.inverse.checkpoint import CheckpointError
 from warpshadow.inverse.descent import FitWarning, Result, fit, short_adam
+from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
@@ -24,6 +25,8 @@ __all__ = [
     "CheckpointError",
     "Deformation",
     "Exposure",
+    "Fit",
+    "FitFileError",
     "FitWarning",
     "Free",
     "Light",
@@ -37,6 +40,7 @@ __all__ = [
     "Texture",
     "deformation_stages",
     "fit",
+    "load_fit",
     "pose_stages",
     "short_adam",
     "write_result",

@@ -12,28 +12,17 @@ import torch
 
 from warpshadow import check
 from warpshadow.check import AnyPath
-from warpshadow.inverse import (
-    Albedo,
-    CameraPose,
-    Deformation,
-    Exposure,
-    Free,
-    Light,
-    Loss,
-    Pose,
-    Problem,
-    Radii,
-    Result,
-    Stage,
-    Target,
-    Texture,
-    deformation_stages,
-    fit,
-    pose_stages,
-    short_adam,
-)
-from warpshadow.inverse.schedule import check_stages
-from warpshadow.inverse.target import read_target
+from warpshadow.inverse.descent import Result, fit, short_adam
+from warpshadow.inverse.free.base import Free
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.free.reflectance import Albedo, Texture
+from warpshadow.inverse.free.shape import Deformation, Radii
+from warpshadow.inverse.free.views import CameraPose, Exposure
+from warpshadow.inverse.loss import Loss
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.schedule import Stage, check_stages, deformation_stages, pose_stages
+from warpshadow.inverse.target import Target, read_target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
 from warpshadow.scene.scene import Scene, Visibility
