@@ -12,7 +12,9 @@ from warpshadow.device import warp_internals
 
 ROOT = Path(__file__).resolve().parents[2]
 
-INTERNAL = re.compile(r"(?<![\w.])(wp|warp)\._[a-z]\w*|\b_(wp_scalar_type|shape)_\b|\bfwd_args\b|\buser_modules\b|\._ref\b")
+INTERNAL = re.compile(
+    r"(?<![\w.])(wp|warp)\._[a-z]\w*|\b_(wp_scalar_type|shape)_\b|\bfwd_args\b|\buser_modules\b|\._ref\b"
+)
 """Names of Warp's that are not public, of those that have been used."""
 
 
