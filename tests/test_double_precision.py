@@ -287,8 +287,8 @@ def test_interpolation(double, device, check, clip):
     assert len(np.unique(face_ids.numpy())) == 3  # two sides and the background
 
     def draw(clip_positions, attributes):
-        weights = double("stages.rasterize").barycentrics(face_ids, faces, clip_positions)
-        return double("stages.rasterize").interpolate(
+        weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
+        return double("stages.interpolate").interpolate(
             double("stages.rasterize").Fragments(face_ids, weights), faces, attributes
         )
 
@@ -336,7 +336,7 @@ def test_exposure(double, device, check, clip):
     face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 
     def expose(clip_positions, shading, albedo):
-        weights = double("stages.rasterize").barycentrics(face_ids, faces, clip_positions)
+        weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
         return double("stages.film").average(
             double("stages.film").expose(
                 double("stages.rasterize").Fragments(face_ids, weights), faces, shading, albedo
@@ -393,8 +393,7 @@ def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, mo
     Surfaces pull by the faces at the points of samples, of which images are made: mean slopes are no derivatives.
     """
     expose = double("stages.film").expose
-    monkeypatch.setattr(double("stages.film"), "expose", lambda *arguments, **_: expose(*arguments))
-    monkeypatch.setattr(double("pipeline.view"), "pull_surfaces", lambda *arguments: None)
+    monkeypatch.setattr(double("pipeline.view"), "expose_moving", lambda *inputs: (expose(*inputs[:4]), None))
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
     camera = renderer.scene.camera
     towards, offset, intrinsics = variables(renderer, camera.rotation, camera.translation, camera.intrinsics)

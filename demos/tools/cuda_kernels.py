@@ -12,7 +12,7 @@ import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.stages import transfer
-from warpshadow.stages.rasterize import _interpolation, _interpolation_adjoint
+from warpshadow.stages.interpolate import _make_interpolate, _make_interpolate_adjoint
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -53,11 +53,11 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (
-            _interpolation,
-            _interpolation_adjoint,
+            _make_interpolate,
+            _make_interpolate_adjoint,
             batch._make_add,
-            smooth._blend_kernel,
-            smooth._blend_adjoint_kernel,
+            smooth._make_blend,
+            smooth._make_blend_adjoint,
         )
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },

@@ -15,7 +15,8 @@ from warpshadow.device import parallel
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.rasterize import interpolate, rasterize
+from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.rasterize import rasterize
 from warpshadow.stages.shading import shade
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, log_sh

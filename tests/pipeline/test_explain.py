@@ -454,8 +454,8 @@ VISIBILITY = "visibility"
 SHADOWS = ("static shadows", VISIBILITY)
 
 
-def stage_of(kernel: wp.Kernel) -> str | None:
-    """The stage that a kernel belongs to; None for copies, and for poses, which come before."""
+def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
+    """The stage that a kernel with some inputs belongs to; None for copies, and for poses, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
     if module in ("device.batch", "stages.poses"):
         return None
@@ -463,22 +463,25 @@ def stage_of(kernel: wp.Kernel) -> str | None:
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
         after = {
-            "_find_edge_colors": "contrasts",
+            "_find_edge_colors": "exposure",
             "blend": "smoothing",
             "_measure_adjoint": "smoothing",
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
-        parts = {"footprints": "footprints", "_expose": "exposure", "_sample": "reflectance"}
-        return next((name for part, name in parts.items() if part in key), "mip pyramids")
-    if module == "stages.rasterize":
-        return "reflectance" if "interpol" in key else "rasterization"
+        if "_sample" in key:  # given the samples of white surfaces, it exposes them
+            return "exposure" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
+        return "footprints" if "footprints" in key else "mip pyramids"
+    if module == "stages.interpolate":
+        return "reflectance"
+    if module in ("stages.rasterize", "stages.barycentrics"):
+        return "rasterization"
     if module in ("stages.transfer", "stages.kept_cells"):
         return "shading" if "_light_cells" in key else "transfer"
     if module == "stages.film":
         return "averaging" if "average" in key else "exposure"
     same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
-    return {"stages.project": "clip positions", "stages.slopes": "contrasts", **same}[module]
+    return {"stages.project": "clip positions", "stages.slopes": "exposure", **same}[module]
 
 
 class Launches:
@@ -489,7 +492,7 @@ class Launches:
         launch = wp.launch
 
         def counted(kernel, *arguments, **options):
-            self.counts[stage_of(kernel)] += 1
+            self.counts[stage_of(kernel, options["inputs"])] += 1
             return launch(kernel, *arguments, **options)
 
         monkeypatch.setattr(wp, "launch", counted)
@@ -638,10 +641,10 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
     lines = str(explain()).splitlines()
-    assert [line.split()[0] for line in (lines[0], lines[18])] == ["forward", "backward"]
-    (rasterization,) = (line for line in lines[:18] if "rasterization" in line)
+    assert [line.split()[0] for line in (lines[0], lines[17])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:17] if "rasterization" in line)
     assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
-    (exposure,) = (line for line in lines[18:] if "exposure" in line)
+    (exposure,) = (line for line in lines[17:] if "exposure" in line)
     assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
     assert "2,304 samples" in exposure
 

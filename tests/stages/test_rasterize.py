@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from twins import central_differences
 
 from warpshadow.assets.camera import Camera
+from warpshadow.stages.barycentrics import find_barycentrics
+from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import Fragments, barycentrics, interpolate, rasterize
+from warpshadow.stages.rasterize import Fragments, rasterize
 
 # Vertices snap to 1/4096 pixel, so coverage may differ from the twin's within this distance of an edge
 # [pixels].
@@ -369,7 +371,7 @@ def test_each_instance_of_a_batch_equals_its_own_image(device):
 def test_dealing_the_rows_of_a_face_to_several_threads_gives_the_same_image(device, monkeypatch):
     clip, faces = random_triangles(np.random.default_rng(15), 30)
     expected, _ = draw(clip, faces, 40, 31, device)
-    monkeypatch.setattr(sys.modules[rasterize.__module__], "_strip_count", lambda device: 7)
+    monkeypatch.setattr(sys.modules[rasterize.__module__], "strip_count", lambda device: 7)
     face_ids, _ = draw(clip, faces, 40, 31, device)
     np.testing.assert_array_equal(face_ids, expected)
 
@@ -491,13 +493,13 @@ def test_barycentrics_refuse_positions_of_another_batch(device):
     clip, faces = on_device(*random_triangles(np.random.default_rng(22), 3), device)
     face_ids = wp.zeros((2, 4, 4), dtype=wp.int32, device=device)
     with pytest.raises(ValueError, match="^clip_positions: got shape"):
-        barycentrics(face_ids, faces, clip)
+        find_barycentrics(face_ids, faces, clip)
 
 
 def test_barycentrics_of_kept_face_ids_equal_those_of_rasterize(device):
     clip, faces = on_device(*random_triangles(np.random.default_rng(21), 20), device)
     fragments = rasterize(clip, faces, 20, 20)
-    again = barycentrics(fragments.face_ids, faces, clip)
+    again = find_barycentrics(fragments.face_ids, faces, clip)
     np.testing.assert_array_equal(again.numpy(), fragments.barycentrics.numpy())
 
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 import warpshadow as ws
 from warpshadow.assets.topology import edge_neighbors
+from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import interpolate, rasterize
+from warpshadow.stages.rasterize import rasterize
 from warpshadow.stages.silhouettes import find
 from warpshadow.stages.silhouettes.find import find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
@@ -77,7 +78,7 @@ def lines(found):
     """What lies between pixels: {(pixel, side 0 or 2): the two numbers of the edge}."""
     width = found.fragments.face_ids.shape[2]
     between = {}
-    for pixel, sides in zip(found.silhouettes.pixels.numpy(), found.silhouettes.edges.numpy().tolist(), strict=True):
+    for pixel, sides in zip(found.silhouettes.samples.numpy(), found.silhouettes.edges.numpy().tolist(), strict=True):
         for side, edge in enumerate(sides):
             if pixel >= 0 and edge[0] != -1:
                 first = pixel - (0, 1, 0, width)[side]
@@ -145,7 +146,7 @@ def twin(image, found, clip, at_rest):
         area = 0.5 - t if t <= (1 - m) / 2 else max((1 + m) / 2 - t, 0) ** 2 / (2 * m)
         return area, 1 / (1 + lean**4)
 
-    for pixel, edges in zip(found.silhouettes.pixels.numpy(), found.silhouettes.edges.numpy(), strict=True):
+    for pixel, edges in zip(found.silhouettes.samples.numpy(), found.silhouettes.edges.numpy(), strict=True):
         if pixel >= 0:
             others = pixel + np.array([1, -1, width, -width])
             shares = [
@@ -374,7 +375,7 @@ def test_surfaces_intersect_where_they_are_told_apart(device):
 
 def test_each_pixel_has_one_entry(device):
     positions, faces, bodies = through_plane(ws.icosphere(0.8, 2))
-    pixels = setup(positions, faces, device, surfaces=bodies).silhouettes.pixels.numpy()
+    pixels = setup(positions, faces, device, surfaces=bodies).silhouettes.samples.numpy()
     pixels = pixels[pixels >= 0]
     assert len(np.unique(pixels)) == len(pixels)
 
@@ -386,20 +387,20 @@ def test_without_reading_the_count_back_the_result_is_the_same(device, monkeypat
     monkeypatch.setattr(wp.Device, "is_capturing", True)
     found = setup(mesh.positions, mesh.faces, device)
     monkeypatch.undo()
-    assert found.silhouettes.pixels.size == expected.size
+    assert found.silhouettes.samples.size == expected.size
     np.testing.assert_array_equal(coverage(found), expected)
 
 
 def test_several_threads_that_follow_an_edge_find_the_same(device, monkeypatch):
     mesh = ws.icosphere(1.0, 1)
     expected = lines(setup(mesh.positions, mesh.faces, device))
-    monkeypatch.setattr(find, "_strip_count", lambda device: 7)
+    monkeypatch.setattr(find, "strip_count", lambda device: 7)
     assert lines(setup(mesh.positions, mesh.faces, device)) == expected
 
 
 def test_nothing_seen_has_no_silhouettes(device):
     found = setup(triangle() + [0, 0, 10], [[0, 1, 2]], device)
-    assert found.silhouettes.pixels.size == 0
+    assert found.silhouettes.samples.size == 0
     assert (coverage(found) == 0).all()
 
 
@@ -759,5 +760,5 @@ def test_arrays_that_do_not_belong_together_are_refused(small, device):
         find_silhouettes(small.fragments, faces, neighbors[:3], small.clip)
     with pytest.raises(ValueError, match="^clip_positions: got shape"):
         find_silhouettes(small.fragments, faces, neighbors, wp.zeros((2, 8), dtype=wp.vec4, device=device))
-    with pytest.raises(ValueError, match="^surfaces: got shape"):
+    with pytest.raises(ValueError, match="^bodies: got shape"):
         find_silhouettes(small.fragments, faces, neighbors, small.clip, wp.zeros(3, dtype=int, device=device))

@@ -10,9 +10,9 @@ from warpshadow.assets.topology import edge_neighbors
 from warpshadow.stages.film import expose
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.silhouettes.smooth import find_edge_colors
-from warpshadow.stages.slopes import LEAST_DISTANCE, pull_surfaces
+from warpshadow.stages.slopes import LEAST_DISTANCE, expose_moving
 
 # float32 kernels against float64; measured 2e-6.
 FLOAT32 = 2e-5
@@ -39,21 +39,23 @@ class Drawn:
         self.shading, self.albedo = (wp.array(np.float32(a), dtype=wp.vec3, device=device) for a in (colors, albedo))
         self.seeds = np.float32(rng.normal(size=(lights, *size, 4)))
 
-    def samples(self, **options):
-        return expose(self.fragments, self.faces, self.shading, self.albedo, **options)
+    @property
+    def receivers(self):
+        return wp.array(np.arange(self.clip.shape[1]), dtype=wp.int32, device=self.device)
+
+    def samples(self):
+        return expose(self.fragments, self.faces, self.shading, self.albedo)
 
     def edge_colors(self, samples):
-        receivers = wp.array(np.arange(self.clip.shape[1]), dtype=wp.int32, device=self.device)
-        return find_edge_colors(samples, self.silhouettes, self.clip, self.shading, receivers, self.albedo)
+        return find_edge_colors(samples, self.silhouettes, self.clip, self.shading, self.receivers, self.albedo)
 
     def pulls(self, seeds):
         """Gradient to the clip positions by mean slopes."""
         with wp.Tape() as tape:
-            samples = self.samples(at_points=False)
-            colors = self.edge_colors(samples)
-            pull_surfaces(
-                samples, self.fragments, self.faces, self.shading, self.albedo, self.silhouettes, colors, self.clip
-            )
+            seen = self.fragments, self.faces, self.shading, self.albedo
+            samples, edge_colors = expose_moving(*seen, self.silhouettes, self.clip, self.receivers)
+        np.testing.assert_array_equal(samples.numpy(), self.samples().numpy())
+        np.testing.assert_array_equal(edge_colors.numpy(), self.edge_colors(samples).numpy())
         return self._played(tape, samples, seeds)
 
     def pulls_of_faces(self, seeds):
@@ -172,7 +174,7 @@ def test_colors_at_edges_are_those_of_both_surfaces_there(device):
     depths = np.einsum("pk,pk->p", weights, drawn.clip.numpy()[0, drawn.faces.numpy()[seen], 3])
     steps = np.array([1, -1, CAMERA.width, -CAMERA.width])
     count = 0
-    for pixel, sides, found in zip(silhouettes.pixels.numpy(), silhouettes.edges.numpy(), edge_colors, strict=True):
+    for pixel, sides, found in zip(silhouettes.samples.numpy(), silhouettes.edges.numpy(), edge_colors, strict=True):
         for side in np.flatnonzero(sides[:, 0] >= 0) if pixel >= 0 else ():
             other = pixel + steps[side]
             count += seen[pixel] < 2 <= seen[other] and depths[other] < depths[pixel]

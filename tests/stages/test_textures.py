@@ -7,11 +7,14 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import read_image, write_image
 from warpshadow.assets.primitives import plane
+from warpshadow.stages.barycentrics import find_barycentrics
+from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import Fragments, barycentrics, interpolate, rasterize
+from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
-from warpshadow.stages.textures.sample import expose_albedo, fill_unseen, sample_albedo, seen_texels
+from warpshadow.stages.textures.sample import expose_albedo, sample_albedo
+from warpshadow.stages.textures.seen import fill_unseen, seen_texels
 
 MEAN = 5e-7  # float32 means of texels in [0, 1]
 SAMPLE = 1e-5  # uvs of up to 2 carry 1e-7, times 64 texels, and the width of a footprint 1e-6 of it
@@ -160,7 +163,7 @@ class Bodies:
 
     def albedo(self, clip_positions, uvs, vertex_albedo, *images):
         faces = self.topology(self.faces)
-        fragments = Fragments(self.face_ids, barycentrics(self.face_ids, faces, clip_positions))
+        fragments = Fragments(self.face_ids, find_barycentrics(self.face_ids, faces, clip_positions))
         return surface_albedo(
             fragments,
             faces,
@@ -363,7 +366,7 @@ def test_footprints_of_the_scene_are_of_all_kinds(device):
     bodies = Bodies(device)
     clip, uvs, _, *images = bodies.variables()
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, find_barycentrics(bodies.face_ids, faces, clip))
     found = find_footprints(
         fragments,
         faces,
@@ -494,7 +497,7 @@ def test_a_batch_of_1_serves_every_instance(device, batched):
     random = np.random.default_rng(0)
     face_ids = bodies.face_ids.numpy()[:1]
     values = {
-        "fragments": barycentrics(bodies.face_ids, faces, bodies.variables()[0]).numpy()[:1],
+        "fragments": find_barycentrics(bodies.face_ids, faces, bodies.variables()[0]).numpy()[:1],
         "clip_positions": bodies.clip_positions[:1],
         "uvs": bodies.uvs[None],
         "vertex_albedo": bodies.vertex_albedo[:1],
@@ -577,7 +580,7 @@ def test_samples_exposed_at_once_are_albedo_times_what_they_receive_both_ways(de
     clip, uvs, *reflecting = bodies.variables(requires_grad=True)
     clip.requires_grad = uvs.requires_grad = False
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, find_barycentrics(bodies.face_ids, faces, clip))
     texture_of_face = bodies.put(bodies.texture_of_face, wp.int32)
     uv_faces = bodies.topology(bodies.uv_faces)
     white = random.uniform(size=(lights, height, width, 4)).astype(np.float32)
@@ -624,7 +627,7 @@ def test_a_round_footprint_has_a_gradient(device):
 
     def albedo(clip_positions):
         return surface_albedo(
-            Fragments(face_ids, barycentrics(face_ids, faces, clip_positions)),
+            Fragments(face_ids, find_barycentrics(face_ids, faces, clip_positions)),
             faces,
             wp.zeros((1, 4), dtype=wp.vec3, device=device),
             clip_positions,
@@ -760,7 +763,7 @@ def test_weights_of_texels_are_the_gradient_of_the_images_sum(device):
     clip, uvs, vertex_albedo, *images = bodies.variables()
     images = [bodies.put(image, wp.vec3, requires_grad=True) for image in bodies.images]
     faces = bodies.topology(bodies.faces)
-    fragments = Fragments(bodies.face_ids, barycentrics(bodies.face_ids, faces, clip))
+    fragments = Fragments(bodies.face_ids, find_barycentrics(bodies.face_ids, faces, clip))
     pyramids = mip_pyramids(images)
     uv_faces = bodies.topology(bodies.uv_faces)
     texture_of_face = bodies.put(bodies.texture_of_face, wp.int32)

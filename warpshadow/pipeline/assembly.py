@@ -123,8 +123,8 @@ class Assembly:
         return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex))
 
     @functools.cached_property
-    def surfaces(self) -> wp.array | None:
-        """Body that each face belongs to, int32 of shape [face]; None where there is one."""
+    def face_bodies(self) -> wp.array | None:
+        """Number of the body that each face belongs to, int32 of shape [face]; None where there is one."""
         return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
 
     @functools.cached_property

@@ -17,6 +17,7 @@ from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.ray_tracing import trace_cells
+from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
 
@@ -79,7 +80,7 @@ class Directional(SphereMethod):
 
     def _trace(self, is_scenes: bool, static: Static, vertices: np.ndarray, normals: wp.array) -> wp.array:
         points, facing = static.gathered(vertices, normals)
-        numbers = wp.array(vertices % len(static.has_vertex), dtype=wp.int32, device=points.device)
+        numbers = wp.array(split_sides(vertices, len(static.has_vertex))[0], dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scenes else self._even_samples
         return trace_cells(static.mesh, points[0], facing[0], numbers, samples, progress=self.progress)
 

@@ -12,10 +12,11 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
-from warpshadow.stages.rasterize import interpolate
+from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
-from warpshadow.stages.textures.sample import sample_albedo, seen_texels
+from warpshadow.stages.textures.sample import sample_albedo
+from warpshadow.stages.textures.seen import seen_texels
 
 Given = Sequence[wp.array | None] | None
 """For each body an array or None for what the scene has; None for all of that."""

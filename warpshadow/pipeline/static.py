@@ -22,6 +22,7 @@ from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sides import split_sides
 
 
 class Static:
@@ -104,10 +105,10 @@ class Static:
 
     def gathered(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
         """The same anew each time."""
-        count = len(self.has_vertex)
-        outward = np.where(vertices < count, 1, -1).astype(np.float32)[:, None]
+        vertices, is_back = split_sides(vertices, len(self.has_vertex))
+        outward = np.where(is_back, -1, 1).astype(np.float32)[:, None]
         return tuple(
-            wp.array(array.numpy()[:, vertices % count] * sign, dtype=wp.vec3, device=array.device)
+            wp.array(array.numpy()[:, vertices] * sign, dtype=wp.vec3, device=array.device)
             for array, sign in ((self._geometry.positions, np.float32(1)), (normals, outward))
         )
 

@@ -20,8 +20,8 @@ from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
-from warpshadow.stages.silhouettes.smooth import find_edge_colors, smooth_silhouettes
-from warpshadow.stages.slopes import pull_surfaces
+from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
+from warpshadow.stages.slopes import expose_moving
 from warpshadow.stages.textures.sample import expose_albedo
 
 
@@ -82,7 +82,7 @@ class View(LitPoints):
             sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
         else:
             sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
-        around = assembly.edges, clip, assembly.surfaces
+        around = assembly.edges, clip, assembly.face_bodies
         silhouettes = Node("silhouettes", find_silhouettes, sides, faces, *around, items=samples, has_adjoint=False)
         if static is None:
             normals = Node("normals", vertex_normals, vertices, faces, items=corners)
@@ -124,15 +124,12 @@ class View(LitPoints):
             white = self._exposed_white(lit)
             faces = self.assembly.faces
             samples = samples_of("exposure", expose_albedo, fragments, faces, *reflecting, white, beside=found)
+        elif clip.requires_grad:
+            samples = samples_of("exposure", _expose_moving, receivers, lit, reflected.samples, self.silhouettes, clip)
         else:
-            expose = functools.partial(_expose, at_points=not clip.requires_grad)
-            samples = samples_of("exposure", expose, receivers, lit, reflected.samples)
-        if clip.requires_grad:
-            seen = self.silhouettes, clip, lit, receivers, reflected.samples
-            edge_colors = samples_of("contrasts", _find_contrasts, samples, *seen)
-        else:
-            edge_colors = Node("contrasts", _nothing, idle="no gradient moves silhouettes")
-        smoothed = samples_of("smoothing", smooth_silhouettes, samples, self.silhouettes, clip, edge_colors)
+            samples = samples_of("exposure", _expose, receivers, lit, reflected.samples)
+        smooth = _smooth_moving if clip.requires_grad else smooth_silhouettes
+        smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, clip)
         if self._across == 1:
             return Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
         return samples_of("averaging", film.average, smoothed, self._across)
@@ -200,30 +197,24 @@ def _same(value: object) -> object:
     return value
 
 
-def _nothing() -> None:
-    return None
+def _expose(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:
+    return film.expose(receivers.fragments, receivers.faces, lit, reflected)
 
 
-def _expose(receivers: Receivers, lit: wp.array, reflected: wp.array, *, at_points: bool) -> wp.array:
-    return film.expose(receivers.fragments, receivers.faces, lit, reflected, at_points=at_points)
+def _expose_moving(
+    receivers: Receivers, lit: wp.array, reflected: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
+) -> tuple[wp.array, wp.array]:
+    """Samples, and the colors at edges."""
+    seen = receivers.fragments, receivers.faces, lit, reflected
+    return expose_moving(*seen, silhouettes, clip_positions, receivers.of_vertices)
+
+
+def _smooth_moving(exposed: tuple[wp.array, wp.array], silhouettes: Silhouettes, clip_positions: wp.array) -> wp.array:
+    samples, edge_colors = exposed
+    return smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
 
 
 def _expose_white(receivers: Receivers, lit: wp.array) -> wp.array:
     _, height, width = receivers.fragments.face_ids.shape
     white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=lit.device)
     return film.expose(receivers.fragments, receivers.faces, lit, white)
-
-
-def _find_contrasts(
-    samples: wp.array,
-    silhouettes: Silhouettes,
-    clip_positions: wp.array,
-    lit: wp.array,
-    receivers: Receivers,
-    reflected: wp.array,
-) -> wp.array:
-    """Colors at edges, by which silhouettes pull; and surfaces pull by the slope of the light that they receive."""
-    edge_colors = find_edge_colors(samples, silhouettes, clip_positions, lit, receivers.of_vertices, reflected)
-    seen = receivers.fragments, receivers.faces, lit, reflected
-    pull_surfaces(samples, *seen, silhouettes, edge_colors, clip_positions)
-    return edge_colors

@@ -3,25 +3,29 @@
 A module here is a stage, or what stages share; README.md lists them in their order.
 """
 
+from warpshadow.stages.barycentrics import find_barycentrics
 from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.film import average, expose, light_at
+from warpshadow.stages.film import average, expose
+from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.light_samples import LightSamples, even_samples, sample_map
 from warpshadow.stages.nearest_rotation import nearest_rotations
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices, to_clip
-from warpshadow.stages.rasterize import Fragments, interpolate, rasterize
+from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.ray_tracing import trace_shading, trace_transfer, trace_visibility
 from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.rotations import rotation_matrices
 from warpshadow.stages.shading import shade
 from warpshadow.stages.sides import find_sides
+from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
-from warpshadow.stages.silhouettes.smooth import find_edge_colors, smooth_silhouettes
-from warpshadow.stages.slopes import pull_surfaces
+from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
+from warpshadow.stages.slopes import expose_moving
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import Textures, mip_pyramids
-from warpshadow.stages.textures.sample import expose_albedo, fill_unseen, sample_albedo, seen_texels
+from warpshadow.stages.textures.sample import expose_albedo, sample_albedo
+from warpshadow.stages.textures.seen import fill_unseen, seen_texels
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.exponential import exponentiate
@@ -45,18 +49,18 @@ __all__ = [
     "exponentiate",
     "expose",
     "expose_albedo",
+    "expose_moving",
     "fill_unseen",
+    "find_barycentrics",
     "find_edge_colors",
     "find_footprints",
     "find_receivers",
     "find_sides",
     "find_silhouettes",
     "interpolate",
-    "light_at",
     "mip_pyramids",
     "nearest_rotations",
     "number_receivers",
-    "pull_surfaces",
     "rasterize",
     "rotation_matrices",
     "sample_albedo",

@@ -6,19 +6,11 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import run_length, split_row
+from warpshadow.stages.interpolate import add_to_corners, adj_weights, at_point
 from warpshadow.stages.rasterize import Fragments
 
-_SAMPLE_COST = 5.0
+_COST, _ADJOINT_COST = 5.0, 10.0
 """Nanoseconds that a sample takes."""
-
-
-@wp.func
-def light_at(corners: wp.vec3i, weights: wp.vec3, instance: int, shading: wp.array2d(dtype=wp.vec3)):
-    """Shading at a point of a face."""
-    result = weights[0] * shading[instance, corners[0]]
-    result += weights[1] * shading[instance, corners[1]]
-    result += weights[2] * shading[instance, corners[2]]
-    return result
 
 
 @wp.kernel(enable_backward=False)
@@ -38,13 +30,13 @@ def _expose(
     """A thread owns a run of samples; they are zero before."""
     batch, thread = split_row(first_row + wp.tid(), samples.shape[1] // run)
     view = instance_in(batch, face_ids.shape[0])
-    lit = instance_in(batch, shading.shape[0])
-    reflected = instance_in(batch, albedo.shape[0])
+    of_receivers = shading[instance_in(batch, shading.shape[0])]
+    of_samples = albedo[instance_in(batch, albedo.shape[0])]
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         if face >= 0:
-            received = light_at(faces[face], barycentrics[view, sample], lit, shading)
-            color = wp.cw_mul(received, albedo[reflected, sample])
+            received = at_point(of_receivers, faces[face], barycentrics[view, sample])
+            color = wp.cw_mul(received, of_samples[sample])
             samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
 
 
@@ -67,13 +59,14 @@ def _expose_adjoint(
 ):
     """A thread owns a run of samples of all instances.
 
-    With received r = Σ_k w_k s_k and color c = r a:  r̄ = c̄ a,  ā = c̄ r,  s̄_k = w_k r̄,  w̄_k = r̄ · s_k.
+    With received light r and color c = r a:  r̄ = c̄ a,  ā = c̄ r.
     """
     thread = first_row + wp.tid()
     for batch in range(adj_samples.shape[0]):
         view = instance_in(batch, face_ids.shape[0])
-        lit = instance_in(batch, shading.shape[0])
-        reflected = instance_in(batch, albedo.shape[0])
+        row = instance_in(batch, shading.shape[0])
+        reflecting = instance_in(batch, albedo.shape[0])
+        of_receivers = shading[row]
         for sample in range(thread * run, (thread + 1) * run):
             face = face_ids[view, sample]
             if face >= 0:
@@ -81,26 +74,21 @@ def _expose_adjoint(
                 weights = barycentrics[view, sample]
                 adj_sample = adj_samples[batch, sample]
                 adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
-                adj_received = wp.cw_mul(adj_color, albedo[reflected, sample])
+                adj_received = wp.cw_mul(adj_color, albedo[reflecting, sample])
                 if adj_shading:
-                    wp.atomic_add(adj_shading, lit, corners[0], weights[0] * adj_received)
-                    wp.atomic_add(adj_shading, lit, corners[1], weights[1] * adj_received)
-                    wp.atomic_add(adj_shading, lit, corners[2], weights[2] * adj_received)
+                    add_to_corners(adj_shading[row], corners, weights, adj_received)
                 if adj_albedo:
-                    received = light_at(corners, weights, lit, shading)
-                    adj_albedo[reflected, sample] = adj_albedo[reflected, sample] + wp.cw_mul(adj_color, received)
+                    by_albedo = wp.cw_mul(adj_color, at_point(of_receivers, corners, weights))
+                    adj_albedo[reflecting, sample] = adj_albedo[reflecting, sample] + by_albedo
                 if adj_barycentrics:
-                    adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + wp.vec3(
-                        wp.dot(adj_received, shading[lit, corners[0]]),
-                        wp.dot(adj_received, shading[lit, corners[1]]),
-                        wp.dot(adj_received, shading[lit, corners[2]]),
-                    )
+                    by_weights = adj_weights(of_receivers, corners, adj_received)
+                    adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + by_weights
 
 
-def expose(
-    fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array, *, at_points: bool = True
-) -> wp.array:
+def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
     """Multiply the light that the samples receive, interpolated from the receivers, with what they reflect.
+
+    Where surfaces move, :func:`warpshadow.stages.slopes.expose_moving` has the better gradient.
 
     Args:
         fragments: What each sample sees.
@@ -108,8 +96,6 @@ def expose(
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
             Any batch, that of the fragments included, may be 1 and then serves every instance.
-        at_points: Whether barycentrics get their gradient, which is that of the faces at the points that samples see;
-            else it is left to :func:`warpshadow.stages.slopes.pull_surfaces`.
 
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
@@ -119,24 +105,23 @@ def expose(
 
     Differentiable: shading, albedo, barycentrics of the fragments.
     """
-    arrays = {"fragments": fragments.face_ids, "shading": shading, "albedo": albedo}
     _, height, width = fragments.face_ids.shape
     check.shape("albedo", albedo.shape, ("batch", height, width))
-    instances, device = common_batch(arrays), shading.device
-    run = run_length(device, width)
-    run_count, cost = height * width // run, _SAMPLE_COST * run
-    factors = [*fragments.rows, faces, shading, rows(albedo), run]
+    count = common_batch({"fragments": fragments.face_ids, "shading": shading, "albedo": albedo})
+    run = run_length(shading.device, width)
+    run_count = height * width // run
+    inputs = [*fragments.rows, faces, shading, rows(albedo), run]
     return differentiable(
-        lambda samples: launch(_expose, instances * run_count, inputs=factors, outputs=[rows(samples)], cost=cost),
+        lambda samples: launch(_expose, count * run_count, cost=_COST * run, inputs=inputs, outputs=[rows(samples)]),
         lambda adj_samples: launch(
             _expose_adjoint,
             run_count,
-            inputs=[*factors, rows(adj_samples)],
-            outputs=[rows(fragments.barycentrics.grad) if at_points else None, rows(albedo.grad)],
+            cost=_ADJOINT_COST * run * count,
+            inputs=[*inputs, rows(adj_samples)],
+            outputs=[rows(fragments.barycentrics.grad), rows(albedo.grad)],
             sums=[shading.grad],
-            cost=2 * cost * instances,
         ),
-        result=wp.zeros((instances, height, width), dtype=wp.vec4, device=device),
+        result=wp.zeros((count, height, width), dtype=wp.vec4, device=shading.device),
         variables=[fragments.barycentrics, shading, albedo],
     )
 
@@ -173,7 +158,7 @@ def average(samples: wp.array, across: int) -> wp.array:
     if across == 1:
         return samples
     batch_count, height, width = samples.shape[0], samples.shape[1] // across, samples.shape[2] // across
-    rows_of_pixels = samples.reshape((batch_count * height, across, width, across))
     pixels = wp.empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
-    launch(_average, pixels.shape, inputs=[rows_of_pixels, across], outputs=[pixels])
+    parts = samples.reshape((batch_count * height, across, width, across))
+    launch(_average, pixels.shape, inputs=[parts, across], outputs=[pixels])
     return pixels.reshape((batch_count, height, width))

@@ -12,7 +12,9 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 
@@ -29,12 +31,6 @@ class Receivers(NamedTuple):
     of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     still: np.ndarray = np.empty(0, int)  # [still], the vertices that the first receivers are
-
-
-@wp.func
-def _outward(number: int, count: int):
-    """Sign of the normal of a side of a face or of a vertex, of which there are ``count``."""
-    return wp.where(number < count, 1.0, -1.0)
 
 
 @wp.kernel
@@ -56,9 +52,9 @@ def _gather(
     instance = instance_in(batch, positions.shape[0])
     own = receiver - vertices.shape[0]
     if own < 0:
-        vertex = vertices[receiver] % positions.shape[1]
+        vertex, is_back = split_side(vertices[receiver], positions.shape[1])
         points[batch, receiver] = positions[instance, vertex]
-        point_normals[batch, receiver] = _outward(vertices[receiver], positions.shape[1]) * normals[instance, vertex]
+        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[instance, vertex]
     else:
         side = int(0)
         weights = wp.vec3(1.0, 0.0, 0.0)
@@ -67,18 +63,10 @@ def _gather(
         if sample >= 0:
             side = sides[view, sample]
             weights = barycentrics[view, sample]
-        corners = faces[side % faces.shape[0]]
-        i = corners[0]
-        j = corners[1]
-        k = corners[2]
-        points[batch, receiver] = (
-            weights[0] * positions[instance, i]
-            + weights[1] * positions[instance, j]
-            + weights[2] * positions[instance, k]
-        )
-        point_normals[batch, receiver] = _outward(side, faces.shape[0]) * wp.normalize(
-            weights[0] * normals[instance, i] + weights[1] * normals[instance, j] + weights[2] * normals[instance, k]
-        )
+        face, is_back = split_side(side, faces.shape[0])
+        points[batch, receiver] = at_point(positions[instance], faces[face], weights)
+        normal = wp.normalize(at_point(normals[instance], faces[face], weights))
+        point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
 
 
 @wp.kernel
@@ -223,8 +211,9 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     takes_part = np.zeros((side_count, vertex_count), bool)
     side_of_edge = np.zeros(edges.shape, int)
     if side_count == 2:
-        # an edge is seen from the side that one of the pixels beside it sees, each of which has an entry for it
-        side_of_edge[:] = (sides.numpy().ravel()[silhouettes.pixels.numpy()] >= face_count)[:, None, None]
+        # an edge is seen from the side that one of the samples beside it sees, each of which has an entry for it
+        _, is_back = split_sides(sides.numpy().ravel()[silhouettes.samples.numpy()], face_count)
+        side_of_edge[:] = is_back[:, None, None]
     for side in range(side_count):
         takes_part[side, faces[is_seen[side * face_count : (side + 1) * face_count]]] = True
     takes_part[side_of_edge[edges >= 0], edges[edges >= 0]] = True

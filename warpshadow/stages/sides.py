@@ -7,13 +7,35 @@ number v, with its normal, and number V + v, with the opposite one. The corners 
 
 from dataclasses import replace
 
+import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import rows
-from warpshadow.stages.rasterize import Fragments, run_length
+from warpshadow.device.batch import instance_in, rows
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import run_length
+from warpshadow.stages.rasterize import Fragments
 
 _FACE_RUN = 1024
 """Faces that a thread owns on a CPU, so that it finds the camera's eye once for all of them."""
+
+
+@wp.func
+def split_side(number: int, count: int):
+    """Which of ``count`` faces or vertices a number is, and whether it is seen from behind."""
+    is_back = number >= count
+    return wp.where(is_back, number - count, number), is_back
+
+
+@wp.func
+def join_side(index: int, is_back: bool, count: int):
+    """Number of a face or vertex among ``count``, seen from the front or from behind: `split_side` the other way."""
+    return wp.where(is_back, index + count, index)
+
+
+def split_sides(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`split_side` for an array of numbers."""
+    is_back = numbers >= count
+    return numbers - count * is_back, is_back
 
 
 @wp.func
@@ -28,7 +50,7 @@ def _eye(clip_matrix: wp.mat44):
 
 
 @wp.kernel(enable_backward=False)
-def _find_turned(
+def _find_backs(
     # in
     positions: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
@@ -36,16 +58,16 @@ def _find_turned(
     clip_matrices: wp.array(dtype=wp.mat44),
     run: int,
     # out
-    is_turned: wp.array2d(dtype=wp.bool),
+    shows_back: wp.array2d(dtype=wp.bool),
     is_any: wp.array(dtype=wp.bool),
 ):
-    """A thread owns a run of two-sided faces of a view: which turn their backs to the eye; false before.
+    """A thread owns a run of two-sided faces of a view: which of them the eye sees from behind; false before.
 
     In the world and in float64: in clip space a distant ground, seen at a grazing angle, would be lost in rounding.
     """
     view, thread = wp.tid()
-    instance = wp.min(view, positions.shape[0] - 1)
-    eye = _eye(clip_matrices[wp.min(view, clip_matrices.shape[0] - 1)])
+    instance = instance_in(view, positions.shape[0])
+    eye = _eye(clip_matrices[instance_in(view, clip_matrices.shape[0])])
     for i in range(thread * run, wp.min((thread + 1) * run, two_sided.shape[0])):
         face = two_sided[i]
         corners = faces[face]
@@ -53,7 +75,7 @@ def _find_turned(
         b = wp.vec3d(positions[instance, corners[1]])
         c = wp.vec3d(positions[instance, corners[2]])
         if wp.dot(wp.cross(b - a, c - a), a - eye) > wp.float64(0.0):
-            is_turned[view, face] = True
+            shows_back[view, face] = True
             is_any[0] = True
 
 
@@ -61,7 +83,7 @@ def _find_turned(
 def _see_sides(
     # in
     face_ids: wp.array2d(dtype=wp.int32),
-    is_turned: wp.array2d(dtype=wp.bool),
+    shows_back: wp.array2d(dtype=wp.bool),
     run: int,
     # out
     sides: wp.array2d(dtype=wp.int32),
@@ -70,11 +92,11 @@ def _see_sides(
     """A thread owns a run of samples; ``is_any`` is false before."""
     view, thread = wp.tid()
     for sample in range(thread * run, (thread + 1) * run):
-        side = face_ids[view, sample]
-        if is_turned[view, wp.max(side, 0)] and side >= 0:
-            side += is_turned.shape[1]
+        face = face_ids[view, sample]
+        is_back = shows_back[view, wp.max(face, 0)] and face >= 0
+        sides[view, sample] = join_side(face, is_back, shows_back.shape[1])
+        if is_back:
             is_any[0] = True
-        sides[view, sample] = side
 
 
 def find_sides(
@@ -98,28 +120,24 @@ def find_sides(
     """
     device = positions.device
     views, height, width = fragments.face_ids.shape
-    is_turned = wp.zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
+    shows_back = wp.zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
     is_any = wp.zeros(2, dtype=wp.bool, device=device)
     run = run_length(device, _FACE_RUN)
-    wp.launch(
-        _find_turned,
-        dim=(views, -(-two_sided.shape[0] // run)),
+    launch(
+        _find_backs,
+        (views, -(-two_sided.shape[0] // run)),
         inputs=[positions, faces, two_sided, clip_matrices, run],
-        outputs=[is_turned, is_any[:1]],
-        device=device,
-        record_tape=False,
+        outputs=[shows_back, is_any[:1]],
     )
     if not device.is_capturing and not is_any.numpy()[0]:
         return fragments
     sides = wp.empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
     run = run_length(device, width)
-    wp.launch(
+    launch(
         _see_sides,
-        dim=(views, height * width // run),
-        inputs=[rows(fragments.face_ids), is_turned, run],
+        (views, height * width // run),
+        inputs=[rows(fragments.face_ids), shows_back, run],
         outputs=[rows(sides), is_any[1:]],
-        device=device,
-        record_tape=False,
     )
     if not device.is_capturing and not is_any.numpy()[1]:
         return fragments

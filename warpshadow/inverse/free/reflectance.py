@@ -13,7 +13,7 @@ from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import Found, Setting, World
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene, Visibility
-from warpshadow.stages.textures.sample import fill_unseen
+from warpshadow.stages.textures.seen import fill_unseen
 
 
 @dataclass(frozen=True)

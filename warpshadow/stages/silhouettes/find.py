@@ -1,31 +1,18 @@
-"""Silhouettes: edges that a rasterized image has between pixels, smoothed so that their gradient moves vertices.
+"""Silhouettes: where neighboring samples see different surfaces, one of which ends between them.
 
-Where the surface that the nearer of two neighboring pixels sees ends before the other's center, at a silhouette edge,
-each of the two takes of the other's color what of itself lies beyond the edge (after Laine et al. 2020, section 3.5,
-who take edges as upright). With the edge at distance t from a pixel's own center towards the other's, leaning by m
-pixels a pixel (at most 1), that is the area beyond a straight edge,
+A rasterized image jumps there, and does not change while the line between two samples moves. So samples at silhouettes
+are smoothed (after Laine et al. 2020, section 3.5, who take edges as upright): each takes of the other's color what of
+itself lies beyond the line (:mod:`warpshadow.stages.silhouettes.areas`). The line is the edge where the surface of the
+nearer sample ends before the center of the other, or that where two surfaces intersect.
 
-    e = ½ − t                     t ≤ (1 − m)/2
-        ((1 + m)/2 − t)² / 2m     between
-        0                         t ≥ (1 + m)/2
+Lines that cut a row of samples are found between neighbors in the row, those that cut a column between neighbors in
+the column, and a line that leans may do both. It counts ω = 1 / (1 + m⁴) where it leans by m samples from one row (or
+column) to the next. A sample of color c, with neighbors of colors c_k and areas e_k beyond the lines, so becomes
 
-An edge cuts rows and columns of pixels. It counts ω = 1 / (1 + m⁴) where it does the one, and the rest where it does
-the other. A pixel of color c, with neighbors of colors c_k, so becomes
+    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
 
-    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          sides l across side k
-
-which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common, nothing
-if they lie beyond one edge, their product if they lie beyond two upright ones. Lines where two surfaces intersect are
-smoothed alike.
-
-On screen an edge with ends a, b is the line ℓ = a × b, and the intersection of two faces the line ℓ = n − n′ on which
-their planes n·(x, y, w) = 1 have the same depth. In a row, where ℓ·(x, y, 1) = 0, lines move by
-
-    dx = (α ℓ·da + β ℓ·db) / ℓ_x                            α, β: the point on the edge is α a + β b, with w = 1
-    dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of what the pixels see, u: its 1/w
-
-How m changes is left out: it hardly matters to what two pixels take of each other on balance (1e-4 of the gradient by
-a rigid motion), and at edges far below a pixel it would outweigh the rest, pulling their ends opposite ways.
+which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common: nothing
+if they lie beyond one line, their product if they lie beyond two upright ones.
 """
 
 from dataclasses import dataclass
@@ -33,162 +20,88 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
-from warpshadow.stages.rasterize import Fragments, run_length
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import run_length, strip_count
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.screen import (
+    half_size,
+    has_neighbor,
+    neighbor,
+    orientation,
+    plane,
+    relative,
+    sample_center,
+    sense,
+)
+from warpshadow.stages.silhouettes.areas import measure_areas
+from warpshadow.stages.silhouettes.lines import INTERSECTION, NOTHING, Seen, image_of, line_between, make_seen
 
 wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 s, and runs as fast
 
 MOST_STEPS = 32
-"""Faces that are walked over between the centers of two pixels before the search for an edge is given up."""
+"""Faces that are walked over between the centers of two samples before the search for an edge is given up."""
 
 LEAST_OPENING = 1e-4
-"""Relative change of two surfaces' distance over a pixel, below which rounding hides where they intersect."""
+"""Relative change of two surfaces' distance over a sample, below which rounding hides where they intersect."""
 
-# Rasterization moves vertices by up to 1/8192 pixel, so an edge may be this far on the wrong side of a center [pixels].
+# Rasterization moves vertices by up to 1/8192 sample: an edge may be this far on the wrong side of a center [samples].
 _SNAP = 1.0 / 2048.0
 
-# In place of the silhouette between two pixels, which may be none (−1).
+# In place of the silhouette between two samples, which may be none (−1).
 _UNKNOWN = -2
-
-# In place of an edge's vertices.
-NOTHING = -1
-_INTERSECTION = -2
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """Where an image has silhouettes: an entry for every pixel beside one.
+    """Where an image has silhouettes: an entry for every sample beside one.
 
     Args:
-        pixels: Index of the pixel in the flat images [batch, height, width], −1 in an entry that is not used, int32 of
-            shape [entry].
+        samples: Number of the sample in the flat images [batch, height, width], −1 in an entry that is not used, int32
+            of shape [entry].
         edges: Vertices a, b of the edge between it and its neighbor to the right, left, below and above, in the order
             in which the line a × b is positive on its surface; (−1, −1) where there is none, (−2, −2) where their
             faces intersect; vec2i of shape [entry, 4].
-        shares: The area e of the pixel that lies beyond each, and how much it counts, ω; vec2 of shape [entry, 4].
-        entries: Entry of each pixel of the flat images, −1 for none, int32 of shape [pixel].
-        fragments: What each pixel sees.
+        shares: The area e of the sample that lies beyond each, and how much it counts, ω; vec2 of shape [entry, 4].
+        entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
+        fragments: What each sample sees.
         faces: The rasterized faces, vec3i of shape [face].
     """
 
-    pixels: wp.array
+    samples: wp.array
     edges: wp.array
     shares: wp.array
     entries: wp.array
     fragments: Fragments
     faces: wp.array
 
-
-# --------------------------------------------------------------------------------------------------- lines on screen
-
-
-@wp.func
-def pixel_center(pixel: int, width: int, height: int):
-    """Center of a pixel of the flat images, in normalized device coordinates."""
-    row = pixel / width
-    x = float(2 * (pixel - row * width) + 1 - width) / float(width)
-    y = float(2 * (row % height) + 1 - height) / float(height)
-    return wp.vec2(x, y)
+    def flat_shape(self, images: wp.array) -> tuple[int, int]:
+        """Shape of images as those that the silhouettes serve, one after another: [images of each, sample of all]."""
+        batch_count, height, width = self.fragments.face_ids.shape
+        return images.shape[0] // batch_count, batch_count * height * width
 
 
-@wp.func
-def neighbor(pixel: int, side: int, width: int):
-    """Pixel to the right (side 0), left, below or above."""
-    step = wp.where(side < 2, 1, width)
-    return pixel + wp.where(side % 2 == 0, step, -step)
+@wp.struct
+class _Crossings:
+    """What lies between neighboring samples, a list in no order."""
+
+    count: wp.array(dtype=wp.int32)
+    items: wp.array(dtype=wp.vec4i)  # sample, way to its neighbor, and vertices of the edge
+    claims: wp.array(dtype=wp.int32)  # one item that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
+
+
+# ---------------------------------------------------------------------------------------------------- edges
 
 
 @wp.func
-def _opposite(side: int):
-    """The side opposite to a side."""
-    return wp.where(side % 2 == 0, side + 1, side - 1)
-
-
-@wp.func
-def _has_neighbor(pixel: int, side: int, width: int, height: int):
-    """Whether the image goes on to a side of a pixel."""
-    row = pixel / width
-    place = wp.where(side < 2, pixel - row * width, row % height)
-    last = wp.where(side < 2, width, height) - 1
-    return wp.where(side % 2 == 0, place < last, place > 0)
-
-
-@wp.func
-def relative(p: wp.vec4, center: wp.vec2):
-    """The x, y and w of a vertex relative to the ray through a point of the screen, so that nothing cancels there."""
-    return wp.vec3(p[0] - center[0] * p[3], p[1] - center[1] * p[3], p[3])
-
-
-@wp.func
-def _plane(face: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
-    """Plane n·(x, y, w) = 1 of a face relative to the ray through a point of the screen; n_w is 1/w there."""
-    a = relative(clip_positions[face[0]], center)
-    b = relative(clip_positions[face[1]], center)
-    c = relative(clip_positions[face[2]], center)
-    normal = wp.cross(b - a, c - a)
-    return normal / wp.dot(normal, a)
-
-
-@wp.func
-def _line(
-    pixel: int,
-    side: int,
-    edge: wp.vec2i,
-    width: int,
-    height: int,
-    face_ids: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array(dtype=wp.vec4),
-):
-    """The line ℓ between a pixel and its neighbor to a side, relative to the pixel's center."""
-    center = pixel_center(pixel, width, height)
-    if edge[0] >= 0:
-        return wp.cross(relative(clip_positions[edge[0]], center), relative(clip_positions[edge[1]], center))
-    here = faces[face_ids[pixel]]
-    there = faces[face_ids[neighbor(pixel, side, width)]]
-    return _plane(here, center, clip_positions) - _plane(there, center, clip_positions)
-
-
-@wp.func
-def distance(line: wp.vec3, side: int, half_size: wp.vec2):
-    """Where a line crosses the way from a pixel's center to its neighbor's, t [pixels]."""
-    axis = side / 2
-    return float(2 * (side % 2) - 1) * half_size[axis] * line[2] / line[axis]
-
-
-@wp.func
-def _lean(line: wp.vec3, side: int, half_size: wp.vec2):
-    """How far along that way a line moves from one row (or column) of pixels to the next, m [pixels]."""
-    axis = side / 2
-    return wp.abs(line[1 - axis] / line[axis]) * half_size[axis] / half_size[1 - axis]
-
-
-@wp.func
-def ends_before(line: wp.vec3, side: int):
-    """Whether an edge bounds the surface of the pixel itself, not that of its neighbor to a side."""
-    return float(2 * (side % 2) - 1) * line[side / 2] > 0.0
-
-
-# ---------------------------------------------------------------------------------------------------- where they are
-
-
-@wp.func
-def _volume(a: wp.vec4, b: wp.vec4, c: wp.vec4):
-    """Volume that the eye spans with a face: its sign is the face's orientation on screen."""
-    origin = wp.vec3(a[0], a[1], a[3])
-    return wp.dot(wp.cross(wp.vec3(b[0], b[1], b[3]) - origin, wp.vec3(c[0], c[1], c[3]) - origin), origin)
-
-
-@wp.func
-def _depth(face: int, weights: wp.vec3, faces: wp.array(dtype=wp.vec3i), clip_positions: wp.array(dtype=wp.vec4)):
-    """Distance of a pixel's point along the view, infinite for the background."""
+def _depth(seen: Seen, sample: int):
+    """Distance of a sample's point along the view, infinite for the background."""
     depth = float(wp.inf)
+    face = seen.face_ids[sample]
     if face >= 0:
-        corners = faces[face]
-        depth = (
-            weights[0] * clip_positions[corners[0]][3]
-            + weights[1] * clip_positions[corners[1]][3]
-            + weights[2] * clip_positions[corners[2]][3]
-        )
+        weights = seen.barycentrics[sample]
+        clip = seen.clip_positions[image_of(seen, sample)]
+        corners = seen.faces[face]
+        depth = weights[0] * clip[corners[0]][3] + weights[1] * clip[corners[1]][3] + weights[2] * clip[corners[2]][3]
     return depth
 
 
@@ -208,7 +121,7 @@ def _is_silhouette(
         return True
     back = neighbors[across]
     corner = wp.where(back[0] == face, 0, wp.where(back[1] == face, 1, 2))
-    return volume * _volume(a, b, clip_positions[faces[across][corner]]) >= 0.0
+    return volume * orientation(a, b, clip_positions[faces[across][corner]]) >= 0.0
 
 
 @wp.func
@@ -221,7 +134,7 @@ def _end_of_surface(
     neighbors: wp.array(dtype=wp.vec3i),
     clip_positions: wp.array(dtype=wp.vec4),
 ):
-    """Walk over a surface, from face to face along a row or column, until below a point of the screen.
+    """Walk over a surface, from face to face along a row or column, until a position on screen is reached.
 
     Returns 3 face + corner of the silhouette edge at which the surface ends before, −1 if it does not.
     """
@@ -231,7 +144,7 @@ def _end_of_surface(
     while face >= 0 and face != goal and step < MOST_STEPS:
         corners = faces[face]
         around = neighbors[face]
-        volume = _volume(clip_positions[corners[0]], clip_positions[corners[1]], clip_positions[corners[2]])
+        volume = orientation(clip_positions[corners[0]], clip_positions[corners[1]], clip_positions[corners[2]])
         onward = int(-1)
         for k in range(3):
             p = clip_positions[corners[(k + 1) % 3]]
@@ -254,152 +167,95 @@ def _end_of_surface(
 
 
 @wp.func
-def _silhouette_between(
-    pixel: int,
-    side: int,
-    width: int,
-    height: int,
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    neighbors: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array(dtype=wp.vec4),
-):
-    """The one silhouette edge between a pixel and its neighbor to a side, as 3 face + corner, or −1.
+def _silhouette_between(seen: Seen, neighbors: wp.array(dtype=wp.vec3i), sample: int, way: int):
+    """The one silhouette edge between a sample and its neighbor on a way, as 3 face + corner, or −1.
 
-    It is where the nearer one's surface ends; only if that goes on, below the other's, is it where the other's ends.
+    It is where the surface of the nearer sample ends before the other's center. If that surface goes on, hidden behind
+    the other's, it is where the other's ends instead.
     """
-    other = neighbor(pixel, side, width)
-    here = face_ids[pixel]
-    there = face_ids[other]
-    depth_here = _depth(here, barycentrics[pixel], faces, clip_positions)
-    depth_there = _depth(there, barycentrics[other], faces, clip_positions)
-    axis = side / 2
-    first = pixel_center(pixel, width, height)
-    last = pixel_center(other, width, height)
+    other = neighbor(sample, way, seen.width)
+    here = seen.face_ids[sample]
+    there = seen.face_ids[other]
+    is_nearer = _depth(seen, sample) <= _depth(seen, other)
+    first = sample_center(sample, seen.width, seen.height)
+    last = sample_center(other, seen.width, seen.height)
     margin = _SNAP * (last - first)
+    clip = seen.clip_positions[image_of(seen, sample)]
     found = int(-1)
     for attempt in range(2):
         if found < 0:
-            from_here = (depth_here <= depth_there) == (attempt == 0)
+            from_here = is_nearer == (attempt == 0)
             start = wp.where(from_here, here, there)
             goal = wp.where(from_here, there, here)
             end = wp.where(from_here, last + margin, first - margin)
-            found = _end_of_surface(start, goal, end, axis, faces, neighbors, clip_positions)
+            found = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, clip)
     return found
 
 
 @wp.func
-def _add_crossing(
-    pixel: int,
-    side: int,
-    edge: wp.vec2i,
-    width: int,
-    crossing_count: wp.array(dtype=wp.int32),
-    crossings: wp.array(dtype=wp.vec4i),
-    claims: wp.array(dtype=wp.int32),
-):
-    """Add what lies between two pixels to the list. Of the crossings beside a pixel one claims it, no matter which."""
-    crossing = wp.atomic_add(crossing_count, 0, 1)
-    crossings[crossing] = wp.vec4i(pixel, side, edge[0], edge[1])
-    claims[pixel] = 2 * crossing
-    claims[neighbor(pixel, side, width)] = 2 * crossing + 1
+def _add_crossing(seen: Seen, sample: int, way: int, edge: wp.vec2i, crossings: _Crossings):
+    """Add what lies between two samples to the list; of the crossings beside a sample one claims it, any."""
+    crossing = wp.atomic_add(crossings.count, 0, 1)
+    crossings.items[crossing] = wp.vec4i(sample, way, edge[0], edge[1])
+    crossings.claims[sample] = 2 * crossing
+    crossings.claims[neighbor(sample, way, seen.width)] = 2 * crossing + 1
 
 
 @wp.func
-def _add_edge_if_seen(
-    pixel: int,
-    side: int,
-    edge: wp.vec2i,
-    half_edge: int,
-    width: int,
-    height: int,
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    neighbors: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array(dtype=wp.vec4),
-    between: wp.array2d(dtype=wp.int32),
-    crossing_count: wp.array(dtype=wp.int32),
-    crossings: wp.array(dtype=wp.vec4i),
-    claims: wp.array(dtype=wp.int32),
-):
-    """Add an edge that passes between a pixel and its neighbor if it is what they see.
-
-    Several edges do, from both of their faces, so what is between them is kept.
-    """
-    if face_ids[pixel] != face_ids[neighbor(pixel, side, width)]:
-        found = between[side / 2, pixel]
-        if found == _UNKNOWN:
-            found = _silhouette_between(
-                pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip_positions
-            )
-            between[side / 2, pixel] = found
-        if found == half_edge:
-            _add_crossing(pixel, side, edge, width, crossing_count, crossings, claims)
-
-
-@wp.func
-def _end_on_screen(p: wp.vec4, q: wp.vec4, half_size: wp.vec2):
-    """The end p of an edge pq, or where the edge meets the near plane if p lies behind it [pixels]."""
+def _end_on_screen(p: wp.vec4, q: wp.vec4, half: wp.vec2):
+    """The end p of an edge pq, or where the edge meets the near plane if p lies behind it [samples]."""
     behind = p[2] - p[3]
     end = p
     if behind > 0.0:
         end = p + (behind / (behind - (q[2] - q[3]))) * (q - p)
-    return wp.vec2((end[0] / end[3] + 1.0) * half_size[0], (end[1] / end[3] + 1.0) * half_size[1])
+    return wp.vec2((end[0] / end[3] + 1.0) * half[0], (end[1] / end[3] + 1.0) * half[1])
 
 
 @wp.func
 def _centers_before(coordinate: float, count: int):
-    """How many of ``count`` pixels have their centers before a coordinate [pixels]."""
+    """How many of ``count`` samples have their centers before a coordinate [samples]."""
     return int(wp.clamp(wp.ceil(coordinate - 0.5), 0.0, float(count)))
 
 
 @wp.kernel(enable_backward=False)
 def _find_edges(
     # in
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
+    seen: Seen,
     neighbors: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array2d(dtype=wp.vec4),
-    width: int,
-    height: int,
-    strip_count: int,
+    strips: int,
     # out
     between: wp.array2d(dtype=wp.int32),
-    crossing_count: wp.array(dtype=wp.int32),
-    crossings: wp.array(dtype=wp.vec4i),
-    claims: wp.array(dtype=wp.int32),
+    crossings: _Crossings,
 ):
-    """A thread owns every ``strip_count``-th row and column that the silhouette edges of a face of an instance cut.
+    """A thread owns every ``strips``-th row and column that the silhouette edges of a face of an instance cut.
 
-    Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings.
+    Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings. Several edges
+    pass between two samples, so which of them the samples see is kept, in ``between``.
     """
     batch, face, strip = wp.tid()
-    clip = clip_positions[batch]
-    corners = faces[face]
+    clip = seen.clip_positions[batch]
+    corners = seen.faces[face]
     around = neighbors[face]
-    half_size = 0.5 * wp.vec2(float(width), float(height))
-    volume = _volume(clip[corners[0]], clip[corners[1]], clip[corners[2]])
+    half = half_size(seen.width, seen.height)
+    volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
     for k in range(3):
         edge = wp.vec2i(corners[(k + 1) % 3], corners[(k + 2) % 3])
         a = clip[edge[0]]
         b = clip[edge[1]]
         is_before_near_plane = a[3] > a[2] or b[3] > b[2]
-        if is_before_near_plane and _is_silhouette(face, around[k], a, b, volume, faces, neighbors, clip):
+        if is_before_near_plane and _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip):
             if volume < 0.0:
                 edge = wp.vec2i(edge[1], edge[0])
-            p = _end_on_screen(a, b, half_size)
-            q = _end_on_screen(b, a, half_size)
+            p = _end_on_screen(a, b, half)
+            q = _end_on_screen(b, a, half)
             for axis in range(2):
                 # Said for axis 0: along rows, from the lower to the higher row. Axis 1 goes along columns.
                 low = wp.where(p[1 - axis] < q[1 - axis], p, q)
                 high = wp.where(p[1 - axis] < q[1 - axis], q, p)
                 extent = high[1 - axis] - low[1 - axis]
                 slope = (high[axis] - low[axis]) / wp.max(extent, 1.0e-30)
-                row_count = wp.where(axis == 0, height, width)
-                column_count = wp.where(axis == 0, width, height)
+                row_count = wp.where(axis == 0, seen.height, seen.width)
+                column_count = wp.where(axis == 0, seen.width, seen.height)
                 row = _centers_before(low[1 - axis] - _SNAP, row_count) + strip
                 row_end = _centers_before(high[1 - axis] + _SNAP, row_count)
                 while row < row_end:
@@ -407,159 +263,96 @@ def _find_edges(
                     column = wp.max(_centers_before(x - _SNAP, column_count) - 1, 0)
                     column_end = wp.min(_centers_before(x + _SNAP, column_count), column_count - 1)
                     while column < column_end:
-                        _add_edge_if_seen(
-                            batch * width * height + wp.where(axis == 0, row * width + column, column * width + row),
-                            2 * axis,
-                            edge,
-                            3 * face + k,
-                            width,
-                            height,
-                            face_ids,
-                            barycentrics,
-                            faces,
-                            neighbors,
-                            clip,
-                            between,
-                            crossing_count,
-                            crossings,
-                            claims,
-                        )
+                        sample = batch * seen.width * seen.height
+                        sample += wp.where(axis == 0, row * seen.width + column, column * seen.width + row)
+                        if seen.face_ids[sample] != seen.face_ids[neighbor(sample, 2 * axis, seen.width)]:
+                            found = between[axis, sample]
+                            if found == _UNKNOWN:
+                                found = _silhouette_between(seen, neighbors, sample, 2 * axis)
+                                between[axis, sample] = found
+                            if found == 3 * face + k:
+                                _add_crossing(seen, sample, 2 * axis, edge, crossings)
                         column += 1
-                    row += strip_count
+                    row += strips
+
+
+# ---------------------------------------------------------------------------------------------------- intersections
 
 
 @wp.func
-def _approach(
-    pixel: int,
-    side: int,
-    width: int,
-    height: int,
-    face_ids: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array(dtype=wp.vec4),
-):
-    """Whether the face of a pixel's neighbor gets clearly nearer than the pixel's from one to the other."""
-    axis = side / 2
-    line = _line(pixel, side, wp.vec2i(_INTERSECTION, _INTERSECTION), width, height, face_ids, faces, clip_positions)
-    inverse_depth = _plane(faces[face_ids[pixel]], pixel_center(pixel, width, height), clip_positions)[2]
-    half_size = wp.where(axis == 0, 0.5 * float(width), 0.5 * float(height))
-    opening = float(2 * (side % 2) - 1) * line[axis] / half_size
+def _approach(seen: Seen, sample: int, way: int):
+    """Whether the face of a sample's neighbor gets clearly nearer than the sample's from one to the other."""
+    axis = way / 2
+    clip = seen.clip_positions[image_of(seen, sample)]
+    line = line_between(seen, sample, way, wp.vec2i(INTERSECTION, INTERSECTION))
+    center = sample_center(sample, seen.width, seen.height)
+    inverse_depth = plane(seen.faces[seen.face_ids[sample]], center, clip)[2]
+    opening = -sense(way) * line[axis] / half_size(seen.width, seen.height)[axis]
     return opening > LEAST_OPENING * inverse_depth
 
 
 @wp.kernel(enable_backward=False)
 def _find_intersections(
     # in
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
+    seen: Seen,
     neighbors: wp.array(dtype=wp.vec3i),
-    surfaces: wp.array(dtype=wp.int32),
-    clip_positions: wp.array2d(dtype=wp.vec4),
-    width: int,
-    height: int,
+    bodies: wp.array(dtype=wp.int32),
     run: int,
     # out
-    crossing_count: wp.array(dtype=wp.int32),
-    crossings: wp.array(dtype=wp.vec4i),
-    claims: wp.array(dtype=wp.int32),
+    crossings: _Crossings,
 ):
-    """A thread owns ``run`` pixels after one another: what is between each and its right and its lower neighbor."""
+    """A thread owns ``run`` samples after one another: what is between each and its right and its lower neighbor."""
     first = wp.tid() * run
-    for pixel in range(first, wp.min(first + run, face_ids.shape[0])):
-        here = face_ids[pixel]
+    count = seen.face_ids.shape[0]
+    for sample in range(first, wp.min(first + run, count)):
+        here = seen.face_ids[sample]
         if here >= 0:
-            # Nearly all pixels end here, so this comes first, and without branches.
-            last = face_ids.shape[0] - 1
-            surface = surfaces[here]
-            right = surfaces[wp.max(face_ids[wp.min(pixel + 1, last)], 0)]
-            below = surfaces[wp.max(face_ids[wp.min(pixel + width, last)], 0)]
-            if right != surface or below != surface:
-                row = pixel / width
-                batch = row / height
-                clip = clip_positions[batch]
+            # Nearly all samples end here, so this comes first, and without branches.
+            body = bodies[here]
+            right = bodies[wp.max(seen.face_ids[wp.min(sample + 1, count - 1)], 0)]
+            below = bodies[wp.max(seen.face_ids[wp.min(sample + seen.width, count - 1)], 0)]
+            if right != body or below != body:
                 for axis in range(2):
-                    side = 2 * axis
-                    other = neighbor(pixel, side, width)
-                    is_last = wp.where(axis == 0, other == (row + 1) * width, other >= (batch + 1) * height * width)
-                    differs = not is_last and wp.where(axis == 0, right, below) != surface and face_ids[other] >= 0
-                    if differs and _approach(pixel, side, width, height, face_ids, faces, clip):
-                        found = _silhouette_between(
-                            pixel, side, width, height, face_ids, barycentrics, faces, neighbors, clip
-                        )
-                        if found < 0:
-                            edge = wp.vec2i(_INTERSECTION, _INTERSECTION)
-                            _add_crossing(pixel, side, edge, width, crossing_count, crossings, claims)
+                    way = 2 * axis
+                    differs = wp.where(axis == 0, right, below) != body
+                    if differs and has_neighbor(sample, way, seen.width, seen.height):
+                        is_face = seen.face_ids[neighbor(sample, way, seen.width)] >= 0
+                        if is_face and _approach(seen, sample, way):
+                            found = _silhouette_between(seen, neighbors, sample, way)
+                            if found < 0:
+                                edge = wp.vec2i(INTERSECTION, INTERSECTION)
+                                _add_crossing(seen, sample, way, edge, crossings)
+
+
+# ---------------------------------------------------------------------------------------------------- entries
 
 
 @wp.kernel(enable_backward=False)
-def _gather(
+def _make_entries(
     # in
-    crossing_count: wp.array(dtype=wp.int32),
-    crossings: wp.array(dtype=wp.vec4i),
-    claims: wp.array(dtype=wp.int32),
+    crossings: _Crossings,
     width: int,
     has_all: bool,
     # out
-    pixels: wp.array(dtype=wp.int32),
+    samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a crossing: it goes to the entries of its two pixels; all outputs are −1 before.
+    """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
 
-    If there is an entry for all pixels, it is the pixel's own.
+    If there is an entry for all samples, it is the sample's own.
     """
     thread = wp.tid()
-    if thread < crossing_count[0]:
-        crossing = crossings[thread]
-        side = crossing[1]
-        edge = wp.vec2i(crossing[2], crossing[3])
-        pixel = crossing[0]
-        other = neighbor(pixel, side, width)
-        entry = wp.where(has_all, pixel, claims[pixel])
-        other_entry = wp.where(has_all, other, claims[other])
-        pixels[entry] = pixel
-        pixels[other_entry] = other
-        entries[pixel] = entry
-        entries[other] = other_entry
-        edges[entry, side] = edge
-        edges[other_entry, side + 1] = edge
-
-
-@wp.kernel(enable_backward=False)
-def _measure(
-    # in
-    pixels: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
-    face_ids: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    clip_positions: wp.array2d(dtype=wp.vec4),
-    width: int,
-    height: int,
-    # out
-    shares: wp.array2d(dtype=wp.vec2),
-):
-    """A thread owns a side of an entry's pixel: the area e beyond the line there, and how much it counts, ω."""
-    entry, side = wp.tid()
-    edge = edges[entry, side]
-    share = wp.vec2()
-    if edge[0] != NOTHING:
-        pixel = pixels[entry]
-        half_size = 0.5 * wp.vec2(float(width), float(height))
-        clip = clip_positions[pixel / (width * height)]
-        line = _line(pixel, side, edge, width, height, face_ids, faces, clip)
-        t = wp.clamp(distance(line, side, half_size), 0.0, 1.0)
-        lean = _lean(line, side, half_size)
-        m = wp.min(lean, 1.0)
-        area = float(0.0)
-        if t <= 0.5 * (1.0 - m):
-            area = 0.5 - t
-        elif t < 0.5 * (1.0 + m):
-            rest = 0.5 * (1.0 + m) - t
-            area = 0.5 * rest * rest / m
-        if wp.isfinite(line / line[side / 2]):  # else vertices are so far away that products overflow
-            share = wp.vec2(area, 1.0 / (1.0 + lean * lean * lean * lean))
-    shares[entry, side] = share
+    if thread < crossings.count[0]:
+        crossing = crossings.items[thread]
+        for end in range(2):
+            sample = crossing[0]
+            if end == 1:
+                sample = neighbor(sample, crossing[1], width)
+            entry = wp.where(has_all, sample, crossings.claims[sample])
+            samples[entry] = sample
+            entries[sample] = entry
+            edges[entry, crossing[1] + end] = wp.vec2i(crossing[2], crossing[3])
 
 
 def find_silhouettes(
@@ -567,82 +360,51 @@ def find_silhouettes(
     faces: wp.array,
     neighbors: wp.array,
     clip_positions: wp.array,
-    surfaces: wp.array | None = None,
+    bodies: wp.array | None = None,
 ) -> Silhouettes:
     """Find the edges at which the surfaces in an image end, and the lines where they intersect.
 
     Args:
-        fragments: What each pixel sees.
+        fragments: What each sample sees.
         faces: The rasterized faces, vec3i of shape [face].
         neighbors: :func:`warpshadow.assets.topology.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
-        surfaces: A number for each face, the same all over a body, int32 of shape [face]. Intersections are looked for
-            between different ones; without it there are none, and where bodies intersect they have no gradient.
+        bodies: Number of each face's body, int32 of shape [face]. Intersections are looked for between different ones;
+            without it there are none, and where bodies intersect they have no gradient.
 
     Returns:
-        Silhouettes, for :func:`smooth_silhouettes`. They have as many entries as need be: the count is read back, which
-        waits for the device. While a CUDA graph is captured they have one for each pixel instead, and nothing is read.
+        Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. While a
+        CUDA graph is captured they have one for each sample instead, and nothing is read.
 
     Raises:
         ValueError: naming the argument, what it got and what it accepts.
 
-    Not differentiable: which lines lie between which pixels changes at isolated poses only.
+    Not differentiable: which lines lie between which samples changes at isolated poses only.
     """
-    batch_count, height, width = fragments.face_ids.shape
     check.shape("neighbors", neighbors.shape, faces.shape)
-    check.shape("clip_positions", clip_positions.shape, (batch_count, "vertex"))
-    face_ids, barycentrics = fragments.face_ids.flatten(), fragments.barycentrics.flatten()
-    device = face_ids.device
-    crossing_count = wp.zeros(1, dtype=wp.int32, device=device)
-    crossings = wp.empty(2 * face_ids.size, dtype=wp.vec4i, device=device)
-    claims = wp.empty(face_ids.size, dtype=wp.int32, device=device)
-    strip_count = _strip_count(device)
-    between = wp.full((2, face_ids.size), _UNKNOWN, dtype=wp.int32, device=device)
-    wp.launch(
+    check.shape("clip_positions", clip_positions.shape, (fragments.face_ids.shape[0], "vertex"))
+    device, sample_count = faces.device, fragments.face_ids.size
+    seen, crossings, strips = make_seen(fragments, faces, clip_positions), _Crossings(), strip_count(device)
+    crossings.count = wp.zeros(1, dtype=wp.int32, device=device)
+    crossings.items = wp.empty(2 * sample_count, dtype=wp.vec4i, device=device)
+    crossings.claims = wp.empty(sample_count, dtype=wp.int32, device=device)
+    between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
+    launch(
         _find_edges,
-        dim=(batch_count, faces.shape[0], strip_count),
-        inputs=[face_ids, barycentrics, faces, neighbors, clip_positions, width, height, strip_count],
-        outputs=[between, crossing_count, crossings, claims],
-        device=device,
-        record_tape=False,
+        (clip_positions.shape[0], faces.shape[0], strips),
+        inputs=[seen, neighbors, strips],
+        outputs=[between, crossings],
     )
-    if surfaces is not None:
-        check.shape("surfaces", surfaces.shape, faces.shape)
-        run = run_length(device, width)
-        wp.launch(
-            _find_intersections,
-            dim=-(-face_ids.size // run),
-            inputs=[face_ids, barycentrics, faces, neighbors, surfaces, clip_positions, width, height, run],
-            outputs=[crossing_count, crossings, claims],
-            device=device,
-            record_tape=False,
-        )
+    if bodies is not None:
+        check.shape("bodies", bodies.shape, faces.shape)
+        run = run_length(device, seen.width)
+        dim = -(-sample_count // run)
+        launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, run], outputs=[crossings])
     has_all = bool(device.is_capturing)
-    most = crossings.size if has_all else int(crossing_count.numpy()[0])
-    entry_count = face_ids.size if has_all else 2 * most
-    pixels = wp.full(entry_count, -1, dtype=wp.int32, device=device)
+    most = crossings.items.size if has_all else int(crossings.count.numpy()[0])
+    entry_count = sample_count if has_all else 2 * most
+    samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
-    entries = wp.full(face_ids.size, -1, dtype=wp.int32, device=device)
-    wp.launch(
-        _gather,
-        dim=most,
-        inputs=[crossing_count, crossings, claims, width, has_all],
-        outputs=[pixels, edges, entries],
-        device=device,
-        record_tape=False,
-    )
-    shares = wp.empty(edges.shape, dtype=wp.vec2, device=device)
-    wp.launch(
-        _measure,
-        dim=shares.shape,
-        inputs=[pixels, edges, face_ids, faces, clip_positions, width, height],
-        outputs=[shares],
-        device=device,
-        record_tape=False,
-    )
-    return Silhouettes(pixels, edges, shares, entries, fragments, faces)
-
-
-def _strip_count(device: wp.Device) -> int:
-    """Threads that follow an edge: on CUDA several, so that none follows a long one alone."""
-    return 16 if device.is_cuda else 1
+    entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
+    launch(_make_entries, most, inputs=[crossings, seen.width, has_all], outputs=[samples, edges, entries])
+    return Silhouettes(samples, edges, measure_areas(samples, edges, seen), entries, fragments, faces)

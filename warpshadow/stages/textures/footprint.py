@@ -7,12 +7,17 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, rows
-from warpshadow.device.tape import launch
-from warpshadow.stages.rasterize import Fragments, _instance, _relative, _volumes
+from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.launch import launch
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.screen import center, relative, volumes
 from warpshadow.stages.textures.pyramid import Textures
 
 REACH = 0.25
+"""Widths that a line of probes is longer than they are wide together: a probe reaches beyond its width.
+
+Of 0 to 1, a quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
+"""
 
 MAX_PROBES = 7
 """Most probes of a footprint, an odd number; where it is longer still, its probes grow wider."""
@@ -48,34 +53,31 @@ class Footprints:
         return math.ceil(math.log2(width))
 
 
-# ---------------------------------------------------------------------------------------------------- footprints
-
-
 @wp.func
 def _uv_derivatives(
-    a: wp.vec4, b: wp.vec4, c: wp.vec4, to_a: wp.vec2, to_b: wp.vec2, to_c: wp.vec2, ray: wp.vec2, pixel: wp.vec2
+    a: wp.vec4, b: wp.vec4, c: wp.vec4, to_a: wp.vec2, to_b: wp.vec2, to_c: wp.vec2, ray: wp.vec2, step: wp.vec2
 ):
     """Derivative of uv by the position of a sample [1/sample], its columns by column and row.
 
     ``a``, ``b`` and ``c`` are the vertices in clip space, ``to_a``, ``to_b`` and ``to_c`` their uvs relative to that of
-    the sample, and ``pixel`` the steps of the ray from one sample to the next. With volumes v, linear in the ray,
+    the sample, and ``step`` is that of the ray from one sample to the next. With volumes v, linear in the ray,
     uv = Σ v_i uv_i / Σ v_i has the derivative Σ v_i' (uv_i - uv) / Σ v_i, on the whole plane of the face.
     """
-    at_a = _relative(a, ray)
-    at_b = _relative(b, ray)
-    at_c = _relative(c, ray)
-    volumes = _volumes(at_a, at_b, at_c)
-    total = volumes[0] + volumes[1] + volumes[2]
+    at_a = relative(a, ray)
+    at_b = relative(b, ray)
+    at_c = relative(c, ray)
+    spanned = volumes(at_a, at_b, at_c)
+    total = spanned[0] + spanned[1] + spanned[2]
     by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
     by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
     # seen edge-on the total vanishes: no less, then, than a millionth of what the volumes change within a sample
     least = 1.0e-6 * (
-        pixel[0] * (wp.abs(by_x[0]) + wp.abs(by_x[1]) + wp.abs(by_x[2]))
-        + pixel[1] * (wp.abs(by_y[0]) + wp.abs(by_y[1]) + wp.abs(by_y[2]))
+        step[0] * (wp.abs(by_x[0]) + wp.abs(by_x[1]) + wp.abs(by_x[2]))
+        + step[1] * (wp.abs(by_y[0]) + wp.abs(by_y[1]) + wp.abs(by_y[2]))
     )
     scale = wp.where(wp.abs(total) > least, total, least + 1.0e-30)
-    x = (pixel[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
-    y = (pixel[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
+    x = (step[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
+    y = (step[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
     return wp.mat22(x[0], y[0], x[1], y[1])
 
 
@@ -131,29 +133,31 @@ def _find_footprints(
 ):
     """A thread owns a sample; uvs and probes are zero before."""
     thread = wp.tid()
-    instance = _instance(thread, image_width * image_height, batch_count)
+    instance = int(0)
+    if batch_count > 1:  # on a CPU dividing takes as long as much of the rest
+        instance = thread // (image_width * image_height)
     sample = thread - instance * image_width * image_height
-    fragment = wp.min(instance, face_ids.shape[0] - 1)
-    face = face_ids[fragment, sample]
+    view = instance_in(instance, face_ids.shape[0])
+    face = face_ids[view, sample]
     texture = int(-1)
     if face >= 0:
         texture = texture_of_face[face]
     texture_ids[thread] = texture
     if texture >= 0:
-        projected = wp.min(instance, clip_positions.shape[0] - 1)
-        a = clip_positions[projected, faces[face][0]]
-        b = clip_positions[projected, faces[face][1]]
-        c = clip_positions[projected, faces[face][2]]
-        mapped = wp.min(instance, uvs.shape[0] - 1)
-        uv_a = uvs[mapped, uv_faces[face][0]]
-        uv_b = uvs[mapped, uv_faces[face][1]]
-        uv_c = uvs[mapped, uv_faces[face][2]]
-        weights = barycentrics[fragment, sample]
+        clip = clip_positions[instance_in(instance, clip_positions.shape[0])]
+        a = clip[faces[face][0]]
+        b = clip[faces[face][1]]
+        c = clip[faces[face][2]]
+        of_instance = uvs[instance_in(instance, uvs.shape[0])]
+        uv_a = of_instance[uv_faces[face][0]]
+        uv_b = of_instance[uv_faces[face][1]]
+        uv_c = of_instance[uv_faces[face][2]]
+        weights = barycentrics[view, sample]
         uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
         row = sample // image_width
-        pixel = wp.vec2(2.0 / float(image_width), 2.0 / float(image_height))
-        ray = wp.vec2((float(sample - row * image_width) + 0.5) * pixel[0] - 1.0, (float(row) + 0.5) * pixel[1] - 1.0)
-        derivatives = _uv_derivatives(a, b, c, uv_a - uv, uv_b - uv, uv_c - uv, ray, pixel)
+        ray = center(sample - row * image_width, row, image_width, image_height)
+        step = wp.vec2(2.0 / float(image_width), 2.0 / float(image_height))
+        derivatives = _uv_derivatives(a, b, c, uv_a - uv, uv_b - uv, uv_c - uv, ray, step)
         sample_uvs[thread] = uv
         probes[thread] = _probes(derivatives, float(levels[texture, 0][1]), float(levels[texture, 0][2]))
 
@@ -195,21 +199,17 @@ def find_footprints(
     check.shape("uv_faces", uv_faces.shape, faces.shape)
     check.shape("texture_of_face", texture_of_face.shape, faces.shape)
     check.finite_arrays({"uvs": uvs})
-    variables = {"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs}
-    batch_count = common_batch(variables)
+    batch_count = common_batch({"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs})
     _, height, width = fragments.face_ids.shape
-    shape = batch_count, height, width
-    device = fragments.face_ids.device
-    requires_grad = any(array.requires_grad for array in variables.values())
-    texture_ids = wp.empty(shape, dtype=wp.int32, device=device)
-    sample_uvs = wp.zeros(shape, dtype=wp.vec2, device=device, requires_grad=requires_grad)
-    probes = wp.zeros(shape, dtype=wp.vec4, device=device, requires_grad=requires_grad)
+    count, shape = batch_count * height * width, (batch_count, height, width)
+    texture_ids = wp.empty(count, dtype=wp.int32, device=faces.device)
+    sample_uvs = wp.zeros(count, dtype=wp.vec2, device=faces.device)
+    probes = wp.zeros(count, dtype=wp.vec4, device=faces.device)
     launch(
         _find_footprints,
-        dim=texture_ids.size,
+        count,
         inputs=[
-            rows(fragments.face_ids),
-            rows(fragments.barycentrics),
+            *fragments.rows,
             faces,
             clip_positions,
             uv_faces,
@@ -220,7 +220,6 @@ def find_footprints(
             height,
             batch_count,
         ],
-        outputs=[texture_ids.flatten(), sample_uvs.flatten(), probes.flatten()],
-        device=device,
+        outputs=[texture_ids, sample_uvs, probes],
     )
-    return Footprints(texture_ids, sample_uvs, probes)
+    return Footprints(*(array.reshape(shape) for array in (texture_ids, sample_uvs, probes)))

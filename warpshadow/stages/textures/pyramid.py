@@ -20,9 +20,12 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, rows
-from warpshadow.device.tape import record_adjoint
-from warpshadow.stages.rasterize import run_length
+from warpshadow.device.batch import accumulate, common_batch, rows
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import run_length
+from warpshadow.device.tape import unrecorded
+
+Sizes = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +42,7 @@ class Textures:
     texels: wp.array
     levels: wp.array
     level_counts: wp.array
-    sizes: tuple[tuple[int, int], ...]
-
-
-# ---------------------------------------------------------------------------------------------------- mip levels
+    sizes: Sizes
 
 
 def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
@@ -57,7 +57,7 @@ def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
 class _Layout:
     """Where the levels of textures lie in an array of texels."""
 
-    def __init__(self, sizes: tuple[tuple[int, int], ...], device: str):
+    def __init__(self, sizes: Sizes, device: str):
         level_sizes = [_level_sizes(*size) for size in sizes]
         self.level_counts = [len(part) for part in level_sizes]
         self.levels = np.zeros((len(sizes), max(self.level_counts), 3), np.int32)
@@ -79,32 +79,8 @@ class _Layout:
 
 
 @functools.lru_cache(maxsize=64)
-def _layout(sizes: tuple[tuple[int, int], ...], device: str) -> _Layout:
+def _layout(sizes: Sizes, device: str) -> _Layout:
     return _Layout(sizes, device)
-
-
-@wp.kernel(enable_backward=False)
-def _copy(
-    # in
-    values: wp.array(dtype=wp.vec3),
-    # out
-    copies: wp.array(dtype=wp.vec3),
-):
-    """A thread owns a value."""
-    thread = wp.tid()
-    copies[thread] = values[thread]
-
-
-@wp.kernel(enable_backward=False)
-def _add(
-    # in
-    values: wp.array(dtype=wp.vec3),
-    # out
-    sums: wp.array(dtype=wp.vec3),
-):
-    """A thread owns a sum."""
-    thread = wp.tid()
-    sums[thread] = sums[thread] + values[thread]
 
 
 @wp.func
@@ -121,6 +97,15 @@ def _shares(coarse: int, fine_count: int, coarse_count: int):
     return wp.vec3(float(coarse_count - coarse), float(coarse_count), float(coarse + 1)) / float(fine_count)
 
 
+@wp.func
+def _covered(texel: int, fine: wp.vec3i, coarse: wp.vec3i):
+    """First of the 3 × 3 fine texels around a coarse one, and what part of it their columns and rows are."""
+    row = texel // coarse[1]
+    column = texel - row * coarse[1]
+    start = fine[0] + 2 * row * fine[1] + 2 * column
+    return start, _shares(column, fine[1], coarse[1]), _shares(row, fine[2], coarse[2])
+
+
 @wp.kernel(enable_backward=False)
 def _halve(
     # in
@@ -134,11 +119,7 @@ def _halve(
     batch, thread = wp.tid()
     of_instance = texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        row = texel // coarse[1]
-        column = texel - row * coarse[1]
-        across = _shares(column, fine[1], coarse[1])
-        down = _shares(row, fine[2], coarse[2])
-        start = fine[0] + 2 * row * fine[1] + 2 * column
+        start, across, down = _covered(texel, fine, coarse)
         mean = wp.vec3()
         for i in range(3):
             if down[i] > 0.0:
@@ -161,11 +142,7 @@ def _halve_adjoint(
     batch, thread = wp.tid()
     of_instance = adj_texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        row = texel // coarse[1]
-        column = texel - row * coarse[1]
-        across = _shares(column, fine[1], coarse[1])
-        down = _shares(row, fine[2], coarse[2])
-        start = fine[0] + 2 * row * fine[1] + 2 * column
+        start, across, down = _covered(texel, fine, coarse)
         adj_mean = of_instance[coarse[0] + texel]
         for i in range(3):
             if down[i] > 0.0:
@@ -206,41 +183,49 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
     layout = _layout(sizes, str(device))
     if len(images) == 1 and coarsest == 0:
         return Textures(rows(images[0]), layout.device_levels, layout.device_level_counts, sizes)
-    texels = wp.empty(
-        (common_batch({f"images[{number}]": image for number, image in enumerate(images)}), layout.texel_count),
-        dtype=wp.vec3,
-        device=device,
-        requires_grad=any(image.requires_grad for image in images),
+    batch_count = common_batch({f"images[{number}]": image for number, image in enumerate(images)})
+
+    def fill(texels: wp.array) -> None:
+        with unrecorded():  # Warp's tape would record copies
+            for number, image in enumerate(images):
+                for from_image, to_texels in _finest_levels(image, texels, layout, number):
+                    wp.copy(to_texels, from_image)
+                for fine, coarse in layout.steps(number, coarsest):
+                    _launch_on_level(_halve, fine, coarse, texels)
+
+    texels = differentiable(
+        fill,
+        lambda adj_texels: gather_levels(adj_texels, [image.grad for image in images], sizes, coarsest=coarsest),
+        result=wp.empty((batch_count, layout.texel_count), dtype=wp.vec3, device=device),
+        variables=images,
     )
-    for number, image in enumerate(images):
-        for from_image, to_texels in _finest(image, texels, layout, number):
-            _launch(_copy, to_texels.size, [from_image], [to_texels])
-        for fine, coarse in layout.steps(number, coarsest):
-            _launch_on_level(_halve, fine, coarse, texels)
-
-    def adjoint() -> None:
-        for number, image in enumerate(images):
-            if image.requires_grad:
-                _add_to_image(image.grad, texels.grad, layout, number, coarsest)
-
-    record_adjoint(adjoint, [*images, texels])
     return Textures(texels, layout.device_levels, layout.device_level_counts, sizes)
 
 
-def _add_to_image(
-    adj_image: wp.array, adj_texels: wp.array, layout: _Layout, number: int, coarsest: int | None
+def gather_levels(
+    adj_texels: wp.array, adj_images: Sequence[wp.array | None], sizes: Sizes, *, coarsest: int | None
 ) -> None:
-    """Gather the gradients of all levels of a texture, the coarsest first, in its image."""
-    for fine, coarse in reversed(layout.steps(number, coarsest)):
-        _launch_on_level(_halve_adjoint, fine, coarse, adj_texels)
-    for to_image, from_texels in _finest(adj_image, adj_texels, layout, number):
-        _launch(_add, to_image.size, [from_texels], [to_image])
+    """The adjoint of :func:`mip_pyramids`: add the gradients of all levels to those of the images.
+
+    Args:
+        adj_texels: Of the texels, vec3 of shape [batch, texel]; those of finer levels gather what coarser ones have.
+        adj_images: Of the images, vec3 of shape [batch, height, width]; None for those that want none.
+        sizes: Height and width of each image.
+        coarsest: Coarsest level that has gradients, None for the last.
+    """
+    layout = _layout(sizes, str(adj_texels.device))
+    for number, image in enumerate(adj_images):
+        if image is not None:
+            for fine, coarse in reversed(layout.steps(number, coarsest)):
+                _launch_on_level(_halve_adjoint, fine, coarse, adj_texels)
+            for to_image, from_texels in _finest_levels(image, adj_texels, layout, number):
+                accumulate(from_texels, to_image)
 
 
-def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
+def _finest_levels(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> list[tuple[wp.array, wp.array]]:
     """An image [height · width] and the texels of its finest level, in each instance."""
     first, width, height = layout.levels[number, 0].tolist()
-    flat = image.reshape((image.shape[0], width * height))
+    flat = rows(image)
     return [
         (flat[min(batch, image.shape[0] - 1)], texels[batch, first : first + width * height])
         for batch in range(texels.shape[0])
@@ -250,10 +235,4 @@ def _finest(image: wp.array, texels: wp.array, layout: _Layout, number: int) -> 
 def _launch_on_level(kernel: wp.Kernel, fine: wp.vec3i, coarse: wp.vec3i, texels: wp.array) -> None:
     """Launch for a coarse level of every instance."""
     run = run_length(texels.device, coarse[1])
-    _launch(kernel, (texels.shape[0], coarse[1] * coarse[2] // run), [fine, coarse, run], [texels])
-
-
-def _launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
-    """Launch off the tape, on the device of the first array."""
-    device = next(value.device for value in [*inputs, *outputs] if isinstance(value, wp.array))
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)
+    launch(kernel, (texels.shape[0], coarse[1] * coarse[2] // run), inputs=[fine, coarse, run], outputs=[texels])

@@ -1,24 +1,39 @@
 """Samples of textures: the mean over a footprint, and its adjoint."""
 
-import numpy as np
+import math
+from collections.abc import Sequence
+
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, rows
-from warpshadow.device.parallel import launch_slices, split_row
-from warpshadow.device.tape import record_adjoint
-from warpshadow.stages.rasterize import Fragments, run_length
+from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.parallel import run_length, split_row
+from warpshadow.stages.interpolate import add_to_corners, adj_weights, at_point
+from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.textures.footprint import Footprints
-from warpshadow.stages.textures.pyramid import Textures, _add_to_image, _launch, _layout
+from warpshadow.stages.textures.pyramid import Textures
 
-_SAMPLE_COST = 10.0
+_COST = 10.0
 """Nanoseconds that a sample takes."""
 
-# A probe reaches beyond its width, so a line of n probes may be this many widths longer than n widths. Of 0 to 1, a
-# quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
+
+@wp.struct
+class _Sampled:
+    """The faces and the parts of textures that samples see, all but their colors."""
+
+    face_ids: wp.array2d(dtype=wp.int32)
+    barycentrics: wp.array2d(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    levels: wp.array2d(dtype=wp.vec3i)
+    level_counts: wp.array(dtype=wp.int32)
+    texture_ids: wp.array2d(dtype=wp.int32)
+    uvs: wp.array2d(dtype=wp.vec2)
+    probes: wp.array2d(dtype=wp.vec4)
+    run: int  # samples that a thread owns
 
 
-# ---------------------------------------------------------------------------------------------------- reflectance
+# ---------------------------------------------------------------------------------------------------- colors
 
 
 @wp.func
@@ -140,73 +155,30 @@ def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, 
 
 @wp.func
 def _color(
+    sampled: _Sampled,
+    instance: int,
     sample: int,
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
     vertex_albedo: wp.array(dtype=wp.vec3),
     texels: wp.array(dtype=wp.vec3),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array(dtype=wp.int32),
-    uvs: wp.array(dtype=wp.vec2),
-    probes: wp.array(dtype=wp.vec4),
 ):
-    """What a sample reflects."""
-    texture = texture_ids[sample]
+    """What a sample of an instance reflects."""
+    footprint = instance_in(instance, sampled.texture_ids.shape[0])
+    texture = sampled.texture_ids[footprint, sample]
     color = wp.vec3()
     if texture >= 0:
-        line = probes[sample]
-        level, coarse_part = _level_of(line[2], level_counts[texture])
-        color = _filtered(texels, levels[texture, level], uvs[sample], line)
+        line = sampled.probes[footprint, sample]
+        uv = sampled.uvs[footprint, sample]
+        level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
+        color = _filtered(texels, sampled.levels[texture, level], uv, line)
         if coarse_part > 0.0:
-            coarse = _filtered(texels, levels[texture, level + 1], uvs[sample], line)
+            coarse = _filtered(texels, sampled.levels[texture, level + 1], uv, line)
             color = (1.0 - coarse_part) * color + coarse_part * coarse
     else:
-        face = face_ids[sample]
+        view = instance_in(instance, sampled.face_ids.shape[0])
+        face = sampled.face_ids[view, sample]
         if face >= 0:
-            weights = barycentrics[sample]
-            color = (
-                weights[0] * vertex_albedo[faces[face][0]]
-                + weights[1] * vertex_albedo[faces[face][1]]
-                + weights[2] * vertex_albedo[faces[face][2]]
-            )
+            color = at_point(vertex_albedo, sampled.faces[face], sampled.barycentrics[view, sample])
     return color
-
-
-@wp.func
-def _color_adjoint(
-    sample: int,
-    face_ids: wp.array(dtype=wp.int32),
-    barycentrics: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array(dtype=wp.int32),
-    uvs: wp.array(dtype=wp.vec2),
-    probes: wp.array(dtype=wp.vec4),
-    instance: int,
-    adj_color: wp.vec3,
-    adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
-    adj_texels: wp.array2d(dtype=wp.vec3),
-):
-    """The adjoint of `_color` by what reflects."""
-    texture = texture_ids[sample]
-    if texture >= 0:
-        if adj_texels:
-            adj_of_instance = adj_texels[wp.min(instance, adj_texels.shape[0] - 1)]
-            line = probes[sample]
-            level, coarse_part = _level_of(line[2], level_counts[texture])
-            _scatter(adj_of_instance, levels[texture, level], uvs[sample], line, (1.0 - coarse_part) * adj_color)
-            if coarse_part > 0.0:
-                _scatter(adj_of_instance, levels[texture, level + 1], uvs[sample], line, coarse_part * adj_color)
-    elif adj_vertex_albedo:
-        face = face_ids[sample]
-        if face >= 0:
-            row = wp.min(instance, adj_vertex_albedo.shape[0] - 1)
-            weights = barycentrics[sample]
-            for corner in range(3):
-                wp.atomic_add(adj_vertex_albedo, row, faces[face][corner], weights[corner] * adj_color)
 
 
 @wp.kernel(enable_backward=False)
@@ -214,165 +186,65 @@ def _sample(
     first_row: int,
     worker: int,
     # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
+    sampled: _Sampled,
     vertex_albedo: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array2d(dtype=wp.int32),
-    uvs: wp.array2d(dtype=wp.vec2),
-    probes: wp.array2d(dtype=wp.vec4),
-    run: int,
-    # out
-    albedo: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a run of samples."""
-    instance, thread = split_row(first_row + wp.tid(), texture_ids.shape[1] // run)
-    footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    fragment = wp.min(instance, face_ids.shape[0] - 1)
-    of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
-    of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-    for sample in range(thread * run, (thread + 1) * run):
-        albedo[instance, sample] = _color(
-            sample,
-            face_ids[fragment],
-            barycentrics[fragment],
-            faces,
-            of_vertices,
-            of_instance,
-            levels,
-            level_counts,
-            texture_ids[footprint],
-            uvs[footprint],
-            probes[footprint],
-        )
-
-
-@wp.kernel(enable_backward=False)
-def _expose(
-    first_row: int,
-    worker: int,
-    # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    vertex_albedo: wp.array2d(dtype=wp.vec3),
-    texels: wp.array2d(dtype=wp.vec3),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array2d(dtype=wp.int32),
-    uvs: wp.array2d(dtype=wp.vec2),
-    probes: wp.array2d(dtype=wp.vec4),
-    run: int,
     white: wp.array2d(dtype=wp.vec4),
     # out
-    samples: wp.array2d(dtype=wp.vec4),
+    albedo: wp.array2d(dtype=wp.vec3),
+    exposed: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples."""
-    instance, thread = split_row(first_row + wp.tid(), texture_ids.shape[1] // run)
-    footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    fragment = wp.min(instance, face_ids.shape[0] - 1)
-    of_vertices = vertex_albedo[wp.min(instance, vertex_albedo.shape[0] - 1)]
-    of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-    lit = wp.min(instance, white.shape[0] - 1)
-    for sample in range(thread * run, (thread + 1) * run):
-        color = _color(
-            sample,
-            face_ids[fragment],
-            barycentrics[fragment],
-            faces,
-            of_vertices,
-            of_instance,
-            levels,
-            level_counts,
-            texture_ids[footprint],
-            uvs[footprint],
-            probes[footprint],
-        )
-        samples[instance, sample] = wp.cw_mul(white[lit, sample], wp.vec4(color[0], color[1], color[2], 1.0))
+    """A thread owns a run of samples: what they reflect or, if samples of white surfaces are given, their exposure."""
+    instance, thread = split_row(first_row + wp.tid(), sampled.texture_ids.shape[1] // sampled.run)
+    of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
+    of_textures = texels[instance_in(instance, texels.shape[0])]
+    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
+        color = _color(sampled, instance, sample, of_vertices, of_textures)
+        if exposed:
+            light = white[instance_in(instance, white.shape[0]), sample]
+            exposed[instance, sample] = wp.cw_mul(light, wp.vec4(color[0], color[1], color[2], 1.0))
+        else:
+            albedo[instance, sample] = color
 
 
 @wp.kernel(enable_backward=False)
-def _sample_adjoint_by_albedo(
+def _sample_adjoint_by_colors(
     # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array2d(dtype=wp.int32),
-    uvs: wp.array2d(dtype=wp.vec2),
-    probes: wp.array2d(dtype=wp.vec4),
-    run: int,
+    sampled: _Sampled,
+    white: wp.array2d(dtype=wp.vec4),
     adj_albedo: wp.array2d(dtype=wp.vec3),
+    adj_exposed: wp.array2d(dtype=wp.vec4),
     # out
     adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by what reflects."""
     instance, thread = wp.tid()
-    footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    fragment = wp.min(instance, face_ids.shape[0] - 1)
-    for sample in range(thread * run, (thread + 1) * run):
-        _color_adjoint(
-            sample,
-            face_ids[fragment],
-            barycentrics[fragment],
-            faces,
-            levels,
-            level_counts,
-            texture_ids[footprint],
-            uvs[footprint],
-            probes[footprint],
-            instance,
-            adj_albedo[instance, sample],
-            adj_vertex_albedo,
-            adj_texels,
-        )
-
-
-@wp.kernel(enable_backward=False)
-def _expose_adjoint(
-    # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array2d(dtype=wp.int32),
-    uvs: wp.array2d(dtype=wp.vec2),
-    probes: wp.array2d(dtype=wp.vec4),
-    run: int,
-    white: wp.array2d(dtype=wp.vec4),
-    adj_samples: wp.array2d(dtype=wp.vec4),
-    # out
-    adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
-    adj_texels: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a run of samples: the adjoint of `_expose` by what reflects."""
-    instance, thread = wp.tid()
-    footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    fragment = wp.min(instance, face_ids.shape[0] - 1)
-    lit = wp.min(instance, white.shape[0] - 1)
-    for sample in range(thread * run, (thread + 1) * run):
-        adj_color = wp.cw_mul(white[lit, sample], adj_samples[instance, sample])
-        _color_adjoint(
-            sample,
-            face_ids[fragment],
-            barycentrics[fragment],
-            faces,
-            levels,
-            level_counts,
-            texture_ids[footprint],
-            uvs[footprint],
-            probes[footprint],
-            instance,
-            wp.vec3(adj_color[0], adj_color[1], adj_color[2]),
-            adj_vertex_albedo,
-            adj_texels,
-        )
+    footprint = instance_in(instance, sampled.texture_ids.shape[0])
+    view = instance_in(instance, sampled.face_ids.shape[0])
+    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
+        adj_color = wp.vec3()
+        if adj_exposed:
+            adj = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_exposed[instance, sample])
+            adj_color = wp.vec3(adj[0], adj[1], adj[2])
+        else:
+            adj_color = adj_albedo[instance, sample]
+        texture = sampled.texture_ids[footprint, sample]
+        if texture >= 0:
+            if adj_texels:
+                adj_of_textures = adj_texels[instance_in(instance, adj_texels.shape[0])]
+                line = sampled.probes[footprint, sample]
+                uv = sampled.uvs[footprint, sample]
+                level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
+                fine_color = (1.0 - coarse_part) * adj_color
+                _scatter(adj_of_textures, sampled.levels[texture, level], uv, line, fine_color)
+                if coarse_part > 0.0:
+                    _scatter(adj_of_textures, sampled.levels[texture, level + 1], uv, line, coarse_part * adj_color)
+        elif adj_vertex_albedo:
+            face = sampled.face_ids[view, sample]
+            if face >= 0:
+                adj_of_vertices = adj_vertex_albedo[instance_in(instance, adj_vertex_albedo.shape[0])]
+                add_to_corners(adj_of_vertices, sampled.faces[face], sampled.barycentrics[view, sample], adj_color)
 
 
 @wp.func
@@ -391,18 +263,11 @@ def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, step:
 
 
 @wp.kernel(enable_backward=False)
-def _sample_adjoint_by_place(
+def _sample_adjoint_by_places(
     # in
-    face_ids: wp.array2d(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
+    sampled: _Sampled,
     vertex_albedo: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
-    levels: wp.array2d(dtype=wp.vec3i),
-    level_counts: wp.array(dtype=wp.int32),
-    texture_ids: wp.array2d(dtype=wp.int32),
-    uvs: wp.array2d(dtype=wp.vec2),
-    probes: wp.array2d(dtype=wp.vec4),
-    run: int,
     adj_albedo: wp.array2d(dtype=wp.vec3),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
@@ -411,27 +276,27 @@ def _sample_adjoint_by_place(
 ):
     """A thread owns a run of samples: the adjoint of `_sample` by where on their faces, and how wide, they are."""
     instance, thread = wp.tid()
-    footprint = wp.min(instance, texture_ids.shape[0] - 1)
-    for sample in range(thread * run, (thread + 1) * run):
-        texture = texture_ids[footprint, sample]
+    footprint = instance_in(instance, sampled.texture_ids.shape[0])
+    of_textures = texels[instance_in(instance, texels.shape[0])]
+    for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
+        texture = sampled.texture_ids[footprint, sample]
         adj_color = adj_albedo[instance, sample]
         if texture >= 0:
-            of_instance = texels[wp.min(instance, texels.shape[0] - 1)]
-            line = probes[footprint, sample]
+            line = sampled.probes[footprint, sample]
             count = line[3]
-            level, coarse_part = _level_of(line[2], level_counts[texture])
+            level, coarse_part = _level_of(line[2], sampled.level_counts[texture])
             reach = _reach(count)
             adj_u = float(0.0)
             adj_v = float(0.0)
             adj_line = wp.vec4()
             for probe in range(-reach, reach + 1):
-                uv = uvs[footprint, sample]
+                uv = sampled.uvs[footprint, sample]
                 step = float(probe) * wp.vec2(line[0], line[1])
                 weight = _share(probe, count) / count
-                slopes = _slopes(of_instance, levels[texture, level], uv, step, adj_color)
+                slopes = _slopes(of_textures, sampled.levels[texture, level], uv, step, adj_color)
                 adj_width = float(0.0)
                 if coarse_part > 0.0:
-                    coarse = _slopes(of_instance, levels[texture, level + 1], uv, step, adj_color)
+                    coarse = _slopes(of_textures, sampled.levels[texture, level + 1], uv, step, adj_color)
                     adj_width = weight * (coarse[2] - slopes[2]) / float(1 << level)
                     slopes += coarse_part * (coarse - slopes)
                 # as the line grows, the outermost probes gain half a width each, and all share a longer line
@@ -449,14 +314,11 @@ def _sample_adjoint_by_place(
                     adj_line[3] = 0.0
                 wp.atomic_add(adj_probes, footprint, sample, adj_line)
         elif adj_barycentrics:
-            fragment = wp.min(instance, face_ids.shape[0] - 1)
-            face = face_ids[fragment, sample]
+            view = instance_in(instance, sampled.face_ids.shape[0])
+            face = sampled.face_ids[view, sample]
             if face >= 0:
-                row = wp.min(instance, vertex_albedo.shape[0] - 1)
-                adj_weights = wp.vec3()
-                for corner in range(3):
-                    adj_weights[corner] = wp.dot(vertex_albedo[row, faces[face][corner]], adj_color)
-                wp.atomic_add(adj_barycentrics, fragment, sample, adj_weights)
+                of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
+                wp.atomic_add(adj_barycentrics, view, sample, adj_weights(of_vertices, sampled.faces[face], adj_color))
 
 
 def sample_albedo(
@@ -471,8 +333,8 @@ def sample_albedo(
         faces: Vertex indices, vec3i of shape [face].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex]; not seen on textured faces.
         textures: The textures.
-        footprints: Of the samples, from :func:`find_footprints` with textures of these sizes.
-            Any batch may be 1 and then serves every instance.
+        footprints: Of the samples, from :func:`warpshadow.stages.textures.footprint.find_footprints`, with textures of
+            these sizes. Any batch may be 1 and then serves every instance.
 
     Returns:
         Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
@@ -483,28 +345,26 @@ def sample_albedo(
     Differentiable: textures, footprints, vertex_albedo, barycentrics of the fragments.
     """
     arrays = {"fragments": fragments.barycentrics, "vertex_albedo": vertex_albedo, "textures": textures.texels}
-    _check_samples(arrays, fragments, footprints)
-    reflecting = [vertex_albedo, textures.texels]
-    placed = [fragments.barycentrics, footprints.uvs, footprints.probes]
-    albedo = wp.empty(
-        (common_batch(arrays | {"footprints": footprints.uvs}), *fragments.face_ids.shape[1:]),
-        dtype=wp.vec3,
-        device=vertex_albedo.device,
-        requires_grad=any(array.requires_grad for array in [*reflecting, *placed]),
+    shape = _checked_shape(arrays, fragments, footprints)
+    colors, places = [vertex_albedo, textures.texels], [fragments.barycentrics, footprints.uvs, footprints.probes]
+    sampled = _make_sampled(textures, footprints, fragments, faces)
+
+    def adjoint(adj_albedo: wp.array) -> None:
+        if varies(colors):
+            inputs = [sampled, None, rows(adj_albedo), None]
+            outputs = [array.grad for array in colors]
+            launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=outputs)
+        if varies(places):
+            inputs = [sampled, *colors, rows(adj_albedo)]
+            outputs = [rows(array.grad) for array in places]
+            launch(_sample_adjoint_by_places, _runs(adj_albedo), inputs=inputs, outputs=outputs)
+
+    return differentiable(
+        lambda albedo: _launch_sample([sampled, *colors, None], albedo, [rows(albedo), None]),
+        adjoint,
+        result=wp.empty(shape, dtype=wp.vec3, device=faces.device),
+        variables=[*colors, *places],
     )
-    seen, dim, flat = _seen(textures, footprints), _threads(albedo), rows(albedo)
-    _launch_samples(_sample, dim, [*fragments.rows, faces, *reflecting, *seen], flat)
-
-    def adjoint() -> None:
-        if any(array.requires_grad for array in reflecting):
-            inputs = [*fragments.rows, faces, *seen, flat.grad]
-            _launch(_sample_adjoint_by_albedo, dim, inputs, [array.grad for array in reflecting])
-        if any(array.requires_grad for array in placed):
-            inputs = [fragments.rows[0], faces, *reflecting, *seen, flat.grad]
-            _launch(_sample_adjoint_by_place, dim, inputs, [rows(array.grad) for array in placed])
-
-    record_adjoint(adjoint, [*reflecting, *placed, albedo])
-    return albedo
 
 
 def expose_albedo(
@@ -533,98 +393,63 @@ def expose_albedo(
 
     Differentiable: textures, vertex_albedo. Not: fragments, footprints, white.
     """
-    arrays = {"fragments": fragments.face_ids, "vertex_albedo": vertex_albedo, "textures": textures.texels}
-    _check_samples(arrays, fragments, footprints)
     check.shape("white", white.shape, ("batch", *fragments.face_ids.shape[1:]))
-    reflecting = [vertex_albedo, textures.texels]
-    samples = wp.empty(
-        (common_batch(arrays | {"footprints": footprints.uvs, "white": white}), *white.shape[1:]),
-        dtype=wp.vec4,
-        device=vertex_albedo.device,
-        requires_grad=any(array.requires_grad for array in reflecting),
+    arrays = {"fragments": fragments.face_ids, "vertex_albedo": vertex_albedo, "textures": textures.texels}
+    shape = _checked_shape(arrays | {"white": white}, fragments, footprints)
+    colors = [vertex_albedo, textures.texels]
+    sampled = _make_sampled(textures, footprints, fragments, faces)
+    return differentiable(
+        lambda exposed: _launch_sample([sampled, *colors, rows(white)], exposed, [None, rows(exposed)]),
+        lambda adj_exposed: launch(
+            _sample_adjoint_by_colors,
+            _runs(adj_exposed),
+            inputs=[sampled, rows(white), None, rows(adj_exposed)],
+            outputs=[array.grad for array in colors],
+        ),
+        result=wp.empty(shape, dtype=wp.vec4, device=faces.device),
+        variables=colors,
     )
-    seen, dim, flat = [*_seen(textures, footprints), rows(white)], _threads(samples), rows(samples)
-    _launch_samples(_expose, dim, [*fragments.rows, faces, *reflecting, *seen], flat)
-
-    def adjoint() -> None:
-        inputs = [*fragments.rows, faces, *seen, flat.grad]
-        _launch(_expose_adjoint, dim, inputs, [array.grad for array in reflecting])
-
-    record_adjoint(adjoint, [*reflecting, samples])
-    return samples
 
 
-def _check_samples(arrays: dict[str, wp.array], fragments: Fragments, footprints: Footprints) -> None:
+def add_to_texels(adj_texels: wp.array, textures: Textures, footprints: Footprints, adj_albedo: wp.array) -> None:
+    """The adjoint of :func:`sample_albedo` by the texels alone.
+
+    Args:
+        adj_texels: Gradients of the texels, to which it adds, vec3 of shape [batch, texel].
+        textures: The textures.
+        footprints: Of the samples.
+        adj_albedo: Gradients of what the samples reflect, vec3 of shape [batch, height, width].
+    """
+    inputs = [_make_sampled(textures, footprints), None, rows(adj_albedo), None]
+    launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=[None, adj_texels])
+
+
+def _checked_shape(arrays: dict[str, wp.array], fragments: Fragments, footprints: Footprints) -> tuple[int, ...]:
+    """Shape of an image of samples."""
+    size = fragments.face_ids.shape[1:]
     check.shape("vertex_albedo", arrays["vertex_albedo"].shape, ("batch", "vertex"))
-    check.shape("footprints", footprints.uvs.shape, ("batch", *fragments.face_ids.shape[1:]))
+    check.shape("footprints", footprints.uvs.shape, ("batch", *size))
+    return common_batch(arrays | {"footprints": footprints.uvs}), *size
 
 
-def _threads(samples: wp.array) -> tuple[int, int]:
-    """Instances and the runs of samples of each."""
-    batch_count, height, width = samples.shape
-    return batch_count, height * width // run_length(samples.device, width)
+def _make_sampled(
+    textures: Textures, footprints: Footprints, fragments: Fragments | None = None, faces: wp.array | None = None
+) -> _Sampled:
+    sampled = _Sampled()
+    if fragments is not None:
+        (sampled.face_ids, sampled.barycentrics), sampled.faces = fragments.rows, faces
+    sampled.levels, sampled.level_counts = textures.levels, textures.level_counts
+    sampled.texture_ids, sampled.uvs, sampled.probes = footprints.rows
+    sampled.run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
+    return sampled
 
 
-def _launch_samples(kernel: wp.Kernel, dim: tuple[int, int], inputs: list, samples: wp.array) -> None:
-    """Launch for all samples [batch, sample]."""
-    cost = _SAMPLE_COST * samples.shape[1] / dim[1]
-    launch_slices(kernel, [dim[0] * dim[1]], cost=cost, inputs=inputs, outputs=[samples], device=samples.device)
+def _runs(images: wp.array) -> tuple[int, int]:
+    """Instances, and the runs of samples of each."""
+    batch_count, height, width = images.shape
+    return batch_count, height * width // run_length(images.device, width)
 
 
-def _seen(textures: Textures, footprints: Footprints) -> list:
-    """What kernels take of textures, but for the texels, and of footprints; and how many samples a thread owns."""
-    run = run_length(footprints.uvs.device, footprints.uvs.shape[2])
-    return [textures.levels, textures.level_counts, *footprints.rows, run]
-
-
-# ---------------------------------------------------------------------------------------------------- export
-
-
-def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
-    """Sum what each texel weighs in the samples of all images that see it.
-
-    Args:
-        textures: The textures; what is in them does not matter.
-        footprints: Of the samples, from :func:`find_footprints`.
-
-    Returns:
-        For each texture the weights of its texels, float32 of shape [batch, height, width]: 0 where none sees the
-        texel, and small where it is only seen as a part of a coarser level.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-    """
-    device = footprints.uvs.device
-    layout = _layout(textures.sizes, str(device))
-    batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
-    weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
-    ones = wp.ones((batch_count, *footprints.uvs.shape[1:]), dtype=wp.vec3, device=device)
-    inputs = [None, None, None, *_seen(textures, footprints), rows(ones)]
-    _launch(_sample_adjoint_by_albedo, _threads(ones), inputs, [None, weights])
-    images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
-    for number, image in enumerate(images):
-        _add_to_image(image, weights, layout, number, footprints.coarsest_level())
-    return [image.numpy()[..., 0].copy() for image in images]
-
-
-def fill_unseen(texture: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Give texels that were never seen the color of the nearest one that was, so that seams do not bleed.
-
-    Args:
-        texture: Linear RGB, shape [height, width, 3].
-        weights: What each texel weighs in the images (:func:`seen_texels`), shape [height, width].
-
-    Returns:
-        The texture, filled, shape [height, width, 3]; unchanged where no texel was seen.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    check.shape("texture", texture.shape, ("height", "width", 3))
-    check.shape("weights", weights.shape, texture.shape[:2])
-    if not weights.any():
-        return texture.copy()
-    row, column = distance_transform_edt(weights == 0, return_distances=False, return_indices=True)
-    return texture[row, column]
+def _launch_sample(inputs: Sequence, images: wp.array, outputs: Sequence[wp.array | None]) -> None:
+    dim = math.prod(_runs(images))
+    launch(_sample, dim, cost=_COST * images.size / dim, inputs=inputs, outputs=outputs)

@@ -1,0 +1,164 @@
+"""Interpolate: what an attribute of the vertices is worth at the samples.
+
+At a point of a face with corners i, j, k and barycentrics w it is a = w₀ a_i + w₁ a_j + w₂ a_k. Its adjoint gives each
+corner the part w of the point's gradient ā, and each barycentric ā · a of its corner.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import run_length, split_row
+from warpshadow.device.warp_internals import scalar_type
+from warpshadow.stages.rasterize import Fragments
+
+_COST = 5.0
+"""Nanoseconds that a sample takes, either way."""
+
+
+@wp.func
+def at_point(values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3):
+    """A value of the vertices at a point of a face."""
+    return weights[0] * values[corners[0]] + weights[1] * values[corners[1]] + weights[2] * values[corners[2]]
+
+
+@wp.func
+def add_to_corners(adj_values: wp.array(dtype=Any), corners: wp.vec3i, weights: wp.vec3, adj: Any):
+    """The adjoint of `at_point` by the values."""
+    wp.atomic_add(adj_values, corners[0], weights[0] * adj)
+    wp.atomic_add(adj_values, corners[1], weights[1] * adj)
+    wp.atomic_add(adj_values, corners[2], weights[2] * adj)
+
+
+@wp.func
+def inner(a: float, b: float):
+    """Inner product of attributes of any dtype."""
+    return a * b
+
+
+@wp.func  # type: ignore[no-redef]
+def inner(a: Any, b: Any):  # noqa: F811
+    """Inner product of attributes of any dtype."""
+    return wp.dot(a, b)
+
+
+@wp.func
+def adj_weights(values: wp.array(dtype=Any), corners: wp.vec3i, adj: Any):
+    """The adjoint of `at_point` by the weights."""
+    return wp.vec3(inner(adj, values[corners[0]]), inner(adj, values[corners[1]]), inner(adj, values[corners[2]]))
+
+
+@functools.cache
+def _make_interpolate(dtype: type) -> wp.Kernel:
+    """Make the kernel for attributes of a dtype."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def interpolate(
+        first_row: int,
+        worker: int,
+        # in
+        face_ids: wp.array2d(dtype=wp.int32),
+        barycentrics: wp.array2d(dtype=wp.vec3),
+        faces: wp.array(dtype=wp.vec3i),
+        attributes: wp.array2d(dtype=dtype),
+        run: int,
+        # out
+        image: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns a run of samples; the image is zero before."""
+        instance, thread = split_row(first_row + wp.tid(), image.shape[1] // run)
+        view = instance_in(instance, face_ids.shape[0])
+        values = attributes[instance_in(instance, attributes.shape[0])]
+        for sample in range(thread * run, (thread + 1) * run):
+            face = face_ids[view, sample]
+            if face >= 0:
+                image[instance, sample] = at_point(values, faces[face], barycentrics[view, sample])
+
+    return interpolate
+
+
+@functools.cache
+def _make_interpolate_adjoint(dtype: type) -> wp.Kernel:
+    """Make its adjoint."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def interpolate_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        face_ids: wp.array2d(dtype=wp.int32),
+        barycentrics: wp.array2d(dtype=wp.vec3),
+        faces: wp.array(dtype=wp.vec3i),
+        attributes: wp.array2d(dtype=dtype),
+        run: int,
+        adj_image: wp.array2d(dtype=dtype),
+        # out
+        adj_barycentrics: wp.array2d(dtype=wp.vec3),
+        adj_attributes: wp.array2d(dtype=dtype),
+    ):
+        """A thread owns a run of samples of all instances."""
+        thread = first_row + wp.tid()
+        for instance in range(adj_image.shape[0]):
+            view = instance_in(instance, face_ids.shape[0])
+            row = instance_in(instance, attributes.shape[0])
+            values = attributes[row]
+            for sample in range(thread * run, (thread + 1) * run):
+                face = face_ids[view, sample]
+                if face >= 0:
+                    adj = adj_image[instance, sample]
+                    if adj_barycentrics:
+                        by_weights = adj_weights(values, faces[face], adj)
+                        adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + by_weights
+                    if adj_attributes:
+                        add_to_corners(adj_attributes[row], faces[face], barycentrics[view, sample], adj)
+
+    return interpolate_adjoint
+
+
+def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> wp.array:
+    """Interpolate an attribute of the vertices over the samples, perspective-correct.
+
+    Args:
+        fragments: What each sample sees.
+        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology
+            of the same mesh (uv_faces), face by face.
+        attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute].
+            Either batch may be 1 and then serves every instance of the other.
+    Returns:
+        Image, dtype of the attributes, shape [batch, height, width], zero where there is no face.
+    Raises:
+        ValueError: naming the argument, what it got and what it accepts.
+    Differentiable: attributes, barycentrics of the fragments.
+    """
+    face_ids = fragments.face_ids
+    check.shape("attributes", attributes.shape, ("batch", "attribute"))
+    instances = common_batch({"fragments": face_ids, "attributes": attributes})
+    if scalar_type(attributes.dtype) is not wp.float32:
+        raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
+    device, width = face_ids.device, face_ids.shape[2]
+    run = run_length(device, width)
+    run_count = face_ids[0].size // run
+    inputs = [*fragments.rows, faces, attributes, run]
+    return differentiable(
+        lambda image: launch(
+            _make_interpolate(attributes.dtype),
+            instances * run_count,
+            cost=_COST * run,
+            inputs=inputs,
+            outputs=[rows(image)],
+        ),
+        lambda adj_image: launch(
+            _make_interpolate_adjoint(attributes.dtype),
+            run_count,
+            cost=_COST * run * instances,
+            inputs=[*inputs, rows(adj_image)],
+            outputs=[rows(fragments.barycentrics.grad)],
+            sums=[attributes.grad],
+        ),
+        result=wp.zeros((instances, *face_ids.shape[1:]), dtype=attributes.dtype, device=device),
+        variables=[fragments.barycentrics, attributes],
+    )

@@ -1,0 +1,134 @@
+"""Screen: where samples, lines and planes lie in an image.
+
+An image consists of *samples*: its pixels, or the parts of pixels at which a supersampled image is evaluated. All
+stages that ask where something lies in an image agree on this:
+
+    sample        number row · width + column, from the top left; in flat images of a batch, instances follow each other
+    position      (x, y) from −1 to 1, x to the right and y downwards: the x/w and y/w of clip space
+    center        of the sample at (column, row): ((2 column + 1) / width − 1, (2 row + 1) / height − 1)
+    vertex        its (x, y, w) in clip space; z is for depth alone
+    relative      (x − w x₀, y − w y₀, w), relative to the ray through a position (x₀, y₀): nothing cancels near the ray
+    line          ℓ with ℓ·(x, y, 1) = 0; a × b is the line through vertices a and b
+    plane         n with n·(x, y, w) = 1; relative to a ray, n_w is the 1/w at which the ray meets it
+    way           from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above. Its axis is way/2
+    distance      from a sample's center along a way, 1 at the neighbor's center [samples]
+"""
+
+import warp as wp
+
+# ---------------------------------------------------------------------------------------------------- samples
+
+
+@wp.func
+def center(column: int, row: int, width: int, height: int):
+    """Position of a sample's center."""
+    x = float(2 * column + 1 - width) / float(width)
+    y = float(2 * row + 1 - height) / float(height)
+    return wp.vec2(x, y)
+
+
+@wp.func
+def sample_center(sample: int, width: int, height: int):
+    """Position of the center of a sample of flat images."""
+    row = sample / width
+    return center(sample - row * width, row % height, width, height)
+
+
+@wp.func
+def half_size(width: int, height: int):
+    """Samples in a unit of position, across and down."""
+    return 0.5 * wp.vec2(float(width), float(height))
+
+
+@wp.func
+def neighbor(sample: int, way: int, width: int):
+    """The next sample on a way."""
+    step = wp.where(way < 2, 1, width)
+    return sample + wp.where(way % 2 == 0, step, -step)
+
+
+@wp.func
+def has_neighbor(sample: int, way: int, width: int, height: int):
+    """Whether the image goes on that way."""
+    row = sample / width
+    place = wp.where(way < 2, sample - row * width, row % height)
+    last = wp.where(way < 2, width, height) - 1
+    return wp.where(way % 2 == 0, place < last, place > 0)
+
+
+@wp.func
+def opposite(way: int):
+    """The way back."""
+    return wp.where(way % 2 == 0, way + 1, way - 1)
+
+
+@wp.func
+def sense(way: int):
+    """1 where a way leads to larger positions, else −1."""
+    return 1.0 - 2.0 * float(way % 2)
+
+
+# ---------------------------------------------------------------------------------------------------- faces
+
+
+@wp.func
+def relative(vertex: wp.vec4, position: wp.vec2):
+    """A vertex relative to the ray through a position."""
+    return wp.vec3(vertex[0] - position[0] * vertex[3], vertex[1] - position[1] * vertex[3], vertex[3])
+
+
+@wp.func
+def relative_adjoint(position: wp.vec2, adj_relative: wp.vec3):
+    """The adjoint of `relative`, by the vertex."""
+    return wp.vec4(
+        adj_relative[0],
+        adj_relative[1],
+        0.0,
+        adj_relative[2] - position[0] * adj_relative[0] - position[1] * adj_relative[1],
+    )
+
+
+@wp.func
+def volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """What a ray spans with two vertices each, given relative to it: all of one sign inside of the face abc."""
+    return wp.vec3(b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0])
+
+
+@wp.func
+def orientation(a: wp.vec4, b: wp.vec4, c: wp.vec4):
+    """Volume that the eye spans with a face: its sign says which way around the face is seen."""
+    origin = wp.vec3(a[0], a[1], a[3])
+    return wp.dot(wp.cross(wp.vec3(b[0], b[1], b[3]) - origin, wp.vec3(c[0], c[1], c[3]) - origin), origin)
+
+
+@wp.func
+def plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
+    """Plane of a face, relative to the ray through a position."""
+    a = relative(clip_positions[corners[0]], position)
+    b = relative(clip_positions[corners[1]], position)
+    c = relative(clip_positions[corners[2]], position)
+    normal = wp.cross(b - a, c - a)
+    return normal / wp.dot(normal, a)
+
+
+# ---------------------------------------------------------------------------------------------------- lines
+
+
+@wp.func
+def distance(line: wp.vec3, way: int, half: wp.vec2):
+    """Distance at which a line, relative to a sample's center, crosses a way from there; ``half`` is `half_size`."""
+    axis = way / 2
+    return -sense(way) * half[axis] * line[2] / line[axis]
+
+
+@wp.func
+def lean(line: wp.vec3, way: int, half: wp.vec2):
+    """How far along a way a line moves from one row (or column) of samples to the next [samples]."""
+    axis = way / 2
+    return wp.abs(line[1 - axis] / line[axis]) * half[axis] / half[1 - axis]
+
+
+@wp.func
+def ends_before(line: wp.vec3, way: int):
+    """Whether a line, positive on the surface that ends there, bounds the surface of the sample, not its neighbor."""
+    return -sense(way) * line[way / 2] > 0.0

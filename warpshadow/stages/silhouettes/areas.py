@@ -1,0 +1,140 @@
+"""Areas: how much of a sample lies beyond the lines around it, and how that changes with the vertices.
+
+A line crosses the way to a neighbor at distance t, and leans by m samples a sample (at most 1). Of the sample lies
+beyond it
+
+    e = ½ − t                     t ≤ (1 − m)/2
+        ((1 + m)/2 − t)² / 2m     between
+        0                         t ≥ (1 + m)/2
+
+The line of an edge with ends a, b is ℓ = a × b, and that where two faces intersect ℓ = n − n′, the difference of their
+planes. In a row, where ℓ·(x, y, 1) = 0, lines move by
+
+    dx = (α ℓ·da + β ℓ·db) / ℓ_x                            α, β: the point on the edge is α a + β b, with w = 1
+    dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of what the samples see, u: its 1/w
+
+How m changes is left out: it hardly matters to what two samples take of each other on balance (1e-4 of the gradient by
+a rigid motion), and at edges far below a sample it would outweigh the rest, pulling their ends opposite ways.
+"""
+
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.stages.screen import (
+    distance,
+    half_size,
+    lean,
+    neighbor,
+    plane,
+    relative,
+    relative_adjoint,
+    sample_center,
+    sense,
+)
+from warpshadow.stages.silhouettes.lines import NOTHING, Seen, image_of, line_between
+
+wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
+
+
+@wp.kernel(enable_backward=False)
+def _measure(
+    # in
+    samples: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    seen: Seen,
+    # out
+    shares: wp.array2d(dtype=wp.vec2),
+):
+    """A thread owns a way of an entry: the area e beyond the line there, and how much it counts, ω."""
+    entry, way = wp.tid()
+    edge = edges[entry, way]
+    share = wp.vec2()
+    if edge[0] != NOTHING:
+        half = half_size(seen.width, seen.height)
+        line = line_between(seen, samples[entry], way, edge)
+        t = wp.clamp(distance(line, way, half), 0.0, 1.0)
+        steepness = lean(line, way, half)
+        m = wp.min(steepness, 1.0)
+        area = float(0.0)
+        if t <= 0.5 * (1.0 - m):
+            area = 0.5 - t
+        elif t < 0.5 * (1.0 + m):
+            rest = 0.5 * (1.0 + m) - t
+            area = 0.5 * rest * rest / m
+        if wp.isfinite(line / line[way / 2]):  # else vertices are so far away that products overflow
+            share = wp.vec2(area, 1.0 / (1.0 + steepness * steepness * steepness * steepness))
+    shares[entry, way] = share
+
+
+@wp.kernel(enable_backward=False)
+def _measure_adjoint(
+    # in
+    samples: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    seen: Seen,
+    adj_areas: wp.array2d(dtype=wp.float32),
+    # out
+    adj_clip_positions: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a way of an entry: it pulls at the vertices of the line there."""
+    entry, way = wp.tid()
+    edge = edges[entry, way]
+    adj_area = adj_areas[entry, way]
+    if edge[0] != NOTHING and adj_area != 0.0:
+        axis = way / 2
+        sample = samples[entry]
+        batch = image_of(seen, sample)
+        clip = seen.clip_positions[batch]
+        half = half_size(seen.width, seen.height)
+        center = sample_center(sample, seen.width, seen.height)
+        line = line_between(seen, sample, way, edge)
+        t = wp.clamp(distance(line, way, half), 0.0, 1.0)
+        m = wp.min(lean(line, way, half), 1.0)
+        decline = float(0.0)  # of e with t
+        if t <= 0.5 * (1.0 - m):
+            decline = 1.0
+        elif t < 0.5 * (1.0 + m):
+            decline = (0.5 * (1.0 + m) - t) / m
+        adj_place = -sense(way) * adj_area * decline * half[axis]  # by the line's x in a row, or y in a column
+        if edge[0] >= 0:
+            across_a = relative(clip[edge[0]], center)[1 - axis]
+            across_b = relative(clip[edge[1]], center)[1 - axis]
+            spread = wp.where(axis == 0, -line[0], line[1])
+            pull = adj_place * relative_adjoint(center, line / line[axis])
+            wp.atomic_add(adj_clip_positions, batch, edge[0], (across_b / spread) * pull)
+            wp.atomic_add(adj_clip_positions, batch, edge[1], (-across_a / spread) * pull)
+        else:
+            for end in range(2):
+                at = sample
+                sign = float(1.0)
+                if end == 1:
+                    at = neighbor(sample, way, seen.width)
+                    sign = -1.0
+                corners = seen.faces[seen.face_ids[at]]
+                ray = sample_center(at, seen.width, seen.height)
+                normal = plane(corners, ray, clip)
+                pull = sign * adj_place * (normal[2] / line[axis]) * relative_adjoint(ray, normal)
+                for k in range(3):
+                    wp.atomic_add(adj_clip_positions, batch, corners[k], seen.barycentrics[at][k] * pull)
+
+
+def measure_areas(samples: wp.array, edges: wp.array, seen: Seen) -> wp.array:
+    """Measure what lies beyond the lines beside samples.
+
+    Args:
+        samples: Of each entry, int32 of shape [entry].
+        edges: Vertices of the line on each way, vec2i of shape [entry, 4].
+        seen: What the samples see.
+
+    Returns:
+        (e, ω), the area beyond each line, and how much it counts; vec2 of shape [entry, 4], zero where there is none.
+    """
+    shares = wp.empty(edges.shape, dtype=wp.vec2, device=edges.device)
+    launch(_measure, edges.shape, inputs=[samples, edges, seen], outputs=[shares])
+    return shares
+
+
+def add_to_vertices(samples: wp.array, edges: wp.array, seen: Seen, adj_areas: wp.array) -> None:
+    """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
+    adj_clip_positions = seen.clip_positions.grad
+    launch(_measure_adjoint, edges.shape, inputs=[samples, edges, seen, adj_areas], outputs=[adj_clip_positions])

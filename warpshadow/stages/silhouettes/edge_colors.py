@@ -1,0 +1,121 @@
+"""Edge colors: the colors that surfaces have where they end, by which moving edges change an image."""
+
+import warp as wp
+
+from warpshadow.device.batch import instance_in, rows
+from warpshadow.device.launch import launch
+from warpshadow.stages.screen import (
+    distance,
+    ends_before,
+    half_size,
+    has_neighbor,
+    neighbor,
+    opposite,
+    relative,
+    sample_center,
+)
+from warpshadow.stages.sides import join_side, split_side
+from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.silhouettes.lines import NOTHING, Seen, image_of, line_between, make_seen
+
+wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
+
+
+@wp.kernel(enable_backward=False)
+def _find_edge_colors(
+    # in
+    image: wp.array2d(dtype=wp.vec4),
+    samples: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    seen: Seen,
+    sides: wp.array(dtype=wp.int32),
+    shading: wp.array2d(dtype=wp.vec3),
+    receivers: wp.array(dtype=wp.int32),
+    albedo: wp.array2d(dtype=wp.vec3),
+    # out
+    edge_colors: wp.array3d(dtype=wp.vec4),
+):
+    """A thread owns an entry's sample of an image."""
+    instance, entry = wp.tid()
+    sample = samples[entry]
+    if sample >= 0:
+        batch = image_of(seen, sample)
+        of_receivers = shading[instance_in(instance + batch, shading.shape[0])]
+        of_samples = albedo[instance_in(instance + batch, albedo.shape[0])]
+        center = sample_center(sample, seen.width, seen.height)
+        half = half_size(seen.width, seen.height)
+        clip = seen.clip_positions[batch]
+        here = image[instance, sample]
+        for way in range(4):
+            edge = edges[entry, way]
+            if edge[0] != NOTHING:
+                line = line_between(seen, sample, way, edge)
+                color = here
+                back = opposite(way)
+                if edges[entry, back][0] == NOTHING and has_neighbor(sample, back, seen.width, seen.height):
+                    rise = here - image[instance, neighbor(sample, back, seen.width)]
+                    if rise[3] == 0.0:
+                        color += wp.clamp(distance(line, way, half), 0.0, 1.0) * rise
+                if edge[0] >= 0 and ends_before(line, way):
+                    is_back = bool(False)
+                    if sides:
+                        _, is_back = split_side(sides[sample], seen.faces.shape[0])
+                    first = receivers[join_side(edge[0], is_back, clip.shape[0])]
+                    second = receivers[join_side(edge[1], is_back, clip.shape[0])]
+                    if wp.min(first, second) >= 0:
+                        across_a = relative(clip[edge[0]], center)[1 - way / 2]
+                        across_b = relative(clip[edge[1]], center)[1 - way / 2]
+                        place = wp.clamp(across_a / (across_a - across_b), 0.0, 1.0)
+                        received = wp.lerp(of_receivers[first], of_receivers[second], place)
+                        received = wp.cw_mul(received, of_samples[sample % (seen.width * seen.height)])
+                        color = wp.vec4(received[0], received[1], received[2], 1.0)
+                edge_colors[instance, entry, way] = wp.where(wp.isfinite(color), color, here)
+
+
+def find_edge_colors(
+    image: wp.array,
+    silhouettes: Silhouettes,
+    clip_positions: wp.array,
+    shading: wp.array,
+    receivers: wp.array,
+    albedo: wp.array,
+) -> wp.array:
+    """Find the colors that surfaces have at the edges themselves.
+
+    Shading changes fastest where a surface turns away from the eye: over the last half sample of a ball, by a tenth. So
+    the color of the near surface, which ends at the edge, is interpolated between the edge's vertices. The far surface
+    has no vertices there: its color is extrapolated linearly from the two nearest samples that see it.
+
+    Args:
+        image: Color and coverage before smoothing, vec4 of shape [batch, height, width].
+        silhouettes: Of :func:`find_silhouettes`.
+        clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex].
+        shading: Of the receivers, vec3 of shape [batch, receiver].
+        receivers: Receiver of each vertex, −1 for none, int32 of shape [vertex]; where the silhouettes' fragments have
+            sides, those of their backs follow.
+        albedo: Of the samples, vec3 of shape [batch, height, width].
+
+    Returns:
+        For each way of each entry the color at the edge of what the entry's sample sees, vec4 of shape
+        [instance, entry, 4], for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.
+
+    Not differentiable.
+    """
+    fragments, shape = silhouettes.fragments, silhouettes.flat_shape(image)
+    edge_colors = wp.zeros((shape[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
+    launch(
+        _find_edge_colors,
+        edge_colors.shape[:2],
+        inputs=[
+            image.reshape(shape),
+            silhouettes.samples,
+            silhouettes.edges,
+            make_seen(fragments, silhouettes.faces, clip_positions),
+            None if fragments.sides is None else fragments.sides.flatten(),
+            shading,
+            receivers,
+            rows(albedo),
+        ],
+        outputs=[edge_colors],
+    )
+    return edge_colors

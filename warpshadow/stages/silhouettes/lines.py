@@ -1,0 +1,55 @@
+"""Lines: what separates neighboring samples that see different surfaces, an edge or where two faces intersect."""
+
+import warp as wp
+
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.screen import neighbor, plane, relative, sample_center
+
+NOTHING = -1
+INTERSECTION = -2
+"""In place of an edge's vertices, where there is no line, and where there is that of two faces."""
+
+
+@wp.struct
+class Seen:
+    """What samples see, as kernels take it: arrays of flat images, in which those of a batch follow each other."""
+
+    face_ids: wp.array(dtype=wp.int32)
+    barycentrics: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    clip_positions: wp.array2d(dtype=wp.vec4)
+    width: int
+    height: int
+
+
+def make_seen(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -> Seen:
+    """What samples see, of rasterized faces of vertices in clip space."""
+    seen = Seen()
+    seen.face_ids, seen.barycentrics = fragments.flat
+    seen.faces, seen.clip_positions = faces, clip_positions
+    _, seen.height, seen.width = fragments.face_ids.shape
+    return seen
+
+
+@wp.func
+def image_of(seen: Seen, sample: int):
+    """Number of the image that has a sample of flat images."""
+    return sample / (seen.width * seen.height)
+
+
+@wp.func
+def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
+    """The line of an edge, relative to a position."""
+    return wp.cross(relative(clip_positions[edge[0]], position), relative(clip_positions[edge[1]], position))
+
+
+@wp.func
+def line_between(seen: Seen, sample: int, way: int, edge: wp.vec2i):
+    """The line ℓ between a sample and its neighbor on a way, relative to the sample's center."""
+    position = sample_center(sample, seen.width, seen.height)
+    clip = seen.clip_positions[image_of(seen, sample)]
+    if edge[0] >= 0:
+        return edge_line(edge, position, clip)
+    here = seen.faces[seen.face_ids[sample]]
+    there = seen.faces[seen.face_ids[neighbor(sample, way, seen.width)]]
+    return plane(here, position, clip) - plane(there, position, clip)
