@@ -1,6 +1,8 @@
 """Reflectance: what the samples of a view reflect, by albedo of bodies and vertices and by textures."""
 
+import copy
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -34,15 +36,22 @@ class Materials:
         images: The textures that there are.
         sizes: Heights and widths of the bodies' textures, None without one.
         vertex_albedo: Node of the reflectance of all vertices.
-        pyramids: Node of the mip levels of the textures.
+        pyramids: Node of the mip levels of the textures, all of them.
     """
 
     def __init__(self, assembly: Assembly, albedo: Source, textures: Source):
-        self.assembly, self.albedo, self.textures = assembly, albedo, textures
-        self.images = [image for image in textures.value() if image is not None]
-        self.sizes = tuple([None if image is None else image.shape[1:] for image in textures.value()])
-        counts = np.diff(assembly.first_vertex).tolist()
-        self.vertex_albedo = Node("", lambda colors: concatenate(colors, counts), albedo)
+        self.assembly = assembly
+        self._take_albedo(albedo)
+        self._take_textures(textures)
+
+    def _take_albedo(self, albedo: Source) -> None:
+        counts = np.diff(self.assembly.first_vertex).tolist()
+        self.albedo, self.vertex_albedo = albedo, Node("", lambda colors: concatenate(colors, counts), albedo)
+
+    def _take_textures(self, textures: Source) -> None:
+        self.textures, images = textures, textures.value()
+        self.images = [image for image in images if image is not None]
+        self.sizes = tuple([None if image is None else image.shape[1:] for image in images])
         self.pyramids = self.pyramids_to(lambda: None)
 
     @classmethod
@@ -58,15 +67,15 @@ class Materials:
         return cls(assembly, albedo, textures)
 
     def replaced(self, albedo: Given, textures: Given) -> "Materials":
-        """Those with what is given in place of some, checked; the same where nothing is given."""
+        """A copy that has what is given in place of some, checked; nodes of the others are the same."""
         bodies = self.assembly.scene.bodies
-        colors, images, news = list(self.albedo.value()), list(self.textures.value()), {}
+        colors, images = list(self.albedo.value()), list(self.textures.value())
         for number, color in enumerate(albedo or ()):
             if color is not None:
                 vertex_count = bodies[number].mesh.vertex_count
                 check.shape(f"albedo[{number}]", color.shape, ("batch", 1 if color.shape[1:] == (1,) else vertex_count))
                 check.finite_arrays({f"albedo[{number}]": color})
-                colors[number], images[number], news["albedo"] = color, None, "albedo is given"
+                colors[number], images[number] = color, None
         for number, image in enumerate(textures or ()):
             if image is not None:
                 check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
@@ -75,14 +84,13 @@ class Materials:
                 if albedo is not None and albedo[number] is not None:
                     raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
                 check.finite_arrays({f"textures[{number}]": image})
-                images[number], news["textures"] = image, "textures are given"
-        if not news:
-            return self
-        return Materials(
-            self.assembly,
-            Source("albedo", colors, news=news.get("albedo", "")),
-            Source("textures", images, news=news.get("textures", "")),
-        )
+                images[number] = image
+        materials = copy.copy(self)
+        if not all(map(operator.is_, colors, self.albedo.value())):
+            materials._take_albedo(Source("albedo", colors, news="albedo is given"))
+        if not all(map(operator.is_, images, self.textures.value())):
+            materials._take_textures(Source("textures", images, news="textures are given"))
+        return materials
 
     def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
         """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
@@ -130,11 +138,11 @@ class SeenSurfaces:
 
     def reflect(self, albedo: Given, textures: Given) -> Reflection:
         """Wire what samples reflect; that of the scene's materials is kept."""
-        materials = self._materials.replaced(albedo, textures)
-        if materials is not self._materials:
+        materials, own = self._materials.replaced(albedo, textures), self._materials
+        if materials.albedo is not own.albedo or materials.textures is not own.textures:
             return self._reflect(materials)
         if self._reflection is None:
-            self._reflection = self._reflect(materials)
+            self._reflection = self._reflect(own)
         return self._reflection
 
     def _reflect(self, materials: Materials) -> Reflection:

@@ -9,7 +9,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
-from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.scene.scene import AUTO, SCENE, Scene
 from warpshadow.tuning import tune
 
 
@@ -32,8 +32,9 @@ class Renderer(renderer.Renderer):
     ):
         check.instance("scene", scene, Scene, SCENE)
         check_basis(basis)
-        chosen = tune.resolved(scene, device=check.device("device", device), progress=progress)
-        super().__init__(chosen, cameras=cameras, device=device, basis=basis, progress=progress)
+        if scene.visibility.method == AUTO:
+            scene = tune.resolved(scene, device=check.device("device", device), progress=progress)
+        super().__init__(scene, cameras=cameras, device=device, basis=basis, progress=progress)
 
 
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
