@@ -5,6 +5,7 @@ mesh included; an iteration is then a matrix product and a gather.
 """
 
 import functools
+import json
 import os
 import sys
 import threading
@@ -103,16 +104,17 @@ class TorchRenderer(torch.nn.Module):
             self.warp = self.warp.moved(str(moved.device))
         return super()._apply(fn, recurse)
 
-    def get_extra_state(self) -> dict[str, object]:
-        """What tensors beside it refer to, for ``state_dict``."""
+    def get_extra_state(self) -> torch.Tensor:
+        """What tensors beside it refer to, for ``state_dict``: JSON as bytes, since some formats hold tensors alone."""
         bodies = [[body.called, body.mesh.vertex_count] for body in self.scene.bodies]
-        return {"basis": type(self.basis).__name__, "coefficients": self.basis.size, "bodies": bodies}
+        meaning = {"basis": type(self.basis).__name__, "coefficients": self.basis.size, "bodies": bodies}
+        return torch.tensor(list(json.dumps(meaning).encode()), dtype=torch.uint8)
 
-    def set_extra_state(self, state: object) -> None:
+    def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        own = self.get_extra_state()
-        if state != own:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {state}, expected {own}")
+        given, own = (bytes(each.tolist()).decode() for each in (state, self.get_extra_state()))
+        if given != own:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {given}, expected {own}")
 
     @one_at_a_time
     def forward(
