@@ -103,7 +103,17 @@ def test_a_source_has_the_values_that_it_was_given():
     assert Source.renewed("vertices", given, first) is not first
 
 
-def test_an_array_and_its_version_are_the_same_without_a_look_at_their_values(monkeypatch):
+def test_a_write_that_torch_does_not_count_is_seen():
+    numbers = np.ones((1, 3), np.float32)
+    given = wp.array(numbers, dtype=wp.float32, device="cpu", copy=False)
+    given.version = 7
+    first = Source.renewed("radii", given, None)
+    numbers[:] = 2
+    assert given.numpy()[0, 0] == 2 and Source.renewed("radii", given, first) is not first
+
+
+def test_on_a_gpu_an_array_and_its_version_are_the_same_without_a_look_at_their_values(monkeypatch):
+    monkeypatch.setattr("warpshadow.pipeline.node.is_readable", lambda device: False)
     given = array()
     given.version = 7
     first = Source.renewed("spheres", (given, given), None)

@@ -46,8 +46,8 @@ class Source:
     def renewed(cls, name: str, given: Any, last: "Source | None") -> "Source":
         """A source of a copy of what is given now; the last source where that is the same.
 
-        An array at the same place with the same ``version``, a number that counts the writes to it, is the same. Other
-        arrays are compared on a CPU. On a GPU, which would have to wait for that, they count as others.
+        On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same that lies at the
+        same place and has the same ``version``, a number that counts the writes to it; others are not.
         """
         source = cls(name, given)
         if source.requires_grad:
@@ -84,11 +84,11 @@ def _is_same(given: Any, last: Source) -> bool:
 
 
 def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
-    """Whether an array is another, not written to since, or has the values of a copy of that."""
+    """Whether an array has the values of a copy; on a GPU, whether it is the array before, not written to since."""
+    if is_readable(array.device):  # it sees writes by NumPy, which torch does not count; 20 µs for 35,000 vertices
+        return np.array_equal(array.numpy(), copy.numpy())
     marks = [(each.ptr, each.shape, each.strides, getattr(each, "version", None)) for each in (array, before)]
-    if before is not array and marks[0] == marks[1] and marks[0][-1] is not None:
-        return True
-    return is_readable(array.device) and np.array_equal(array.numpy(), copy.numpy())
+    return before is not array and marks[0] == marks[1] and marks[0][-1] is not None
 
 
 class Node:
