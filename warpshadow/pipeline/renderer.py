@@ -66,9 +66,6 @@ class Renderer:
         basis: What free light is expressed in.
         clock: How long stages took; with ``clock.waits``, stages on a GPU are waited for.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Threads may share it: their calls come one after another. Copied or pickled, it takes along what it was made of, and
     the copy computes the rest anew when it is asked for.
     """
@@ -219,9 +216,6 @@ class Renderer:
             clip_matrices: Cameras, mat44 of shape [batch], by default :attr:`clip_matrices`; see
                 :func:`warpshadow.stages.project.compose_clip_matrices`.
 
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
-
         Differentiable: geometry, clip_matrices.
         """
         is_scenes = geometry is None and clip_matrices is None
@@ -361,7 +355,7 @@ class Renderer:
             What each receiver, as a white surface, reflects: vec3 of shape [batch, receiver].
 
         Raises:
-            ValueError: naming the argument; so where rays are asked for a gradient to geometry.
+            ValueError: where rays are asked for a gradient to geometry.
 
         Differentiable: light, view.
         """
@@ -385,9 +379,6 @@ class Renderer:
 
         Returns:
             vec3 of shape [batch, height, width].
-
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
 
         Differentiable: albedo, textures, view.
         """
@@ -438,9 +429,6 @@ class Renderer:
 
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-
-        Raises:
-            ValueError: naming the argument, what it got and what it accepts.
 
         Differentiable: light, albedo, textures, view.
         """

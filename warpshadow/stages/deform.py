@@ -117,7 +117,7 @@ class DeformationGraph:
             device: Where the graph lives.
 
         Raises:
-            ValueError: naming the argument; so when there are too few nodes.
+            ValueError: when there are too few nodes.
         """
         from scipy.spatial import cKDTree
 

@@ -100,9 +100,6 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: shading, albedo, barycentrics of the fragments.
     """
     _, height, width = fragments.face_ids.shape

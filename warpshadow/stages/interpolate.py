@@ -130,8 +130,6 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
             Either batch may be 1 and then serves every instance of the other.
     Returns:
         Image, dtype of the attributes, shape [batch, height, width], zero where there is no face.
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     Differentiable: attributes, barycentrics of the fragments.
     """
     face_ids = fragments.face_ids

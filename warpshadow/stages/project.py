@@ -52,8 +52,6 @@ def compose_clip_matrices(
         near: Distance of the near plane [scene units].
     Returns:
         As :meth:`Camera.clip_matrix`, mat44 of shape [batch].
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     Differentiable: intrinsics (so focal lengths and principal point), rotations, translations.
     """
     width, height = check.image_size(size)
@@ -90,8 +88,6 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
             Either batch may be 1 and then serves every instance of the other.
     Returns:
         Clip positions, vec4, shape [batch, vertex].
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     Differentiable: positions, clip_matrices.
     """
     check.finite_arrays({"clip_matrices": clip_matrices})

@@ -361,7 +361,7 @@ def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int
     Returns:
         Fragments. Distances along the view are ``interpolate(fragments, faces, w)``.
     Raises:
-        ValueError: naming the argument; so for NaN or Inf positions and for indices of no vertex. (Reading
+        ValueError: for NaN or Inf positions and for indices of no vertex. (Reading
             the two counts back waits for the device. While a CUDA graph is captured that cannot be, and
             nothing is checked.)
     Differentiable: barycentrics in clip_positions. Not: face_ids; nor a weight that is clamped to 0 where

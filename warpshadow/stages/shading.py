@@ -169,9 +169,6 @@ def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -
     Returns:
         Shading, vec3 of shape [batch, vertex].
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))

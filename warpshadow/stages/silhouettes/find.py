@@ -376,9 +376,6 @@ def find_silhouettes(
         Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. While a
         CUDA graph is captured they have one for each sample instead, and nothing is read.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Not differentiable: which lines lie between which samples changes at isolated poses only.
     """
     check.shape("neighbors", neighbors.shape, faces.shape)

@@ -129,9 +129,6 @@ def smooth_silhouettes(
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: image, clip_positions. Without edge colors an edge has those of the samples beside it: where shading
     changes by δ over a sample there, its gradient is δ/2 off. None have intersections within one surface, cuts
     by the near plane, and what leaves the image: there is no neighbor to take from.

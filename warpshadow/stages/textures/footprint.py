@@ -190,9 +190,6 @@ def find_footprints(
     Returns:
         Footprints.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint
     included, which matter: neglected, they were 1% to 15% of the gradient of a textured plane's pose.
     """

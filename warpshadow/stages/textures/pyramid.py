@@ -166,9 +166,6 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
     Returns:
         All levels, those beyond the coarsest unwritten or left out. One image without coarser levels is not copied.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: images.
     """
     if not images:

@@ -339,9 +339,6 @@ def sample_albedo(
     Returns:
         Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
 
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
-
     Differentiable: textures, footprints, vertex_albedo, barycentrics of the fragments.
     """
     arrays = {"fragments": fragments.barycentrics, "vertex_albedo": vertex_albedo, "textures": textures.texels}
@@ -387,9 +384,6 @@ def expose_albedo(
 
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
 
     Differentiable: textures, vertex_albedo. Not: fragments, footprints, white.
     """

@@ -20,9 +20,6 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     Returns:
         For each texture the weights of its texels, float32 of shape [batch, height, width]: 0 where none sees the
         texel, and small where it is only seen as a part of a coarser level.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
     device = footprints.uvs.device
     batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
@@ -43,9 +40,6 @@ def fill_unseen(texture: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     Returns:
         The texture, filled, shape [height, width, 3]; unchanged where no texel was seen.
-
-    Raises:
-        ValueError: naming the argument, what it got and what it accepts.
     """
     from scipy.ndimage import distance_transform_edt
 
