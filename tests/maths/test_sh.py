@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import roots_legendre
 
-from warpshadow.device.lanes import lane_functions, lane_type, module_options
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options
 from warpshadow.maths import sh
 from warpshadow.stages import sh_kernels
 
@@ -270,9 +270,12 @@ def test_bands_left_out_of_the_second_factor_are_as_if_zero():
 @functools.cache
 def turn_and_multiply_kernel(order, lanes):
     Lane, Zonal = lane_type(lanes), sh_kernels.zonal_type(order, lanes)
-    fn = lane_functions(lanes)
+    fn = make_lane_functions(lanes)
     load, load_rows, store_rows = fn.load, fn.load_rows, fn.store_rows
-    add_rotated_zonal, multiply = sh_kernels.add_rotated_zonal(order, lanes), sh_kernels.multiply(order, lanes)
+    add_rotated_zonal, multiply = (
+        sh_kernels.make_add_rotated_zonal(order, lanes),
+        sh_kernels.make_multiply(order, lanes),
+    )
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def turn_and_multiply(
@@ -280,9 +283,7 @@ def turn_and_multiply_kernel(order, lanes):
         zonals: wp.array2d(dtype=wp.float32),
         directions: wp.array(dtype=wp.vec3),
         factors: wp.array2d(dtype=wp.float32),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: sh_kernels.ProductTable,
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
@@ -300,11 +301,10 @@ def turn_and_multiply_kernel(order, lanes):
         zonal = Zonal()
         for band in range(order):
             zonal[band] = zonal_rows[band]
-        x, y, z = load(directions, group)
         load_rows(factors, group, turned_rows)  # to be added to
-        add_rotated_zonal(x, y, z, zonal, turned_rows)
+        add_rotated_zonal(load(directions, group), zonal, turned_rows)
         store_rows(turned_rows, group, turned)
-        multiply(turned_rows, factor_rows, first, pairs, values, product_rows)
+        multiply(turned_rows, factor_rows, table, product_rows)
         store_rows(product_rows, group, product)
 
     return turn_and_multiply
@@ -325,7 +325,7 @@ def test_kernel_functions_turn_add_and_multiply_like_numpy(order, lanes, device)
             wp.array(zonals, device=device),
             wp.array(directions, dtype=wp.vec3, device=device),
             wp.array(factors, device=device),
-            *sh_kernels.product_table(order, device),
+            sh_kernels.product_table(order, device),
             wp.empty((groups, 4, order**2), dtype=lane_type(lanes), device=device),
         ],
         outputs=[turned, product],

@@ -7,8 +7,8 @@ import pytest
 import twins
 import warp as wp
 
-from warpshadow.device.lanes import lane_functions, lane_type, module_options
-from warpshadow.stages.visibility.cones import BLEND, FADE, TINY_RADIUS, cone_function
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options
+from warpshadow.stages.visibility.cones import BLEND, FADE, TINY_RADIUS, make_cone
 
 # cos θ and sin²θ where they are exact: a few float32 roundings.
 FLOAT32 = 3e-7
@@ -23,7 +23,7 @@ FUSED = {"cpu_compiler_flags": "-march=native -ffp-contract=fast"}
 @functools.cache
 def cone_kernel(lanes, is_fused):
     Lane = lane_type(lanes)
-    load, cone = lane_functions(lanes).load, cone_function(lanes)
+    load, find_cone = make_lane_functions(lanes).load, make_cone(lanes)
 
     options = module_options(lanes) | (FUSED if is_fused else {})
 
@@ -37,14 +37,13 @@ def cone_kernel(lanes, is_fused):
     ):
         """A thread owns a group of receivers that see one sphere."""
         group = wp.tid()
-        x, y, z = load(offsets, group)
-        ux, uy, uz, cosine, sine2, weight = cone(x, y, z, radii[group])
-        result[group, 0] = ux
-        result[group, 1] = uy
-        result[group, 2] = uz
-        result[group, 3] = cosine
-        result[group, 4] = sine2
-        result[group, 5] = weight
+        cone = find_cone(load(offsets, group), 1.0 / radii[group])
+        result[group, 0] = cone.axis.x
+        result[group, 1] = cone.axis.y
+        result[group, 2] = cone.axis.z
+        result[group, 3] = cone.cosine
+        result[group, 4] = cone.sine2
+        result[group, 5] = cone.weight
 
     return write_cones
 

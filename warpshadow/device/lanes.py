@@ -6,7 +6,7 @@ vector register has floats on a CPU, 1 on a GPU, where threads play that part. A
 only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
 
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times what else could be chosen.
+are, so the width is among the flags. ``python demos/benchmark.py --lanes`` times what else could be chosen.
 """
 
 import contextlib
@@ -125,7 +125,7 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
     return " ".join((base, *(flag for flag in flags if flag not in refused)))
 
 
-def _make_empty(flags: str) -> wp.Kernel:
+def _empty_kernel(flags: str) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
     def do_nothing():
         """What the compiler makes of the flags is all that matters."""
@@ -136,7 +136,7 @@ def _make_empty(flags: str) -> wp.Kernel:
 def _builds(flags: str) -> bool:
     """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
     try:
-        wp.launch(_make_empty(flags), dim=1, device="cpu", record_tape=False)
+        wp.launch(_empty_kernel(flags), dim=1, device="cpu", record_tape=False)
     except Exception:  # Warp raises no other
         return False
     return True
@@ -170,15 +170,34 @@ def lane_type(lanes: int) -> type:
     return wp.types.vector(length=lanes, dtype=wp.float32)
 
 
+@functools.cache
+def vectors_type(lanes: int) -> Any:
+    """Struct of the coordinates of a 3D vector for each receiver of a thread."""
+    Lane = lane_type(lanes)
+
+    @wp.struct
+    class Vectors:
+        x: Lane
+        y: Lane
+        z: Lane
+
+    return Vectors
+
+
 class LaneFunctions(NamedTuple):
     """Kernel functions on lanes that Warp's vectors lack."""
 
     is_any_above: wp.Function
+    dot: wp.Function
+    along: wp.Function
+    offset: wp.Function
+    scale: wp.Function
+    add: wp.Function
+    subtract: wp.Function
     find_group: wp.Function
     load: wp.Function
     load_products: wp.Function
     add_vectors: wp.Function
-    add_to_sphere: wp.Function
     load_rows: wp.Function
     add_rows: wp.Function
     store_rows: wp.Function
@@ -188,9 +207,9 @@ class LaneFunctions(NamedTuple):
 
 
 @functools.cache
-def lane_functions(lanes: int) -> LaneFunctions:
+def make_lane_functions(lanes: int) -> LaneFunctions:
     """Make the kernel functions for a number of lanes."""
-    Lane = lane_type(lanes)
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     # Warp's maximum and sum of a vector go from item to item, each waiting for the one before.
     @wp.func_native(f"""
@@ -212,6 +231,32 @@ def lane_functions(lanes: int) -> LaneFunctions:
     """)
     def total(value: Lane) -> float: ...  # type: ignore[empty-body]
 
+    @wp.func(inline=True)
+    def dot(a: Vectors, b: Vectors):
+        return wp.cw_mul(a.x, b.x) + wp.cw_mul(a.y, b.y) + wp.cw_mul(a.z, b.z)
+
+    @wp.func(inline=True)
+    def along(direction: wp.vec3, a: Vectors):
+        """Dot products with one direction."""
+        return direction[0] * a.x + direction[1] * a.y + direction[2] * a.z
+
+    @wp.func(inline=True)
+    def offset(center: wp.vec3, points: Vectors):
+        """From each point to a center."""
+        return Vectors(Lane(center[0]) - points.x, Lane(center[1]) - points.y, Lane(center[2]) - points.z)
+
+    @wp.func(inline=True)
+    def scale(factor: Lane, a: Vectors):
+        return Vectors(wp.cw_mul(factor, a.x), wp.cw_mul(factor, a.y), wp.cw_mul(factor, a.z))
+
+    @wp.func(inline=True)
+    def add(a: Vectors, b: Vectors):
+        return Vectors(a.x + b.x, a.y + b.y, a.z + b.z)
+
+    @wp.func(inline=True)
+    def subtract(a: Vectors, b: Vectors):
+        return Vectors(a.x - b.x, a.y - b.y, a.z - b.z)
+
     @wp.func
     def find_group(row: int, vertex_count: int):
         """Instance and group of a row, where the groups of all instances follow each other."""
@@ -219,7 +264,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
 
     @wp.func
     def load(values: wp.array(dtype=wp.vec3), group: int):
-        """The x, y and z of a group's vectors."""
+        """A group's vectors."""
         last = values.shape[0] - 1
         x = Lane()
         y = Lane()
@@ -229,7 +274,7 @@ def lane_functions(lanes: int) -> LaneFunctions:
             x[lane] = value[0]
             y[lane] = value[1]
             z[lane] = value[2]
-        return x, y, z
+        return Vectors(x, y, z)
 
     @wp.func
     def load_products(
@@ -249,27 +294,10 @@ def lane_functions(lanes: int) -> LaneFunctions:
             scratch[k] = value
 
     @wp.func
-    def add_vectors(x: Lane, y: Lane, z: Lane, group: int, values: wp.array(dtype=wp.vec3)):
+    def add_vectors(a: Vectors, group: int, values: wp.array(dtype=wp.vec3)):
         """Add to a group's vectors."""
         for lane in range(wp.min(lanes, values.shape[0] - group * lanes)):
-            wp.atomic_add(values, group * lanes + lane, wp.vec3(x[lane], y[lane], z[lane]))
-
-    @wp.func
-    def add_to_sphere(
-        dx: Lane,
-        dy: Lane,
-        dz: Lane,
-        radius: Lane,
-        batch: int,
-        sphere: int,
-        adj_centers: wp.array2d(dtype=wp.vec3),
-        adj_radii: wp.array2d(dtype=wp.float32),
-    ):
-        """Add a group's share to the gradients of a sphere, those that are wanted."""
-        if adj_centers:
-            wp.atomic_add(adj_centers, batch, sphere, wp.vec3(total(dx), total(dy), total(dz)))
-        if adj_radii:
-            wp.atomic_add(adj_radii, batch, sphere, total(radius))
+            wp.atomic_add(values, group * lanes + lane, wp.vec3(a.x[lane], a.y[lane], a.z[lane]))
 
     @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), group: int, scratch: wp.array(dtype=Lane)):
@@ -313,11 +341,16 @@ def lane_functions(lanes: int) -> LaneFunctions:
 
     return LaneFunctions(
         is_any_above,
+        dot,
+        along,
+        offset,
+        scale,
+        add,
+        subtract,
         find_group,
         load,
         load_products,
         add_vectors,
-        add_to_sphere,
         load_rows,
         add_rows,
         store_rows,

@@ -3,12 +3,12 @@
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import lane_type
+from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.device.launch import launch
-from warpshadow.stages.visibility.cones import BLEND, cone_function
+from warpshadow.stages.visibility.cones import BLEND, make_cone
 
-_cone = cone_function(1)
-_Lane = lane_type(1)
+_cone = make_cone(1)
+_Lane, _Vectors = lane_type(1), vectors_type(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -36,8 +36,8 @@ def _exact_occlusion(
                     blocked = wp.uint8(1)
                     break
             else:
-                _x, _y, _z, cosine, _sine2, weight = _cone(_Lane(toward[0]), _Lane(toward[1]), _Lane(toward[2]), radius)
-                if weight[0] > 0.5 and along > cosine[0] * distance:
+                cone = _cone(_Vectors(_Lane(toward[0]), _Lane(toward[1]), _Lane(toward[2])), 1.0 / radius)
+                if cone.weight[0] > 0.5 and along > cone.cosine[0] * distance:
                     blocked = wp.uint8(1)
                     break
     occlusion[batch, vertex, direction] = blocked

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.lanes import lane_type
+from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.stages.visibility.cones import cone_function
+from warpshadow.stages.visibility.cones import make_cone
 
 LANES = 16
 """Directions that a thread handles at once."""
@@ -32,8 +32,8 @@ _PAIR_COST = 0.5
 
 _Lane = lane_type(LANES)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
-_Scalar = lane_type(1)
-_cone = cone_function(1)
+_Scalar, _Vectors = lane_type(1), vectors_type(1)
+_cone = make_cone(1)
 
 # ------------------------------------------------------------------------------------------------- transmittance
 
@@ -56,16 +56,17 @@ def _project_spheres(
     ball = balls[i, sphere]
     radius = ball[3]
     toward = frames[receiver] * (wp.vec3(ball[0], ball[1], ball[2]) - points[receiver])
-    ux, uy, uz, cosines, sines2, weights = _cone(_Scalar(toward[0]), _Scalar(toward[1]), _Scalar(toward[2]), radius)
-    cosine = cosines[0]
-    sine = wp.sqrt(sines2[0])
+    cone = _cone(_Vectors(_Scalar(toward[0]), _Scalar(toward[1]), _Scalar(toward[2])), 1.0 / radius)
+    cosine = cone.cosine[0]
+    sine2 = cone.sine2[0]
+    sine = wp.sqrt(sine2)
     lo = cosine * wp.cos(width) - sine * wp.sin(width)
     inner = wp.max(sine * wp.cos(width) - cosine * wp.sin(width), 0.0)
     hi = wp.sqrt(1.0 - inner * inner)
-    opacity = weights[0] * wp.min((sines2[0] / (1.0 + cosine)) / (1.0 - 0.5 * (hi + lo)), 1.0)
+    opacity = cone.weight[0] * wp.min((sine2 / (1.0 + cosine)) / (1.0 - 0.5 * (hi + lo)), 1.0)
     if toward[2] < -radius - width * wp.length(toward):
         opacity = 0.0  # wholly below the horizon
-    axes[i, sphere] = wp.vec3(ux[0], uy[0], uz[0])
+    axes[i, sphere] = wp.vec3(cone.axis.x[0], cone.axis.y[0], cone.axis.z[0])
     edges[i, sphere] = wp.vec3(lo, 1.0 / (hi - lo), opacity)
 
 

@@ -18,8 +18,8 @@ from warpshadow.device.lanes import (
     as_chunks,
     group_count,
     lane_count,
-    lane_functions,
     lane_type,
+    make_lane_functions,
     module_options,
     use_vector_registers,
 )
@@ -30,10 +30,10 @@ from warpshadow.maths.directions import CHUNK, check_count
 from warpshadow.stages.sh_kernels import (
     PRODUCT_COST,
     ProductTable,
-    add_rotated_zonal,
-    multiply,
+    make_add_rotated_zonal,
+    make_multiply,
+    make_rotated_zonal_adjoint,
     product_table,
-    rotated_zonal_adjoint,
     zonal_type,
 )
 
@@ -46,9 +46,9 @@ wp.set_module_options({"max_unroll": 1})
 @functools.cache
 def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    fn = lane_functions(lanes)
-    find_group, load, load_rows, store_rows = fn.find_group, fn.load, fn.load_rows, fn.store_rows
-    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
+    fn = make_lane_functions(lanes)
+    find_group, dot, load, load_rows, store_rows = fn.find_group, fn.dot, fn.load, fn.load_rows, fn.store_rows
+    add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -58,9 +58,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         # in
         visibility: wp.array3d(dtype=wp.float32),
         normals: wp.array2d(dtype=wp.vec3),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
@@ -73,18 +71,18 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         cosine = scratch[place, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
-        x, y, z = load(normals[batch], group)
+        normal = load(normals[batch], group)
         # there is no cosine around a zero normal
-        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
+        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
-        add_rotated_zonal_(x, y, z, zonal, cosine)
+        add_rotated_zonal(normal, zonal, cosine)
         if wp.static(is_shadowed):
             factor = scratch[place, 1]
             product = scratch[place, 2]
             load_rows(visibility[batch], group, factor)
-            multiply_(factor, cosine, first, pairs, values, product)
+            multiply(factor, cosine, table, product)
             store_rows(product, group, transfer[batch])
         else:
             store_rows(cosine, group, transfer[batch])
@@ -95,11 +93,11 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
 @functools.cache
 def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    fn = lane_functions(lanes)
-    find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
+    fn = make_lane_functions(lanes)
+    find_group, dot, load, load_rows = fn.find_group, fn.dot, fn.load, fn.load_rows
     add_rows, add_vectors = fn.add_rows, fn.add_vectors
-    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
-    rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
+    add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
+    rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -109,9 +107,7 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         # in
         visibility: wp.array3d(dtype=wp.float32),
         normals: wp.array2d(dtype=wp.vec3),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         adj_transfer: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array3d(dtype=Lane),
@@ -126,8 +122,8 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
         adj_row = scratch[place, 0]
         factor = scratch[place, 1]
         product = scratch[place, 2]
-        x, y, z = load(normals[batch], group)
-        is_there = wp.min((wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)) * 1.0e30, Lane(1.0))
+        normal = load(normals[batch], group)
+        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
@@ -138,27 +134,18 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
             if adj_visibility:
                 for i in range(wp.static(order**2)):
                     factor[i] = Lane(0.0)
-                add_rotated_zonal_(x, y, z, zonal, factor)
-                multiply_(factor, adj_row, first, pairs, values, product)
+                add_rotated_zonal(normal, zonal, factor)
+                multiply(factor, adj_row, table, product)
                 add_rows(product, group, adj_visibility[batch])
             load_rows(visibility[batch], group, factor)
-            multiply_(factor, adj_row, first, pairs, values, product)
+            multiply(factor, adj_row, table, product)
             for i in range(wp.static(order**2)):
                 adj_row[i] = product[i]
         if adj_normals:
-            adj_x, adj_y, adj_z, _adj_zonal = rotated_zonal_adjoint_(x, y, z, zonal, adj_row)
-            add_vectors(adj_x, adj_y, adj_z, group, adj_normals[batch])
+            adj_normal, _adj_zonal = rotated_zonal_adjoint(normal, zonal, adj_row)
+            add_vectors(adj_normal, group, adj_normals[batch])
 
     return transfer_sh_adjoint
-
-
-@functools.cache
-def _first_bands(order: int, device: str, bands: int) -> ProductTable:
-    """Products of which the first bands are wanted: no pairs for the others."""
-    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
-    table = product_table(order, device, bands_of_j=lit_bands)
-    first = table.first.numpy()
-    return table._replace(first=wp.array(np.minimum(first, first[bands**2]), device=device))
 
 
 def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, bands: int | None = None) -> wp.array:
@@ -190,11 +177,12 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = PRODUCT_COST * lanes * order**2 * bands**2
     is_shadowed = visibility is not None
+    lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
     return differentiable(
         lambda transfer: launch(
             _sh_transfer_kernel(order, is_shadowed, lanes),
             row_count,
-            inputs=[*variables, *_first_bands(order, str(device), bands)],
+            inputs=[*variables, product_table(order, str(device), lit_bands, bands)],
             scratch=scratch,
             outputs=[transfer],
             cost=cost,
@@ -202,7 +190,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         lambda adj_transfer: launch(
             _sh_transfer_adjoint_kernel(order, is_shadowed, lanes),
             row_count,
-            inputs=[*variables, *product_table(order, str(device), bands_of_j=tuple(range(bands))), adj_transfer],
+            inputs=[*variables, product_table(order, str(device), tuple(range(bands))), adj_transfer],
             scratch=scratch,
             outputs=[None if variable is None else variable.grad for variable in variables],
             cost=2 * cost,

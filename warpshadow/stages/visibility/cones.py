@@ -10,12 +10,13 @@ spheres that stand in for it, so the rule goes on, C¹, where that formula ends:
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import lane_functions, lane_type
+from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
 BLEND = 0.01
 """The exact formula ends at D = (1 + BLEND) r."""
@@ -46,40 +47,36 @@ def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array,
 
 
 @functools.cache
-def cone_function(lanes: int) -> wp.Function:
-    """Make the kernel function of a group of receivers: the offset to a sphere's center and its radius → its cone.
+def cone_type(lanes: int) -> Any:
+    """Struct of the cones of a sphere, one for each receiver of a group."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
-    :func:`relative_cone_function` of the offset in radii.
-    """
-    Lane = lane_type(lanes)
-    relative_cone = relative_cone_function(lanes)
+    @wp.struct
+    class Cone:
+        axis: Vectors  # unit; 0 at the sphere's center
+        cosine: Lane  # of the half-angle θ
+        sine2: Lane  # sin²θ, accurate for tiny spheres, where 1 − cos²θ is not
+        weight: Lane  # in [0, 1]: fades the sphere out near its center
 
-    @wp.func
-    def cone(dx: Lane, dy: Lane, dz: Lane, radius: float):
-        return relative_cone((1.0 / radius) * dx, (1.0 / radius) * dy, (1.0 / radius) * dz)
-
-    return cone
+    return Cone
 
 
 @functools.cache
-def relative_cone_function(lanes: int) -> wp.Function:
-    """Make the kernel function of a group of receivers: the offset to a sphere's center, in radii → its cone.
-
-    It returns lanes of: the direction's x, y, z; cos θ; sin²θ (accurate for tiny spheres, where 1 − cos²θ is not);
-    the weight in [0, 1] that fades the sphere out near its center.
-    """
-    Lane = lane_type(lanes)
-    sqrt = lane_functions(lanes).sqrt
+def make_cone(lanes: int) -> wp.Function:
+    """Make the kernel function of a group of receivers: offsets to a sphere's center, and 1/radius → its cones."""
+    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, scale, dot = fn.sqrt, fn.scale, fn.dot
     SINE2 = wp.constant(float(_SINE2))
     COSINE = wp.constant(float(_COSINE))
     RISE = wp.constant(float(_RISE))
     NEAREST2 = wp.constant(_NEAREST2)
 
-    @wp.func
-    def cone(x: Lane, y: Lane, z: Lane):
-        distance2 = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+    @wp.func(inline=True)
+    def cone(offset: Vectors, curvature: float):
+        relative = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
         # A receiver at the center has direction 0 and weight 0. One so far that the square is Inf has inverse 0.
-        distance = sqrt(wp.max(distance2, Lane(NEAREST2)))
+        distance = sqrt(wp.max(dot(relative, relative), Lane(NEAREST2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         sine2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
         # What the blend's cubic lacks of _COSINE is exactly 0 from 1.01 r on, where u is: sums need no cases, and
@@ -92,45 +89,33 @@ def relative_cone_function(lanes: int) -> wp.Function:
         sine2 = sine2 + wp.cw_mul(lack, Lane(2.0 * COSINE) - lack)
         near = wp.min((1.0 / FADE) * distance, Lane(1.0))
         weight = wp.cw_mul(wp.cw_mul(near, near), Lane(3.0) - 2.0 * near)
-        return wp.cw_mul(x, inverse), wp.cw_mul(y, inverse), wp.cw_mul(z, inverse), cosine, sine2, weight
+        return Cone(scale(inverse, relative), cosine, sine2, weight)
 
     return cone
 
 
 @functools.cache
-def cone_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`cone_function`: offset in radii, 1/radius, adjoints of results → those of arguments.
+def make_cone_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`make_cone`'s function: its arguments, result and adjoint → those of offset and radius.
 
     Cosine, sin²θ and weight depend on X = D/r alone, and sin²θ = 1 − cos²θ, so with c' = dc/dX
 
         X̄ = (c̄ − 2c s̄²) c' + w̄ w',   r̄ = −X̄ X / r,   d̄ = ((ū − u (u·ū)) / X + u X̄) / r
         c' = X⁻³ / c beyond 1.01 r, else the slope of the blend's cubic
     """
-    Lane = lane_type(lanes)
-    sqrt = lane_functions(lanes).sqrt
-    cone = relative_cone_function(lanes)
+    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, dot = fn.sqrt, fn.dot
     SINE2 = wp.constant(float(_SINE2))
     COSINE = wp.constant(float(_COSINE))
     RISE = wp.constant(float(_RISE))
     NEAREST2 = wp.constant(_NEAREST2)
     FARTHEST2 = wp.constant(_FARTHEST2)
 
-    @wp.func
-    def adjoint(
-        x: Lane,
-        y: Lane,
-        z: Lane,
-        curvature: float,
-        adj_ux: Lane,
-        adj_uy: Lane,
-        adj_uz: Lane,
-        adj_cosine: Lane,
-        adj_sine2: Lane,
-        adj_weight: Lane,
-    ):
-        ux, uy, uz, cosine, _sine2, _weight = cone(x, y, z)
-        distance2 = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
-        distance = sqrt(wp.min(wp.max(distance2, Lane(NEAREST2)), Lane(FARTHEST2)))
+    @wp.func(inline=True)
+    def adjoint(offset: Vectors, curvature: float, cone: Cone, adj_cone: Cone):
+        relative = Vectors(curvature * offset.x, curvature * offset.y, curvature * offset.z)
+        distance = sqrt(wp.min(wp.max(dot(relative, relative), Lane(NEAREST2)), Lane(FARTHEST2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         ratio2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
         beyond = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
@@ -142,13 +127,15 @@ def cone_adjoint(lanes: int) -> wp.Function:
         weight_slope = (6.0 / FADE) * wp.cw_mul(near, Lane(1.0) - near)
 
         adj_distance = Lane(0.0)  # summed up from 0, all of the kernel runs a seventh faster on a CPU
-        adj_distance += wp.cw_mul(adj_cosine - 2.0 * wp.cw_mul(cosine, adj_sine2), cosine_slope)
-        adj_distance += wp.cw_mul(adj_weight, weight_slope)
-        along = wp.cw_mul(ux, adj_ux) + wp.cw_mul(uy, adj_uy) + wp.cw_mul(uz, adj_uz)
-        radial = adj_distance - wp.cw_mul(along, inverse)
-        adj_dx = curvature * (wp.cw_mul(adj_ux, inverse) + wp.cw_mul(ux, radial))
-        adj_dy = curvature * (wp.cw_mul(adj_uy, inverse) + wp.cw_mul(uy, radial))
-        adj_dz = curvature * (wp.cw_mul(adj_uz, inverse) + wp.cw_mul(uz, radial))
-        return adj_dx, adj_dy, adj_dz, -curvature * wp.cw_mul(adj_distance, distance)
+        adj_distance += wp.cw_mul(adj_cone.cosine - 2.0 * wp.cw_mul(cone.cosine, adj_cone.sine2), cosine_slope)
+        adj_distance += wp.cw_mul(adj_cone.weight, weight_slope)
+        axis, adj_axis = cone.axis, adj_cone.axis
+        radial = adj_distance - wp.cw_mul(dot(axis, adj_axis), inverse)
+        adj_offset = Vectors(
+            curvature * (wp.cw_mul(adj_axis.x, inverse) + wp.cw_mul(axis.x, radial)),
+            curvature * (wp.cw_mul(adj_axis.y, inverse) + wp.cw_mul(axis.y, radial)),
+            curvature * (wp.cw_mul(adj_axis.z, inverse) + wp.cw_mul(axis.z, radial)),
+        )
+        return adj_offset, -curvature * wp.cw_mul(adj_distance, distance)
 
     return adjoint

@@ -11,36 +11,44 @@ and the soft edge has a smooth gradient.
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import group_count, lane_count, lane_functions, lane_type, module_options
-from warpshadow.device.parallel import Scratch, launch_slices, scratch_place
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.lanes import (
+    group_count,
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    vectors_type,
+)
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_count, edge_width
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
+from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.culling import (
-    QUADS,
+    REACH,
     Cells,
-    find_bundles_function,
-    find_node,
+    cap_type,
     make_cells,
+    make_reaches,
+    make_rises,
+    make_widen,
+)
+from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_adjoint
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres
+from warpshadow.stages.visibility.walk import (
+    ALL,
+    make_load_receivers,
     make_spheres,
-    reach_function,
-    rise_function,
+    make_walk,
+    pull_type,
+    receivers_type,
+    seen_type,
 )
-from warpshadow.stages.visibility.merging import (
-    ITEMS,
-    MERGING,
-    QUAD,
-    Spheres,
-    load_merged_function,
-    merge_where_far,
-    merged_adjoint,
-)
-from warpshadow.stages.visibility.soft_edges import edge_adjoint, edge_function
 
 SOFTNESS = 0.35
 """κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
@@ -52,66 +60,137 @@ _PAIR_COST = 0.15
 
 
 @functools.cache
-def _load_normals_function(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads the normals of a group, 0 where there is no horizon."""
+def _task_type(lanes: int) -> Any:
+    """Struct of what a thread works on: a span of bundles of directions."""
     Lane = lane_type(lanes)
-    load = lane_functions(lanes).load
 
-    @wp.func
-    def load_normals(normals: wp.array2d(dtype=wp.vec3), batch: int, group: int):
-        x = Lane(0.0)
-        y = Lane(0.0)
-        z = Lane(0.0)
-        if wp.static(has_horizon):
-            x, y, z = load(normals[batch], group)
-        return x, y, z
+    @wp.struct
+    class Task:
+        cells: Cells
+        first_bundle: int
+        ends: wp.array(dtype=wp.int32)  # [bundle] the place in the walk where nothing is left to block
+        found: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        passing: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
-    return load_normals
+    return Task
 
 
 @functools.cache
-def _block_function(lanes: int) -> wp.Function:
-    """Make the kernel function that lets a sphere block its share of what passes towards a bundle of directions."""
-    Lane = lane_type(lanes)
-    is_any_above = lane_functions(lanes).is_any_above
+def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that finds out which receivers and directions a thread works on."""
+    Lane, Task = lane_type(lanes), _task_type(lanes)
+    find_group, load_receivers = make_lane_functions(lanes).find_group, make_load_receivers(has_horizon, lanes)
+
+    @wp.func(inline=False)
+    def begin(
+        row: int,
+        span: int,
+        worker: int,
+        points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
+        cells: Cells,
+        all_ends: wp.array3d(dtype=wp.int32),
+        scratch: wp.array2d(dtype=Lane),
+        found: wp.array3d(dtype=wp.int32),
+    ):
+        batch, group = find_group(row, points.shape[1])
+        place = scratch_place(worker, row * all_ends.shape[1] + span)
+        ends = all_ends[row, span]
+        task = Task(cells, span * ends.shape[0], ends, found[place], scratch[place])
+        return batch, group, load_receivers(points, normals, batch, group), task
+
+    return begin
+
+
+@functools.cache
+def _make_cull(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that lists the bundles of directions that spheres can reach."""
+    Lane, Receivers, Task = lane_type(lanes), receivers_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
 
     @wp.func
-    def block(
-        ux: Lane,
-        uy: Lane,
-        uz: Lane,
-        low: Lane,
-        slope: Lane,
-        opacity: Lane,
-        direction: int,
-        directions: wp.array(dtype=wp.vec3),
-        place: int,
-        passing: wp.array(dtype=Lane),
-    ):
+    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
+        """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
+        count = int(0)
+        cells = task.cells
+        if bound[3] > 0.0:
+            reach = REACH * bound[3]
+            away = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
+            distance = sqrt(dot(away, away))
+            is_within = is_any_above(-distance, -reach)
+            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
+            sine = reach * inverse
+            cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
+            cap = widen(scale(inverse, away), cosine, sine, cells.cos_width, cells.sin_width)
+            if is_within or rises(cap, receivers.normals):
+                candidate_count = among
+                if among == ALL:
+                    candidate_count = task.ends.shape[0]
+                for k in range(candidate_count):
+                    bundle = k
+                    if among != ALL:
+                        bundle = task.found[0, k]
+                    at = task.first_bundle + bundle
+                    is_met = task.ends[bundle] > place
+                    if is_met and (is_within or reaches(cap, cells.axes[at], cells.half_angles[at])):
+                        task.found[wp.where(among == ALL, 0, 1), count] = bundle
+                        count += 1
+        return count
+
+    return cull
+
+
+@functools.cache
+def _make_block(lanes: int) -> wp.Function:
+    """Make the kernel function that lets a sphere block its share of what passes towards a bundle of directions."""
+    Lane, Task, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
+    fn = make_lane_functions(lanes)
+    is_any_above, along = fn.is_any_above, fn.along
+
+    @wp.func(inline=True)
+    def block(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: Task):
         """Returns whether anything is left."""
         most = Lane(0.0)
+        direction = (task.first_bundle + bundle) * BUNDLE
+        place = bundle * BUNDLE
         for i in range(BUNDLE):
-            omega = directions[direction + i]
-            t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
+            t = wp.cw_mul(along(task.cells.directions[direction + i], cap.axis) - cap.cosine, slope)
             t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
             step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-            left = wp.cw_mul(passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
+            left = wp.cw_mul(task.passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
             most = wp.max(most, left)
-            passing[place + i] = left
+            task.passing[place + i] = left
         return is_any_above(most, _OPAQUE)
 
     return block
 
 
 @functools.cache
-def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane = lane_type(lanes)
-    fn = lane_functions(lanes)
-    find_group, load, load_normals = fn.find_group, fn.load, _load_normals_function(has_horizon, lanes)
-    store_columns, sqrt, is_any_above = fn.store_columns, fn.sqrt, fn.is_any_above
-    cone, edge, block = relative_cone_function(lanes), edge_function(lanes), _block_function(lanes)
-    reaches, rises = reach_function(lanes), rise_function(lanes)
-    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
+def _make_transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
+    Lane, Receivers, Seen, Task = lane_type(lanes), receivers_type(lanes), seen_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    store_columns, sqrt, is_any_above, along = fn.store_columns, fn.sqrt, fn.is_any_above, fn.along
+    begin, falloff, block = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_block(lanes)
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        cone = seen.cone
+        cells = task.cells
+        sine = sqrt(cone.sine2)
+        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        if rises(cap, receivers.normals):
+            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            for k in range(count):
+                bundle = task.found[1, k]
+                at = task.first_bundle + bundle
+                is_met = task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at])
+                if is_met and not block(cap, slope, opacity, bundle, task):
+                    task.ends[bundle] = seen.place + 1
+
+    walk = make_walk(_make_cull(has_horizon, lanes), visit, Task, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit(
@@ -124,143 +203,104 @@ def _transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         cells: Cells,
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found_bundles: wp.array3d(dtype=wp.int32),
+        found: wp.array3d(dtype=wp.int32),
         # out
         all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         item, span = wp.tid()
-        row = first_row + item
-        batch, group = find_group(row, points.shape[1])
-        place = scratch_place(worker, row * all_ends.shape[1] + span)
-        passing = scratch[place]
-        every = found_bundles[place, 0]
-        found_by_run = found_bundles[place, 1]
-        found = found_bundles[place, 2]
-        ends = all_ends[row, span]
-        first_bundle = span * ends.shape[0]
-        cos_width = cells.cos_width
-        sin_width = cells.sin_width
-        x, y, z = load(points[batch], group)
-        nx, ny, nz = load_normals(normals, batch, group)
-        for bundle in range(ends.shape[0]):
-            every[bundle] = bundle
+        batch, group, receivers, task = begin(
+            first_row + item, span, worker, points, normals, cells, all_ends, scratch, found
+        )
+        for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
-                passing[bundle * BUNDLE + i] = Lane(1.0)
-            ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
+                task.passing[bundle * BUNDLE + i] = Lane(1.0)
+            task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
             if wp.static(has_horizon):
-                axis = cells.axes[first_bundle + bundle]
-                height = axis[0] * nx + axis[1] * ny + axis[2] * nz
-                if not is_any_above(height, -cells.edges[first_bundle + bundle][1]):
-                    ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
-        for run in range(spheres.bounds_of_runs.shape[1]):
-            begin = run * QUADS
-            end = wp.min(begin + QUADS, spheres.bounds_of_quads.shape[1])
-            run_count = find_bundles(
-                x,
-                y,
-                z,
-                nx,
-                ny,
-                nz,
-                spheres.bounds_of_runs[batch, run],
-                begin,
-                first_bundle,
-                cells,
-                ends,
-                every,
-                ends.shape[0],
-                found_by_run,
-            )
-            if run_count == 0:
-                end = begin
-            for quad in range(begin, end):
-                count = find_bundles(
-                    x,
-                    y,
-                    z,
-                    nx,
-                    ny,
-                    nz,
-                    spheres.bounds_of_quads[batch, quad],
-                    quad,
-                    first_bundle,
-                    cells,
-                    ends,
-                    found_by_run,
-                    run_count,
-                    found,
-                )
-                item_count = int(0)
-                merged = Lane(0.0)
-                if count > 0:
-                    item_count = ITEMS
-                    merged = load_merged(x, y, z, batch, quad, spheres)
-                for item in range(item_count):
-                    node = find_node(quad, item, spheres.count, spheres.centers.shape[1])
-                    share = Lane(1.0) - merged
-                    if item == QUAD:
-                        share = merged
-                    radius = float(0.0)
-                    if node >= 0 and is_any_above(share, 0.0):
-                        radius = spheres.radii[batch, node]
-                    if radius > TINY_RADIUS:
-                        center = spheres.centers[batch, node]
-                        curvature = 1.0 / radius
-                        ux, uy, uz, cosine, sine2, fade = cone(
-                            curvature * (Lane(center[0]) - x),
-                            curvature * (Lane(center[1]) - y),
-                            curvature * (Lane(center[2]) - z),
-                        )
-                        weight = wp.cw_mul(fade, share)
-                        sine = sqrt(sine2)
-                        low = cos_width * cosine - sin_width * sine
-                        wide_sine = sin_width * cosine + cos_width * sine
-                        is_up = bool(True)
-                        if wp.static(has_horizon):
-                            is_up = rises(ux, uy, uz, low, wide_sine, nx, ny, nz)
-                        if is_up:
-                            _high, slope, opacity = edge(cosine, sine, sine2, weight, low, cos_width, sin_width)
-                            for k in range(count):
-                                bundle = found[k]
-                                at = first_bundle + bundle
-                                is_met = ends[bundle] > quad * ITEMS + item
-                                if is_met:
-                                    is_met = reaches(ux, uy, uz, low, wide_sine, cells.axes[at], cells.edges[at])
-                                if is_met:
-                                    is_left = block(
-                                        ux,
-                                        uy,
-                                        uz,
-                                        low,
-                                        slope,
-                                        opacity,
-                                        at * BUNDLE,
-                                        cells.directions,
-                                        bundle * BUNDLE,
-                                        passing,
-                                    )
-                                    if not is_left:
-                                        ends[bundle] = quad * ITEMS + item + 1
-        direction_count = ends.shape[0] * BUNDLE
-        store_columns(passing, first_bundle * BUNDLE, direction_count, group, transmittance[batch])
+                at = task.first_bundle + bundle
+                if not is_any_above(along(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+                    task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
+        walk(receivers, batch, spheres, Gradients(), task)
+        direction_count = task.ends.shape[0] * BUNDLE
+        store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, group, transmittance[batch])
 
     return transmit
 
 
 @functools.cache
-def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane = lane_type(lanes)
-    fn = lane_functions(lanes)
-    find_group, load, load_normals = fn.find_group, fn.load, _load_normals_function(has_horizon, lanes)
-    load_products, sqrt, add_vectors, add_to_sphere = fn.load_products, fn.sqrt, fn.add_vectors, fn.add_to_sphere
-    cone, cone_adjoint_ = relative_cone_function(lanes), cone_adjoint(lanes)
-    edge, edge_adjoint_ = edge_function(lanes), edge_adjoint(lanes)
-    merged_adjoint_ = merged_adjoint(lanes)
-    is_any_above = fn.is_any_above
-    reaches, rises = reach_function(lanes), rise_function(lanes)
-    find_bundles, load_merged = find_bundles_function(has_horizon, lanes), load_merged_function(lanes)
+def _make_transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
+    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    load_products, sqrt, along, scale, add_vectors = fn.load_products, fn.sqrt, fn.along, fn.scale, fn.add_vectors
+    begin, falloff, falloff_adjoint = _make_begin(has_horizon, lanes), make_falloff(lanes), make_falloff_adjoint(lanes)
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+    cone_adjoint = make_cone_adjoint(lanes)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        """The adjoint of the sphere's cone.
+
+        With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
+        ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
+        ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
+        """
+        pull = Pull()
+        cone = seen.cone
+        cells = task.cells
+        sine = sqrt(cone.sine2)
+        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        if rises(cap, receivers.normals):
+            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            is_any_met = bool(False)
+            sum_ = Lane(0.0)
+            sum_t = Lane(0.0)
+            sum_x = Lane(0.0)
+            sum_y = Lane(0.0)
+            sum_z = Lane(0.0)
+            adj_opacity = Lane(0.0)
+            for k in range(count):
+                bundle = task.found[1, k]
+                at = task.first_bundle + bundle
+                if task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at]):
+                    is_any_met = True
+                    for i in range(BUNDLE):
+                        omega = cells.directions[at * BUNDLE + i]
+                        t = wp.cw_mul(along(omega, cap.axis) - cap.cosine, slope)
+                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                        left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
+                        adj_blocked = -wp.cw_div(task.passing[bundle * BUNDLE + i], left)
+                        adj_opacity += wp.cw_mul(adj_blocked, step)
+                        rise = wp.cw_mul(t, Lane(1.0) - t)
+                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
+                        sum_ += adj_t
+                        sum_t += wp.cw_mul(adj_t, t)
+                        sum_x += omega[0] * adj_t
+                        sum_y += omega[1] * adj_t
+                        sum_z += omega[2] * adj_t
+            if is_any_met:
+                adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
+                    cone,
+                    sine,
+                    cap.cosine,
+                    cells.cos_width,
+                    cells.sin_width,
+                    wp.cw_mul(slope, sum_t - sum_),
+                    -wp.cw_mul(slope, sum_t),
+                    adj_opacity,
+                )
+                adj_axis = scale(slope, Vectors(sum_x, sum_y, sum_z))
+                adj_cone = Cone(adj_axis, adj_cosine, adj_sine2, wp.cw_mul(adj_weight, seen.share))
+                adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
+                pull.is_any = True
+                pull.offset = adj_offset
+                pull.radius = adj_radius
+                pull.weight = adj_weight
+        return pull
+
+    walk = make_walk(_make_cull(has_horizon, lanes), visit, Task, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit_adjoint(
@@ -276,182 +316,33 @@ def _transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found_bundles: wp.array3d(dtype=wp.int32),
+        found: wp.array3d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers and a span of bundles.
-
-        With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
-        ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
-        ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
-        """
+        """A thread owns a group of receivers and a span of bundles."""
         item, span = wp.tid()
-        row = first_row + item
-        batch, group = find_group(row, points.shape[1])
-        place = scratch_place(worker, row * all_ends.shape[1] + span)
-        products = scratch[place]
-        every = found_bundles[place, 0]
-        found_by_run = found_bundles[place, 1]
-        found = found_bundles[place, 2]
-        ends = all_ends[row, span]
-        first_bundle = span * ends.shape[0]
-        direction_count = ends.shape[0] * BUNDLE
-        load_products(
-            transmittance[batch], adj_transmittance[batch], first_bundle * BUNDLE, direction_count, group, products
+        batch, group, receivers, task = begin(
+            first_row + item, span, worker, points, normals, cells, all_ends, scratch, found
         )
-        cos_width = cells.cos_width
-        sin_width = cells.sin_width
-        x, y, z = load(points[batch], group)
-        nx, ny, nz = load_normals(normals, batch, group)
-        adj_x = Lane(0.0)
-        adj_y = Lane(0.0)
-        adj_z = Lane(0.0)
-        for bundle in range(ends.shape[0]):
-            every[bundle] = bundle
-        for run in range(spheres.bounds_of_runs.shape[1]):
-            begin = run * QUADS
-            end = wp.min(begin + QUADS, spheres.bounds_of_quads.shape[1])
-            run_count = find_bundles(
-                x,
-                y,
-                z,
-                nx,
-                ny,
-                nz,
-                spheres.bounds_of_runs[batch, run],
-                begin,
-                first_bundle,
-                cells,
-                ends,
-                every,
-                ends.shape[0],
-                found_by_run,
-            )
-            if run_count == 0:
-                end = begin
-            for quad in range(begin, end):
-                count = find_bundles(
-                    x,
-                    y,
-                    z,
-                    nx,
-                    ny,
-                    nz,
-                    spheres.bounds_of_quads[batch, quad],
-                    quad,
-                    first_bundle,
-                    cells,
-                    ends,
-                    found_by_run,
-                    run_count,
-                    found,
-                )
-                item_count = int(0)
-                merged = Lane(0.0)
-                if count > 0:
-                    item_count = ITEMS
-                    merged = load_merged(x, y, z, batch, quad, spheres)
-                adj_merged = Lane(0.0)
-                for item in range(item_count):
-                    node = find_node(quad, item, spheres.count, spheres.centers.shape[1])
-                    share = Lane(1.0) - merged
-                    sign = float(-1.0)
-                    if item == QUAD:
-                        share = merged
-                        sign = 1.0
-                    radius = float(0.0)
-                    if node >= 0 and is_any_above(share, 0.0):
-                        radius = spheres.radii[batch, node]
-                    if radius > TINY_RADIUS:
-                        center = spheres.centers[batch, node]
-                        curvature = 1.0 / radius
-                        dx = curvature * (Lane(center[0]) - x)
-                        dy = curvature * (Lane(center[1]) - y)
-                        dz = curvature * (Lane(center[2]) - z)
-                        ux, uy, uz, cosine, sine2, fade = cone(dx, dy, dz)
-                        weight = wp.cw_mul(fade, share)
-                        sine = sqrt(sine2)
-                        low = cos_width * cosine - sin_width * sine
-                        wide_sine = sin_width * cosine + cos_width * sine
-                        is_up = bool(True)
-                        if wp.static(has_horizon):
-                            is_up = rises(ux, uy, uz, low, wide_sine, nx, ny, nz)
-                        if is_up:
-                            _high, slope, opacity = edge(cosine, sine, sine2, weight, low, cos_width, sin_width)
-                            is_any_met = bool(False)
-                            sum_ = Lane(0.0)
-                            sum_t = Lane(0.0)
-                            sum_x = Lane(0.0)
-                            sum_y = Lane(0.0)
-                            sum_z = Lane(0.0)
-                            adj_opacity = Lane(0.0)
-                            for k in range(count):
-                                bundle = found[k]
-                                at = first_bundle + bundle
-                                is_met = ends[bundle] > quad * ITEMS + item
-                                if is_met:
-                                    is_met = reaches(ux, uy, uz, low, wide_sine, cells.axes[at], cells.edges[at])
-                                if is_met:
-                                    is_any_met = True
-                                    for i in range(BUNDLE):
-                                        omega = cells.directions[at * BUNDLE + i]
-                                        t = wp.cw_mul(omega[0] * ux + omega[1] * uy + omega[2] * uz - low, slope)
-                                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
-                                        left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
-                                        adj_blocked = -wp.cw_div(products[bundle * BUNDLE + i], left)
-                                        adj_opacity += wp.cw_mul(adj_blocked, step)
-                                        rise = wp.cw_mul(t, Lane(1.0) - t)
-                                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
-                                        sum_ += adj_t
-                                        sum_t += wp.cw_mul(adj_t, t)
-                                        sum_x += omega[0] * adj_t
-                                        sum_y += omega[1] * adj_t
-                                        sum_z += omega[2] * adj_t
-                            if is_any_met:
-                                adj_low = wp.cw_mul(slope, sum_t - sum_)
-                                adj_high = -wp.cw_mul(slope, sum_t)
-                                adj_cosine, adj_sine2, adj_weight = edge_adjoint_(
-                                    cosine,
-                                    sine,
-                                    sine2,
-                                    weight,
-                                    cos_width,
-                                    sin_width,
-                                    adj_low,
-                                    adj_high,
-                                    adj_opacity,
-                                )
-                                adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
-                                    dx,
-                                    dy,
-                                    dz,
-                                    curvature,
-                                    wp.cw_mul(slope, sum_x),
-                                    wp.cw_mul(slope, sum_y),
-                                    wp.cw_mul(slope, sum_z),
-                                    adj_cosine,
-                                    adj_sine2,
-                                    wp.cw_mul(adj_weight, share),
-                                )
-                                adj_merged += sign * wp.cw_mul(adj_weight, fade)
-                                adj_x -= adj_dx
-                                adj_y -= adj_dy
-                                adj_z -= adj_dz
-                                add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, node, adj_centers, adj_radii)
-                if item_count > 0:
-                    adj_dx, adj_dy, adj_dz = merged_adjoint_(
-                        x, y, z, batch, quad, adj_merged, spheres, adj_centers, adj_radii, adj_extents
-                    )
-                    adj_x -= adj_dx
-                    adj_y -= adj_dy
-                    adj_z -= adj_dz
+        load_products(
+            transmittance[batch],
+            adj_transmittance[batch],
+            task.first_bundle * BUNDLE,
+            task.ends.shape[0] * BUNDLE,
+            group,
+            task.passing,
+        )
+        gradients = Gradients()
+        gradients.centers = adj_centers
+        gradients.radii = adj_radii
+        gradients.extents = adj_extents
+        adj = walk(receivers, batch, spheres, gradients, task)
         if adj_points:
-            add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
+            add_vectors(adj.points, group, adj_points[batch])
 
     return transmit_adjoint
 
@@ -502,44 +393,30 @@ def transmittance(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
-    nodes = merge_where_far(centers, radii, merging)
-    spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(len(directions)))
-    row_count = batch_count * group_count(vertex_count, lanes)
-    dim = row_count, span_count
-    scratch = [
-        Scratch((bundle_count * BUNDLE,), lane_type(lanes)),
-        Scratch((3, bundle_count), wp.int32),
-    ]
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)))
+    dim = batch_count * group_count(vertex_count, lanes), span_count
+    scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
-    variables = [points, *nodes]
-    result = wp.empty(
-        (batch_count, vertex_count, len(directions)),
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable.requires_grad for variable in variables),
-    )
+    result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
     cost = _PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
-    launch_slices(
-        _transmit_kernel(normals is not None, lanes),
-        dim=dim,
-        cost=cost,
-        inputs=[points, normals, spheres, cells],
-        scratch=scratch,
-        outputs=[ends, result],
-        device=device,
-    )
-
-    def adjoint() -> None:
-        launch_slices(
-            _transmit_adjoint_kernel(normals is not None, lanes),
-            dim=dim,
+    return differentiable(
+        lambda result: launch(
+            _make_transmit_kernel(normals is not None, lanes),
+            dim,
+            cost=cost,
+            inputs=[points, normals, spheres, cells],
+            scratch=scratch,
+            outputs=[ends, result],
+        ),
+        lambda adj_result: launch(
+            _make_transmit_adjoint_kernel(normals is not None, lanes),
+            dim,
             cost=2 * cost,
-            inputs=[points, normals, spheres, cells, ends, result, result.grad],
+            inputs=[points, normals, spheres, cells, ends, result, adj_result],
             scratch=scratch,
             outputs=[points.grad],
             sums=[array.grad for array in nodes],
-            device=device,
-        )
-
-    record_adjoint(adjoint, [*variables, result])
-    return result
+        ),
+        result=result,
+        variables=[points, *nodes],
+    )

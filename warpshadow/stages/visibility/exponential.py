@@ -31,11 +31,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import group_count, lane_count, lane_functions, lane_type, module_options
-from warpshadow.device.parallel import Scratch, launch_slices, scratch_place
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.lanes import group_count, lane_count, lane_type, make_lane_functions, module_options
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
-from warpshadow.stages.sh_kernels import multiply, product_table
+from warpshadow.stages.sh_kernels import ProductTable, make_multiply, product_table
 from warpshadow.stages.visibility.zonal_logs import zonal_eigen_log
 
 
@@ -95,14 +95,14 @@ def _optimal_table(order: int, device: str) -> wp.array:
 
 
 @functools.cache
-def _measure_function(order: int, lanes: int) -> wp.Function:
+def _make_measure(order: int, lanes: int) -> wp.Function:
     """Make the kernel function that measures f.
 
     It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; of the
     base e^{…/2}, the share w of the square and its derivative by |f̂|.
     """
     Lane = lane_type(lanes)
-    sqrt = lane_functions(lanes).sqrt
+    sqrt = make_lane_functions(lanes).sqrt
     PER_BLEND = wp.constant(1 / (BLENDED - 0.5))
 
     @wp.func
@@ -140,7 +140,7 @@ def _measure_function(order: int, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _factor_function(base: str, lanes: int) -> wp.Function:
+def _make_factor(base: str, lanes: int) -> wp.Function:
     """Make the kernel function of the base's factors: |h| → a, b of a 1 + b h, and their derivatives."""
     Lane = lane_type(lanes)
     STEP = wp.constant(THRESHOLDS["optimal_linear"].limit / _KNOTS)
@@ -168,10 +168,10 @@ def _factor_function(base: str, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _base_function(order: int, base: str, lanes: int) -> wp.Function:
+def _make_base(order: int, base: str, lanes: int) -> wp.Function:
     """Make the kernel function of the base approximation F (a 1 + b h + q h * h), h = s f̂."""
     Lane = lane_type(lanes)
-    factors = _factor_function(base, lanes)
+    factors = _make_factor(base, lanes)
 
     @wp.func
     def approximate(
@@ -199,7 +199,7 @@ def _base_function(order: int, base: str, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _hold_function(lanes: int) -> wp.Function:
+def _make_hold(lanes: int) -> wp.Function:
     """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
     Lane = lane_type(lanes)
     PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
@@ -220,21 +220,19 @@ def _hold_function(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _square_function(order: int, lanes: int) -> wp.Function:
+def _make_square(order: int, lanes: int) -> wp.Function:
     """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
     Lane = lane_type(lanes)
-    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
 
     @wp.func
     def square_held(
         row: wp.array(dtype=Lane),
         depth: Lane,
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         square: wp.array(dtype=Lane),
     ):
-        multiply_(row, row, first, pairs, values, square)
+        multiply(row, row, table, square)
         share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
         rest = Lane(1.0) - share
         if wp.max(rest) > 0.0:
@@ -246,26 +244,24 @@ def _square_function(order: int, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _square_adjoint_function(order: int, lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`_square_function`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
+def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`_make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
 
     Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the loudness
     λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄ λ/|f̂|.
     """
     Lane = lane_type(lanes)
-    hold, multiply_ = _hold_function(lanes), multiply(order, lanes)
+    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
 
     @wp.func
     def square_held_adjoint(
         row: wp.array(dtype=Lane),
         depth: Lane,
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         adj_square: wp.array(dtype=Lane),
         adj_row: wp.array(dtype=Lane),
     ):
-        multiply_(row, adj_square, first, pairs, values, adj_row)
+        multiply(row, adj_square, table, adj_row)
         mean_square = Lane(0.0)
         along = Lane(0.0)
         adj_share = Lane(0.0)
@@ -289,13 +285,13 @@ def _square_adjoint_function(order: int, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
+def _make_exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
-    fn = lane_functions(lanes)
-    load_rows, store_rows, multiply_ = fn.load_rows, fn.store_rows, multiply(order, lanes)
+    fn = make_lane_functions(lanes)
+    load_rows, store_rows, multiply = fn.load_rows, fn.store_rows, make_multiply(order, lanes)
     find_group = fn.find_group
-    measure, approximate = _measure_function(order, lanes), _base_function(order, base, lanes)
-    square_held = _square_function(order, lanes)
+    measure, approximate = _make_measure(order, lanes), _make_base(order, base, lanes)
+    square_held = _make_square(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh(
@@ -304,9 +300,7 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
         # in
         log_sh: wp.array3d(dtype=wp.float32),
         threshold: float,
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         optimal: wp.array(dtype=wp.vec2),
         # scratch
         scratch: wp.array3d(dtype=Lane),
@@ -333,12 +327,12 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
         mean = row[0]
         row[0] = Lane(0.0)
         if wp.static(base == "quadratic"):
-            multiply_(row, row, first, pairs, values, square)
+            multiply(row, row, table, square)
         approximate(row, square, norm, 0.5 * scale, root, optimal, half)
         approximate(row, square, norm, scale, wp.cw_mul(root, root), optimal, row)
         held = Lane(0.0)
         if wp.max(blend) > 0.0:
-            held = wp.cw_mul(blend, square_held(half, depth, first, pairs, values, square))
+            held = wp.cw_mul(blend, square_held(half, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - blend, row[i]) + wp.cw_mul(blend, square[i])
         for step in range(most):
@@ -346,7 +340,7 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
                 for i in range(wp.static(order**2)):
                     powers[batch, group, step + 1, i] = row[i]
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))  # 1 while step < p
-            held += wp.cw_mul(is_due, square_held(row, depth, first, pairs, values, square))
+            held += wp.cw_mul(is_due, square_held(row, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - is_due, row[i]) + wp.cw_mul(is_due, square[i])
         for lane in range(wp.min(lanes, log_sh.shape[1] - group * lanes)):
@@ -360,13 +354,13 @@ def _exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) 
 
 
 @functools.cache
-def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel:
+def _make_exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
-    fn = lane_functions(lanes)
-    load_rows, add_rows, multiply_ = fn.load_rows, fn.add_rows, multiply(order, lanes)
+    fn = make_lane_functions(lanes)
+    load_rows, add_rows, multiply = fn.load_rows, fn.add_rows, make_multiply(order, lanes)
     find_group = fn.find_group
-    measure, factors = _measure_function(order, lanes), _factor_function(base, lanes)
-    square_held_adjoint = _square_adjoint_function(order, lanes)
+    measure, factors = _make_measure(order, lanes), _make_factor(base, lanes)
+    square_held_adjoint = _make_square_adjoint(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh_adjoint(
@@ -375,9 +369,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         # in
         log_sh: wp.array3d(dtype=wp.float32),
         threshold: float,
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        table: ProductTable,
         optimal: wp.array(dtype=wp.vec2),
         powers: wp.array4d(dtype=Lane),
         adj_visibility: wp.array3d(dtype=wp.float32),
@@ -407,9 +399,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         for back in range(most):
             step = most - 1 - back
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
-            _along, change = square_held_adjoint(
-                powers[batch, group, step + 1], depth, first, pairs, values, adj_row, product
-            )
+            _along, change = square_held_adjoint(powers[batch, group, step + 1], depth, table, adj_row, product)
             adj_depth += wp.cw_mul(is_due, change)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + wp.cw_mul(is_due, product[i] - adj_row[i])
@@ -434,7 +424,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
         rest = Lane(1.0) - blend
         dc = wp.cw_mul(rest, whole)
         if wp.max(blend) > 0.0:
-            squared, change = square_held_adjoint(half, depth, first, pairs, values, adj_row, product)
+            squared, change = square_held_adjoint(half, depth, table, adj_row, product)
             adj_depth += wp.cw_mul(blend, change) + wp.cw_mul(blend_slope, squared - whole)
             for i in range(wp.static(order**2)):
                 adj_half = 0.5 * wp.cw_mul(blend, product[i])
@@ -461,7 +451,7 @@ def _exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel
             adj_row[i] = wp.cw_mul(slope, adj_row[i]) + wp.cw_mul(half_slope, product[i]) + wp.cw_mul(radial, log[i])
             product[i] = whole_and_half
         if wp.static(base == "quadratic"):
-            multiply_(log, product, first, pairs, values, bent)
+            multiply(log, product, table, bent)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + bent[i]
         adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
@@ -515,25 +505,34 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     lanes = lane_count(device)
     batch_count, vertex_count = log_sh.shape[:2]
     groups = group_count(vertex_count, lanes)
-    needs_gradient = log_sh.requires_grad
-    # memory that no squaring reaches is never touched
-    powers_shape = (batch_count, groups, MOST_SQUARINGS + 1, order**2)
-    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if needs_gradient else None
     row_count = batch_count * groups
     scratch = [Scratch((4, order**2), lane_type(lanes))]
-    visibility = wp.empty_like(log_sh, requires_grad=needs_gradient)
+    # memory that no squaring reaches is never touched
+    powers_shape = batch_count, groups, MOST_SQUARINGS + 1, order**2
+    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
     faults = wp.zeros(2, dtype=wp.int32, device=device)
     cost = _SQUARING_COST * lanes * order**4
-    launch_slices(
-        _exponentiate_kernel(order, base, needs_gradient, lanes),
-        dim=[row_count],
-        cost=cost,
-        inputs=[log_sh, threshold, *product_table(order, str(device), symmetric=True), optimal],
-        scratch=scratch,
-        outputs=[powers, visibility],
-        sums=[faults],
-        device=device,
+    visibility = differentiable(
+        lambda visibility: launch(
+            _make_exponentiate_kernel(order, base, powers is not None, lanes),
+            row_count,
+            cost=cost,
+            inputs=[log_sh, threshold, product_table(order, str(device), symmetric=True), optimal],
+            scratch=scratch,
+            outputs=[powers, visibility],
+            sums=[faults],
+        ),
+        lambda adj_visibility: launch(
+            _make_exponentiate_adjoint_kernel(order, base, lanes),
+            row_count,
+            cost=2 * cost,
+            inputs=[log_sh, threshold, product_table(order, str(device)), optimal, powers, adj_visibility],
+            scratch=scratch,
+            outputs=[log_sh.grad],
+        ),
+        result=wp.empty(log_sh.shape, dtype=wp.float32, device=device),
+        variables=[log_sh],
     )
     if not device.is_capturing:
         held, broken = faults.numpy().tolist()
@@ -545,18 +544,4 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
                 "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate",
                 stacklevel=2,
             )
-
-    def adjoint() -> None:
-        table = product_table(order, str(device))
-        launch_slices(
-            _exponentiate_adjoint_kernel(order, base, lanes),
-            dim=[row_count],
-            cost=2 * cost,
-            inputs=[log_sh, threshold, *table, optimal, powers, visibility.grad],
-            scratch=scratch,
-            outputs=[log_sh.grad],
-            device=device,
-        )
-
-    record_adjoint(adjoint, [log_sh, visibility])
     return visibility

@@ -4,36 +4,37 @@ log V(x) ≈ f(x) = Σ_i R(u_i) z(θ_i)                [Lyu et al. 2021, section
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import group_count, lane_count, lane_functions, lane_type, module_options
-from warpshadow.device.parallel import Scratch, launch_slices, scratch_place
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.lanes import group_count, lane_count, lane_type, make_lane_functions, module_options
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import (
     PRODUCT_COST,
-    add_rotated_zonal,
-    multiply,
+    ProductTable,
+    make_add_rotated_zonal,
+    make_multiply,
+    make_rotated_zonal_adjoint,
     product_table,
-    rotated_zonal_adjoint,
     zonal_type,
 )
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_adjoint, relative_cone_function
-from warpshadow.stages.visibility.culling import find_node, make_spheres
-from warpshadow.stages.visibility.merging import (
-    ITEMS,
-    MERGING,
-    QUAD,
-    Spheres,
-    load_merged_function,
-    merge_where_far,
-    merged_adjoint,
+from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone, make_cone_adjoint
+from warpshadow.stages.visibility.merging import MERGING, Gradients, Spheres
+from warpshadow.stages.visibility.walk import (
+    make_load_receivers,
+    make_spheres,
+    make_walk,
+    pull_type,
+    receivers_type,
+    seen_type,
 )
-from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, look_up, look_up_slope, zonal_table
+from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_look_up, zonal_table
 
 HORIZON_FADE = 0.5
 """A sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane."""
@@ -44,11 +45,24 @@ _PAIR_COST = 0.25
 
 
 @functools.cache
-def _horizon_function(lanes: int) -> wp.Function:
+def _task_type(order: int, lanes: int) -> Any:
+    """Struct of what a thread works on: a group's coefficients."""
+    Lane, Band = lane_type(lanes), band_type(order)
+
+    @wp.struct
+    class Task:
+        table: wp.array2d(dtype=Band)
+        row: wp.array(dtype=Lane)  # log-visibility; for the adjoint its adjoint
+
+    return Task
+
+
+@functools.cache
+def _make_horizon(lanes: int) -> wp.Function:
     """Make the kernel function of the fade at the horizon: n·d/r → weight and its derivative."""
     Lane = lane_type(lanes)
 
-    @wp.func
+    @wp.func(inline=True)
     def horizon(height: Lane):
         t = wp.min(wp.max((height + Lane(1.0)) / HORIZON_FADE, Lane(0.0)), Lane(1.0))
         slope = 6.0 / HORIZON_FADE * wp.cw_mul(t, Lane(1.0) - t)
@@ -58,28 +72,48 @@ def _horizon_function(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _above_horizon_function(lanes: int) -> wp.Function:
-    """Make the kernel function that says whether a sphere is above the horizon of any receiver, if only in part."""
-    Lane = lane_type(lanes)
-    is_any_above = lane_functions(lanes).is_any_above
+def _make_cull(order: int, has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that says whether spheres are above the horizon of any receiver, if only in part."""
+    Receivers, Task = receivers_type(lanes), _task_type(order, lanes)
+    fn = make_lane_functions(lanes)
+    is_any_above, dot, offset = fn.is_any_above, fn.dot, fn.offset
 
     @wp.func
-    def is_above_horizon(x: Lane, y: Lane, z: Lane, nx: Lane, ny: Lane, nz: Lane, bound: wp.vec4):
-        height = wp.cw_mul(nx, Lane(bound[0]) - x)
-        height += wp.cw_mul(ny, Lane(bound[1]) - y) + wp.cw_mul(nz, Lane(bound[2]) - z)
-        return is_any_above(height, -1.001 * bound[3])  # rounding included
+    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
+        """Returns 1 or 0."""
+        count = int(1)
+        if wp.static(has_horizon):
+            height = dot(receivers.normals, offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points))
+            if not is_any_above(height, -1.001 * bound[3]):  # rounding included
+                count = 0
+        return count
 
-    return is_above_horizon
+    return cull
 
 
 @functools.cache
-def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Band = lane_type(lanes), band_type(order)
-    fn = lane_functions(lanes)
-    find_group, load, store_rows, is_any_above = fn.find_group, fn.load, fn.store_rows, fn.is_any_above
-    load_merged, is_above_horizon = load_merged_function(lanes), _above_horizon_function(lanes)
-    cone, horizon, look_up_ = relative_cone_function(lanes), _horizon_function(lanes), look_up(order, lanes)
-    add_rotated_zonal_ = add_rotated_zonal(order, lanes)
+def _make_accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
+    Lane, Band, Task = lane_type(lanes), band_type(order), _task_type(order, lanes)
+    Receivers, Seen = receivers_type(lanes), seen_type(lanes)
+    fn = make_lane_functions(lanes)
+    find_group, store_rows, is_any_above, dot = fn.find_group, fn.store_rows, fn.is_any_above, fn.dot
+    load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
+    look_up, add_rotated_zonal = make_look_up(order, False, lanes), make_add_rotated_zonal(order, lanes)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        weight = seen.cone.weight
+        if wp.static(has_horizon):
+            fade, _slope = horizon(seen.curvature * dot(receivers.normals, seen.offset))
+            weight = wp.cw_mul(weight, fade)
+        if is_any_above(weight, 0.0):
+            amount = wp.cw_mul(seen.cone.sine2, weight)
+            zonal = look_up(seen.cone.cosine, task.table)
+            for band in range(order):
+                zonal[band] = wp.cw_mul(zonal[band], amount)
+            add_rotated_zonal(seen.cone.axis, zonal, task.row)
+
+    walk = make_walk(_make_cull(order, has_horizon, lanes), visit, Task, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh(
@@ -98,62 +132,76 @@ def _accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
         batch, group = find_group(thread, points.shape[1])
-        x, y, z = load(points[batch], group)
-        nx = Lane(0.0)
-        ny = Lane(0.0)
-        nz = Lane(0.0)
-        if wp.static(has_horizon):
-            nx, ny, nz = load(normals[batch], group)
         row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
-        for quad in range(spheres.bounds_of_quads.shape[1]):
-            merged = load_merged(x, y, z, batch, quad, spheres)
-            is_up = bool(True)
-            if wp.static(has_horizon):
-                is_up = is_above_horizon(x, y, z, nx, ny, nz, spheres.bounds_of_quads[batch, quad])
-            for item in range(ITEMS):
-                node = find_node(quad, item, spheres.count, spheres.radii.shape[1])
-                share = Lane(1.0) - merged
-                if item == QUAD:
-                    share = merged
-                radius = float(0.0)
-                if node >= 0 and is_up:
-                    radius = spheres.radii[batch, node]
-                if radius > TINY_RADIUS:
-                    center = spheres.centers[batch, node]
-                    dx = Lane(center[0]) - x
-                    dy = Lane(center[1]) - y
-                    dz = Lane(center[2]) - z
-                    curvature = 1.0 / radius
-                    ux, uy, uz, cosine, sine2, weight = cone(curvature * dx, curvature * dy, curvature * dz)
-                    weight = wp.cw_mul(weight, share)
-                    if wp.static(has_horizon):
-                        height = wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz)
-                        fade, _slope = horizon(curvature * height)
-                        weight = wp.cw_mul(weight, fade)
-                    if is_any_above(weight, 0.0):
-                        amount = wp.cw_mul(sine2, weight)
-                        zonal = look_up_(cosine, table)
-                        for band in range(order):
-                            zonal[band] = wp.cw_mul(zonal[band], amount)
-                        add_rotated_zonal_(ux, uy, uz, zonal, row)
+        walk(load_receivers(points, normals, batch, group), batch, spheres, Gradients(), Task(table, row))
         store_rows(row, group, log_sh[batch])
 
     return accumulate_log_sh
 
 
 @functools.cache
-def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
-    fn = lane_functions(lanes)
-    find_group, load, load_rows = fn.find_group, fn.load, fn.load_rows
-    add_vectors, add_to_sphere = fn.add_vectors, fn.add_to_sphere
-    cone, cone_adjoint_, horizon = relative_cone_function(lanes), cone_adjoint(lanes), _horizon_function(lanes)
-    load_merged, merged_adjoint_ = load_merged_function(lanes), merged_adjoint(lanes)
-    is_any_above, is_above_horizon = fn.is_any_above, _above_horizon_function(lanes)
-    look_up_, look_up_slope_ = look_up(order, lanes), look_up_slope(order, lanes)
-    rotated_zonal_adjoint_ = rotated_zonal_adjoint(order, lanes)
+def _make_accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
+    Lane, Zonal, Band, Cone = lane_type(lanes), zonal_type(order, lanes), band_type(order), cone_type(lanes)
+    Receivers, Seen, Pull = receivers_type(lanes), seen_type(lanes), pull_type(lanes)
+    Task = _task_type(order, lanes)
+    fn = make_lane_functions(lanes)
+    find_group, load_rows, add_vectors = fn.find_group, fn.load_rows, fn.add_vectors
+    is_any_above, dot, add, scale = fn.is_any_above, fn.dot, fn.add, fn.scale
+    cone_adjoint = make_cone_adjoint(lanes)
+    load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
+    look_up, look_up_slope = make_look_up(order, False, lanes), make_look_up(order, True, lanes)
+    rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        """The adjoint of the sphere's cone and of its height over the horizon.
+
+        With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā s²,
+        and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
+        """
+        pull = Pull()
+        cone = seen.cone
+        height = Lane(0.0)
+        fade = Lane(1.0)
+        fade_slope = Lane(0.0)
+        if wp.static(has_horizon):
+            height = seen.curvature * dot(receivers.normals, seen.offset)
+            height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
+            fade, fade_slope = horizon(height)
+        faded = wp.cw_mul(cone.weight, fade)
+        if is_any_above(faded, 0.0):
+            amount = wp.cw_mul(cone.sine2, faded)
+            shape = look_up(cone.cosine, task.table)
+            slope = look_up_slope(cone.cosine, task.table)
+            zonal = Zonal()
+            for band in range(order):
+                zonal[band] = wp.cw_mul(shape[band], amount)
+            adj_axis, adj_zonal = rotated_zonal_adjoint(cone.axis, zonal, task.row)
+            adj_amount = Lane(0.0)
+            adj_cosine = Lane(0.0)
+            for band in range(order):
+                adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
+                adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
+            adj_faded = wp.cw_mul(adj_amount, cone.sine2)
+            adj_weight = wp.cw_mul(adj_faded, fade)
+            adj_cone = Cone(
+                adj_axis,
+                wp.cw_mul(adj_cosine, amount),
+                wp.cw_mul(adj_amount, faded),
+                wp.cw_mul(adj_weight, seen.share),
+            )
+            adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
+            adj_height = seen.curvature * wp.cw_mul(wp.cw_mul(adj_faded, cone.weight), fade_slope)
+            pull.is_any = True
+            pull.offset = add(adj_offset, scale(adj_height, receivers.normals))
+            pull.radius = adj_radius - wp.cw_mul(adj_height, height)
+            pull.weight = adj_weight
+            pull.normals = scale(adj_height, seen.offset)
+        return pull
+
+    walk = make_walk(_make_cull(order, has_horizon, lanes), visit, Task, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh_adjoint(
@@ -174,108 +222,21 @@ def _accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a group of receivers.
-
-        With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā s²,
-        and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
-        """
+        """A thread owns a group of receivers."""
         thread = first_row + wp.tid()
         batch, group = find_group(thread, points.shape[1])
         row = scratch[scratch_place(worker, thread)]
         load_rows(adj_log_sh[batch], group, row)
-        x, y, z = load(points[batch], group)
-        nx = Lane(0.0)
-        ny = Lane(0.0)
-        nz = Lane(0.0)
-        if wp.static(has_horizon):
-            nx, ny, nz = load(normals[batch], group)
-        adj_x = Lane(0.0)
-        adj_y = Lane(0.0)
-        adj_z = Lane(0.0)
-        adj_nx = Lane(0.0)
-        adj_ny = Lane(0.0)
-        adj_nz = Lane(0.0)
-        for quad in range(spheres.bounds_of_quads.shape[1]):
-            merged = load_merged(x, y, z, batch, quad, spheres)
-            adj_merged = Lane(0.0)
-            is_up = bool(True)
-            if wp.static(has_horizon):
-                is_up = is_above_horizon(x, y, z, nx, ny, nz, spheres.bounds_of_quads[batch, quad])
-            for item in range(ITEMS):
-                node = find_node(quad, item, spheres.count, spheres.radii.shape[1])
-                share = Lane(1.0) - merged
-                sign = float(-1.0)
-                if item == QUAD:
-                    share = merged
-                    sign = 1.0
-                radius = float(0.0)
-                if node >= 0 and is_up:
-                    radius = spheres.radii[batch, node]
-                if radius > TINY_RADIUS:
-                    center = spheres.centers[batch, node]
-                    dx = Lane(center[0]) - x
-                    dy = Lane(center[1]) - y
-                    dz = Lane(center[2]) - z
-                    curvature = 1.0 / radius
-                    ux, uy, uz, cosine, sine2, near = cone(curvature * dx, curvature * dy, curvature * dz)
-                    weight = wp.cw_mul(near, share)
-                    height = Lane(0.0)
-                    fade = Lane(1.0)
-                    fade_slope = Lane(0.0)
-                    if wp.static(has_horizon):
-                        height = curvature * (wp.cw_mul(nx, dx) + wp.cw_mul(ny, dy) + wp.cw_mul(nz, dz))
-                        height = wp.min(wp.max(height, Lane(-1.0)), Lane(1.0))  # beyond, nothing depends on it
-                        fade, fade_slope = horizon(height)
-                    faded = wp.cw_mul(weight, fade)
-                    if is_any_above(faded, 0.0):
-                        amount = wp.cw_mul(sine2, faded)
-                        shape = look_up_(cosine, table)
-                        slope = look_up_slope_(cosine, table)
-                        zonal = Zonal()
-                        for band in range(order):
-                            zonal[band] = wp.cw_mul(shape[band], amount)
-                        adj_ux, adj_uy, adj_uz, adj_zonal = rotated_zonal_adjoint_(ux, uy, uz, zonal, row)
-                        adj_amount = Lane(0.0)
-                        adj_cosine = Lane(0.0)
-                        for band in range(order):
-                            adj_amount += wp.cw_mul(adj_zonal[band], shape[band])
-                            adj_cosine += wp.cw_mul(adj_zonal[band], slope[band])
-                        adj_faded = wp.cw_mul(adj_amount, sine2)
-                        adj_height = curvature * wp.cw_mul(wp.cw_mul(adj_faded, weight), fade_slope)
-                        adj_dx, adj_dy, adj_dz, adj_radius = cone_adjoint_(
-                            curvature * dx,
-                            curvature * dy,
-                            curvature * dz,
-                            curvature,
-                            adj_ux,
-                            adj_uy,
-                            adj_uz,
-                            wp.cw_mul(adj_cosine, amount),
-                            wp.cw_mul(adj_amount, faded),
-                            wp.cw_mul(wp.cw_mul(adj_faded, fade), share),
-                        )
-                        adj_merged += sign * wp.cw_mul(wp.cw_mul(adj_faded, fade), near)
-                        adj_dx += wp.cw_mul(adj_height, nx)
-                        adj_dy += wp.cw_mul(adj_height, ny)
-                        adj_dz += wp.cw_mul(adj_height, nz)
-                        adj_radius -= wp.cw_mul(adj_height, height)
-                        adj_nx += wp.cw_mul(adj_height, dx)
-                        adj_ny += wp.cw_mul(adj_height, dy)
-                        adj_nz += wp.cw_mul(adj_height, dz)
-                        adj_x -= adj_dx
-                        adj_y -= adj_dy
-                        adj_z -= adj_dz
-                        add_to_sphere(adj_dx, adj_dy, adj_dz, adj_radius, batch, node, adj_centers, adj_radii)
-            adj_dx, adj_dy, adj_dz = merged_adjoint_(
-                x, y, z, batch, quad, adj_merged, spheres, adj_centers, adj_radii, adj_extents
-            )
-            adj_x -= adj_dx
-            adj_y -= adj_dy
-            adj_z -= adj_dz
+        receivers = load_receivers(points, normals, batch, group)
+        gradients = Gradients()
+        gradients.centers = adj_centers
+        gradients.radii = adj_radii
+        gradients.extents = adj_extents
+        adj = walk(receivers, batch, spheres, gradients, Task(table, row))
         if adj_points:
-            add_vectors(adj_x, adj_y, adj_z, group, adj_points[batch])
+            add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
-            add_vectors(adj_nx, adj_ny, adj_nz, group, adj_normals[batch])
+            add_vectors(adj.normals, group, adj_normals[batch])
 
     return accumulate_log_sh_adjoint
 
@@ -321,54 +282,43 @@ def accumulate(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
-    nodes = merge_where_far(centers, radii, merging)
-    spheres = make_spheres(nodes, radii.shape[1], merging * cell_radius(order**2))
-    variables = [points, normals, *nodes]
-    table = zonal_table(order, log, str(device))
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2))
+    inputs = [points, normals, spheres, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
-    log_sh = wp.empty(
-        (batch_count, vertex_count, order**2),
-        dtype=wp.float32,
-        device=device,
-        requires_grad=any(variable is not None and variable.requires_grad for variable in variables),
-    )
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2
-    launch_slices(
-        _accumulate_kernel(order, normals is not None, lanes),
-        dim=[row_count],
-        cost=cost,
-        inputs=[points, normals, spheres, table],
-        scratch=scratch,
-        outputs=[log_sh],
-        device=device,
-    )
-
-    def adjoint() -> None:
-        launch_slices(
-            _accumulate_adjoint_kernel(order, normals is not None, lanes),
-            dim=[row_count],
+    return differentiable(
+        lambda log_sh: launch(
+            _make_accumulate_kernel(order, normals is not None, lanes),
+            row_count,
+            cost=cost,
+            inputs=inputs,
+            scratch=scratch,
+            outputs=[log_sh],
+        ),
+        lambda adj_log_sh: launch(
+            _make_accumulate_adjoint_kernel(order, normals is not None, lanes),
+            row_count,
             cost=2 * cost,
-            inputs=[points, normals, spheres, table, log_sh.grad],
+            inputs=[*inputs, adj_log_sh],
             scratch=scratch,
             outputs=[points.grad, None if normals is None else normals.grad],
             sums=[array.grad for array in nodes],
-            device=device,
-        )
-
-    record_adjoint(adjoint, [*variables, log_sh])
-    return log_sh
+        ),
+        result=wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device),
+        variables=[points, normals, *nodes],
+    )
 
 
 # ---------------------------------------------------------------------------------------------- the slow reference
 
 
 @functools.cache
-def _product_kernel(order: int, lanes: int) -> wp.Kernel:
+def _make_product_kernel(order: int, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
-    fn = lane_functions(lanes)
-    find_group, load, store_rows = fn.find_group, fn.load, fn.store_rows
-    cone, look_up_ = relative_cone_function(lanes), look_up(order, lanes)
-    add_rotated_zonal_, multiply_ = add_rotated_zonal(order, lanes), multiply(order, lanes)
+    fn = make_lane_functions(lanes)
+    find_group, load, store_rows, offset = fn.find_group, fn.load, fn.store_rows, fn.offset
+    find_cone, look_up = make_cone(lanes), make_look_up(order, False, lanes)
+    add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     UNIT = wp.constant(float(np.sqrt(4 * np.pi)))  # the coefficient of the constant function 1
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -380,9 +330,7 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
         centers: wp.array2d(dtype=wp.vec3),
         radii: wp.array2d(dtype=wp.float32),
         table: wp.array2d(dtype=Band),
-        first: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        values: wp.array(dtype=wp.float32),
+        products: ProductTable,
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
@@ -398,25 +346,19 @@ def _product_kernel(order: int, lanes: int) -> wp.Kernel:
         for i in range(wp.static(order**2)):
             so_far[i] = Lane(0.0)
         so_far[0] = Lane(UNIT)
-        x, y, z = load(points[batch], group)
+        receivers = load(points[batch], group)
         for sphere in range(centers.shape[1]):
             radius = radii[batch, sphere]
             if radius > TINY_RADIUS:
-                center = centers[batch, sphere]
-                curvature = 1.0 / radius
-                ux, uy, uz, cosine, sine2, weight = cone(
-                    curvature * (Lane(center[0]) - x),
-                    curvature * (Lane(center[1]) - y),
-                    curvature * (Lane(center[2]) - z),
-                )
-                zonal = look_up_(cosine, table)
+                cone = find_cone(offset(centers[batch, sphere], receivers), 1.0 / radius)
+                zonal = look_up(cone.cosine, table)
                 for band in range(order):
-                    zonal[band] = -wp.cw_mul(zonal[band], wp.cw_mul(sine2, weight))
+                    zonal[band] = -wp.cw_mul(zonal[band], wp.cw_mul(cone.sine2, cone.weight))
                 for i in range(wp.static(order**2)):
                     factor[i] = Lane(0.0)
                 factor[0] = Lane(UNIT)
-                add_rotated_zonal_(ux, uy, uz, zonal, factor)
-                multiply_(so_far, factor, first, pairs, values, product)
+                add_rotated_zonal(cone.axis, zonal, factor)
+                multiply(so_far, factor, products, product)
                 for i in range(wp.static(order**2)):
                     so_far[i] = product[i]
         store_rows(so_far, group, visibility[batch])
@@ -451,20 +393,19 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
     visibility = wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device)
-    launch_slices(
-        _product_kernel(order, lanes),
-        dim=[row_count],
+    launch(
+        _make_product_kernel(order, lanes),
+        row_count,
         cost=PRODUCT_COST * lanes * radii.shape[1] * order**4,
         inputs=[
             points,
             centers,
             radii,
             zonal_table(order, "indicator", str(device)),
-            *product_table(order, str(device)),
+            product_table(order, str(device)),
         ],
         scratch=[Scratch((3, order**2), lane_type(lanes))],
         outputs=[visibility],
-        device=device,
     )
     if not (device.is_capturing or np.isfinite(visibility.numpy()).all()):
         count = radii.shape[1]

@@ -23,8 +23,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import concatenate
-from warpshadow.device.lanes import lane_functions, lane_type
-from warpshadow.device.tape import launch
+from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.device.launch import launch
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 
 QUAD = 4
@@ -125,12 +125,9 @@ def merge(centers: wp.array, radii: wp.array) -> Nodes:
     """
     batch_count, sphere_count = radii.shape
     shape = batch_count, sphere_count // QUAD
-    options = {"device": radii.device, "requires_grad": centers.requires_grad or radii.requires_grad}
-    merged_centers = wp.empty(shape, dtype=wp.vec3, **options)
-    merged_radii, extents = (wp.empty(shape, dtype=wp.float32, **options) for _ in range(2))
-    launch(
-        _merge, dim=shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents], device=radii.device
-    )
+    merged_centers = wp.empty(shape, dtype=wp.vec3, device=radii.device)
+    merged_radii, extents = (wp.empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
+    launch(_merge, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
     counts = [sphere_count, shape[1]]
     return Nodes(concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents)
 
@@ -162,100 +159,111 @@ class Spheres:
     merging_angle: float
 
 
+@wp.struct
+class Gradients:
+    """Where to add the gradients of spheres, those that are wanted."""
+
+    centers: wp.array2d(dtype=wp.vec3)
+    radii: wp.array2d(dtype=wp.float32)
+    extents: wp.array2d(dtype=wp.float32)
+
+
 @functools.cache
-def _merged_function(lanes: int) -> wp.Function:
+def make_add_to_node(lanes: int) -> wp.Function:
+    """Make the kernel function that adds a group's share to the gradients of a node."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    total = make_lane_functions(lanes).total
+
+    @wp.func(inline=True)
+    def add_to_node(adj_offset: Vectors, adj_radius: Lane, batch: int, node: int, gradients: Gradients):
+        if gradients.centers:
+            adj_center = wp.vec3(total(adj_offset.x), total(adj_offset.y), total(adj_offset.z))
+            wp.atomic_add(gradients.centers, batch, node, adj_center)
+        if gradients.radii:
+            wp.atomic_add(gradients.radii, batch, node, total(adj_radius))
+
+    return add_to_node
+
+
+@functools.cache
+def _make_blend(lanes: int) -> wp.Function:
     """Make the kernel function of the share m of a quad's sphere: d/E, τ → m, and its derivative by (D/E)²."""
-    Lane = lane_type(lanes)
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    dot = make_lane_functions(lanes).dot
     BLEND2 = wp.constant(_BLEND**2)
     FARTHEST2 = wp.constant(_FARTHEST2)
 
     @wp.func
-    def merged(x: Lane, y: Lane, z: Lane, angle: float):
-        distance2 = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+    def blend(relative: Vectors, angle: float):
+        distance2 = dot(relative, relative)
         inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(FARTHEST2)))
         slope = 1.0 / (angle * angle * (1.0 - BLEND2))
         t = wp.min(wp.max(slope * (Lane(angle * angle) - inverse2), Lane(0.0)), Lane(1.0))
         rise = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
         return wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t), rise
 
+    return blend
+
+
+@functools.cache
+def _make_relative(lanes: int) -> wp.Function:
+    """Make the kernel function of the offset from a group of receivers to a quad, over its extent: d/E and 1/E."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+
+    @wp.func
+    def relative(points: Vectors, batch: int, quad: int, spheres: Spheres):
+        center = spheres.centers[batch, spheres.count + quad]
+        inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
+        offset = Vectors(
+            inverse * (Lane(center[0]) - points.x),
+            inverse * (Lane(center[1]) - points.y),
+            inverse * (Lane(center[2]) - points.z),
+        )
+        return offset, inverse
+
+    return relative
+
+
+@functools.cache
+def make_merged(lanes: int) -> wp.Function:
+    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    blend, relative = _make_blend(lanes), _make_relative(lanes)
+
+    @wp.func
+    def merged(points: Vectors, batch: int, quad: int, spheres: Spheres):
+        share = Lane(0.0)
+        if quad < spheres.extents.shape[1]:
+            offset, _inverse = relative(points, batch, quad, spheres)
+            share_, _slope = blend(offset, spheres.merging_angle)
+            share = share_
+        return share
+
     return merged
 
 
 @functools.cache
-def load_merged_function(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a quad's sphere has for a group of receivers."""
-    Lane = lane_type(lanes)
-    find_merged = _merged_function(lanes)
-
-    @wp.func
-    def load_merged(
-        x: Lane,
-        y: Lane,
-        z: Lane,
-        batch: int,
-        quad: int,
-        spheres: Spheres,
-    ):
-        merged = Lane(0.0)
-        if quad < spheres.extents.shape[1]:
-            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
-            center = spheres.centers[batch, spheres.count + quad]
-            share, _slope = find_merged(
-                inverse * (Lane(center[0]) - x),
-                inverse * (Lane(center[1]) - y),
-                inverse * (Lane(center[2]) - z),
-                spheres.merging_angle,
-            )
-            merged = share
-        return merged
-
-    return load_merged
-
-
-@functools.cache
-def merged_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`load_merged_function`: m̄ → that of the offset to a quad, which is added to its own.
+def make_merged_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`make_merged`'s function: m̄ → that of the offset to a quad, which is added to its own.
 
     With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
     """
-    Lane = lane_type(lanes)
-    find_merged = _merged_function(lanes)
-    fn = lane_functions(lanes)
-    is_any_above, add_to_sphere, total = fn.is_any_above, fn.add_to_sphere, fn.total
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    blend, relative, add_to_node = _make_blend(lanes), _make_relative(lanes), make_add_to_node(lanes)
+    fn = make_lane_functions(lanes)
+    is_any_above, scale, dot, total = fn.is_any_above, fn.scale, fn.dot, fn.total
 
     @wp.func
-    def adjoint(
-        x: Lane,
-        y: Lane,
-        z: Lane,
-        batch: int,
-        quad: int,
-        adj_merged: Lane,
-        spheres: Spheres,
-        adj_centers: wp.array2d(dtype=wp.vec3),
-        adj_radii: wp.array2d(dtype=wp.float32),
-        adj_extents: wp.array2d(dtype=wp.float32),
-    ):
-        adj_x = Lane(0.0)
-        adj_y = Lane(0.0)
-        adj_z = Lane(0.0)
+    def adjoint(points: Vectors, batch: int, quad: int, adj_merged: Lane, spheres: Spheres, gradients: Gradients):
+        adj_offset = Vectors()
         if quad < spheres.extents.shape[1]:
-            node = spheres.count + quad
-            center = spheres.centers[batch, node]
-            inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
-            x_ = inverse * (Lane(center[0]) - x)
-            y_ = inverse * (Lane(center[1]) - y)
-            z_ = inverse * (Lane(center[2]) - z)
-            _merged, slope = find_merged(x_, y_, z_, spheres.merging_angle)
+            offset, inverse = relative(points, batch, quad, spheres)
+            _merged, slope = blend(offset, spheres.merging_angle)
             if is_any_above(slope, 0.0):
-                pull = (2.0 * inverse) * wp.cw_mul(adj_merged, slope)
-                adj_x = wp.cw_mul(pull, x_)
-                adj_y = wp.cw_mul(pull, y_)
-                adj_z = wp.cw_mul(pull, z_)
-                add_to_sphere(adj_x, adj_y, adj_z, Lane(0.0), batch, node, adj_centers, adj_radii)
-                if adj_extents:
-                    along = wp.cw_mul(adj_x, x_) + wp.cw_mul(adj_y, y_) + wp.cw_mul(adj_z, z_)
-                    wp.atomic_add(adj_extents, batch, quad, -total(along))
-        return adj_x, adj_y, adj_z
+                adj_offset = scale((2.0 * inverse) * wp.cw_mul(adj_merged, slope), offset)
+                add_to_node(adj_offset, Lane(0.0), batch, spheres.count + quad, gradients)
+                if gradients.extents:
+                    wp.atomic_add(gradients.extents, batch, quad, -total(dot(adj_offset, offset)))
+        return adj_offset
 
     return adjoint

@@ -86,43 +86,26 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
 
 
 @functools.cache
-def look_up(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function of a table: cos θ → z_l / sin²θ of each lane."""
+def make_look_up(order: int, is_slope: bool, lanes: int) -> wp.Function:
+    """Make the kernel function of a table: cos θ → z_l / sin²θ of each lane, or its derivative by cos θ."""
     Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
 
     @wp.func
-    def look_up_(cosine: Lane, table: wp.array2d(dtype=Band)):
+    def look_up(cosine: Lane, table: wp.array2d(dtype=Band)):
         zonal = Zonal()
         for lane in range(lanes):
             position = cosine[lane] * float(_INTERVALS)
             interval = wp.min(int(position), _INTERVALS - 1)
             t = position - float(interval)
-            z = table[interval, 2] + t * table[interval, 3]
-            z = table[interval, 1] + t * z
-            z = table[interval, 0] + t * z
+            if wp.static(is_slope):
+                z = 2.0 * table[interval, 2] + (3.0 * t) * table[interval, 3]
+                z = float(_INTERVALS) * (table[interval, 1] + t * z)
+            else:
+                z = table[interval, 2] + t * table[interval, 3]
+                z = table[interval, 1] + t * z
+                z = table[interval, 0] + t * z
             for band in range(order):
                 zonal[band, lane] = z[band]
         return zonal
 
-    return look_up_
-
-
-@functools.cache
-def look_up_slope(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function of a table's derivative: cos θ → d(z_l / sin²θ) / d(cos θ) of each lane."""
-    Lane, Zonal, Band = lane_type(lanes), zonal_type(order, lanes), band_type(order)
-
-    @wp.func
-    def look_up_slope_(cosine: Lane, table: wp.array2d(dtype=Band)):
-        zonal = Zonal()
-        for lane in range(lanes):
-            position = cosine[lane] * float(_INTERVALS)
-            interval = wp.min(int(position), _INTERVALS - 1)
-            t = position - float(interval)
-            z = 2.0 * table[interval, 2] + (3.0 * t) * table[interval, 3]
-            z = float(_INTERVALS) * (table[interval, 1] + t * z)
-            for band in range(order):
-                zonal[band, lane] = z[band]
-        return zonal
-
-    return look_up_slope_
+    return look_up
