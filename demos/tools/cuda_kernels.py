@@ -24,25 +24,23 @@ ORDERS = (2, 8)
 FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{
         f"{make.__name__} {order} {horizon}": partial(make, order, horizon, LANES)
-        for make in (log_sh._make_accumulate_kernel, log_sh._make_accumulate_adjoint_kernel)
+        for make in (log_sh._make_accumulate, log_sh._make_accumulate_adjoint)
         for order, horizon in [(2, False), (8, True)]
     },
-    **{f"_make_product_kernel {order}": partial(log_sh._make_product_kernel, order, LANES) for order in ORDERS},
+    **{f"_make_multiply_spheres {order}": partial(log_sh._make_multiply_spheres, order, LANES) for order in ORDERS},
     **{
-        f"_make_exponentiate_kernel {order} {base} {keeps}": partial(
-            exponential._make_exponentiate_kernel, order, base, keeps, LANES
-        )
+        f"_make_exponentiate {order} {base} {keeps}": partial(exponential._make_exponentiate, order, base, keeps, LANES)
         for order, base, keeps in [(2, "quadratic", True), *((8, base, False) for base in exponential.THRESHOLDS)]
     },
     **{
-        f"_make_exponentiate_adjoint_kernel {order} {base}": partial(
-            exponential._make_exponentiate_adjoint_kernel, order, base, LANES
+        f"_make_exponentiate_adjoint {order} {base}": partial(
+            exponential._make_exponentiate_adjoint, order, base, LANES
         )
         for order, base in [(2, "quadratic"), *((8, base) for base in exponential.THRESHOLDS)]
     },
     **{
         f"{make.__name__} {has_horizon}": partial(make, has_horizon, LANES)
-        for make in (directional._make_transmit_kernel, directional._make_transmit_adjoint_kernel)
+        for make in (directional._make_transmit, directional._make_transmit_adjoint)
         for has_horizon in (False, True)
     },
     **{

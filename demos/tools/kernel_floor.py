@@ -26,7 +26,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene
-from warpshadow.maths.directions import edge_width
+from warpshadow.maths.directions import falloff_width
 from warpshadow.stages import vertex_normals
 
 OPERATIONS_PER_SECOND = 67e12
@@ -192,7 +192,7 @@ def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     normals = vertex_normals(geometry.positions, renderer.assembly.faces)
     arrays = [geometry.positions, normals, geometry.centers, geometry.radii]
     directions = ws.fibonacci(scene.visibility.directions)
-    width = edge_width(scene.visibility.softness, len(directions))
+    width = falloff_width(scene.visibility.softness, len(directions))
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)
     vertex_count, sphere_count = arrays[0].shape[1], arrays[3].shape[1]
     face_count, sample_count = renderer.assembly.faces.shape[0], scene.camera.width * scene.camera.height

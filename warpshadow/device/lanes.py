@@ -5,8 +5,11 @@ a thread owns a *group* of receivers and holds each quantity as one vector with 
 vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays in memory stay [batch, vertex, …];
 only scratch is [batch, group, …] of lanes. A group that runs past the last receiver repeats it and writes it once.
 
+Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory:
+kernels of visibility take 1.1 to 1.35 times as long.
+
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmark.py --lanes`` times what else could be chosen.
+are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times what else could be chosen.
 """
 
 import contextlib
@@ -24,7 +27,7 @@ from warpshadow.maths.directions import CHUNK
 
 LANES_VARIABLE = "WARPSHADOW_LANES"
 BITS_VARIABLE = "WARPSHADOW_VECTOR_BITS"
-"""Environment variables that replace what follows from the CPU."""
+"""Environment variables: lanes, and bits of a vector register, in place of those that follow from the CPU."""
 
 LANE_COUNTS = (1, 2, 4, 8, 16)
 REGISTER_BITS = (128, 256, 512)
@@ -125,7 +128,7 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
     return " ".join((base, *(flag for flag in flags if flag not in refused)))
 
 
-def _empty_kernel(flags: str) -> wp.Kernel:
+def _make_empty(flags: str) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
     def do_nothing():
         """What the compiler makes of the flags is all that matters."""
@@ -136,7 +139,7 @@ def _empty_kernel(flags: str) -> wp.Kernel:
 def _builds(flags: str) -> bool:
     """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
     try:
-        wp.launch(_empty_kernel(flags), dim=1, device="cpu", record_tape=False)
+        wp.launch(_make_empty(flags), dim=1, device="cpu", record_tape=False)
     except Exception:  # Warp raises no other
         return False
     return True

@@ -47,11 +47,12 @@ def cell_radius(count: int) -> float:
     return 2 / np.sqrt(count)
 
 
-def edge_width(softness: float, count: int) -> float:
-    """Half-width w = κ·ρ of a shadow's soft edge towards ``count`` cells [rad].
+def falloff_width(softness: float, count: int) -> float:
+    """Half-width w = κ·ρ of the falloff of a blocked cone towards ``count`` cells [rad].
 
     Raises:
-        ValueError: for a width of π/4 or more, where an edge is no edge, and below 0.002, where float32 loses it.
+        ValueError: for a width of π/4 or more, where the falloff is as wide as cones, and below 0.002, where float32
+            has no digits left for it.
     """
     width = softness * cell_radius(count) if check.is_number(softness) else -1.0
     if not 2e-3 <= width < np.pi / 4:
@@ -65,7 +66,8 @@ def edge_width(softness: float, count: int) -> float:
 class BundleCones(NamedTuple):
     """The cone around each bundle: axes [bundle, 3], cosine and sine of the half-angle [bundle].
 
-    A half-angle that culls nothing is given as an axis of zero length with cosine 0 and sine 1.
+    A bundle that is too wide for such a cone has axis 0, cosine 0 and sine 1: then the test that culls, axis·u > …,
+    is never failed.
     """
 
     axes: np.ndarray

@@ -16,7 +16,7 @@ from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
-from warpshadow.maths.directions import check_count, edge_width
+from warpshadow.maths.directions import check_count, falloff_width
 from warpshadow.spheres import Spheres
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.exponential import THRESHOLDS
@@ -107,7 +107,7 @@ class Visibility:
         check.whole("samples", self.samples, what="directions")
         if not (check.is_number(self.error) and self.error > 0):
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
-        edge_width(self.softness, self.directions)
+        falloff_width(self.softness, self.directions)
         check_merging(self.merging)
 
     @classmethod

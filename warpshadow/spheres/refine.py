@@ -248,7 +248,7 @@ class Refinement:
     """Shares of the receivers on grounds and around the mesh; the others lie on it."""
     BATCH = 256
     WIDTHS = (0.1, 0.04)
-    """Soft edge of the cones [radians], first and last."""
+    """Half-width of the cones' falloff [radians], first and last."""
     RATE = 0.003
     """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
     VISIBLE_FLOOR = 0.2

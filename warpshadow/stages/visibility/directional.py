@@ -1,13 +1,13 @@
 """Visibility as transmittance towards cells of directions.
 
-Each sphere lets 1 − A·smoothstep of the light of a cell pass, the step going from the blocked cone's edge outwards and
-inwards by the softness w, and A making up for it so that the blocked solid angle is exactly the cone's:
+Each sphere blocks a cone of directions of half-angle θ. Its transmittance rises smoothly from θ − w to θ + w, the
+falloff, and the opacity A makes up for that: the blocked solid angle is exactly the cone's.
 
     T_q(x) = Π_i (1 − A_i smoothstep((u_i·ω_q − lo_i) / (hi_i − lo_i)))
     lo = cos(θ+w),  hi = cos(max(θ−w, 0)),  A = min(1, (1 − cos θ) / (1 − (hi+lo)/2)),  w = κ·ρ,  ρ = 2/√Q
 
-There is no band limit to ring, T stays in [0, 1] however many spheres overlap, tiny spheres neither vanish nor bloat,
-and the soft edge has a smooth gradient.
+There is no band limit, so no ringing; T stays in [0, 1] however many spheres overlap; tiny spheres block as much as
+they should; and the falloff has a smooth gradient.
 """
 
 import functools
@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_count, edge_width
+from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_count, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.culling import (
     REACH,
@@ -51,7 +51,7 @@ from warpshadow.stages.visibility.walk import (
 )
 
 SOFTNESS = 0.35
-"""κ: half-width of the soft edge in cell radii. More gives wider gradients and more bias."""
+"""κ: half-width of the falloff in cell radii. More gives wider gradients and more bias."""
 
 _OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
@@ -168,7 +168,7 @@ def _make_block(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Receivers, Seen, Task = lane_type(lanes), receivers_type(lanes), seen_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     store_columns, sqrt, is_any_above, along = fn.store_columns, fn.sqrt, fn.is_any_above, fn.along
@@ -229,7 +229,7 @@ def _make_transmit_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
 
 
 @functools.cache
-def _make_transmit_adjoint_kernel(has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
     Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
@@ -366,7 +366,7 @@ def transmittance(
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
-        softness: κ, half-width of the soft edge in cell radii.
+        softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
 
@@ -384,7 +384,7 @@ def transmittance(
     check.finite("directions", directions)
     if not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
         raise ValueError("directions: got vectors of other lengths, expected unit vectors")
-    width = edge_width(softness, len(directions))
+    width = falloff_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
@@ -401,7 +401,7 @@ def transmittance(
     cost = _PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
     return differentiable(
         lambda result: launch(
-            _make_transmit_kernel(normals is not None, lanes),
+            _make_transmit(normals is not None, lanes),
             dim,
             cost=cost,
             inputs=[points, normals, spheres, cells],
@@ -409,7 +409,7 @@ def transmittance(
             outputs=[ends, result],
         ),
         lambda adj_result: launch(
-            _make_transmit_adjoint_kernel(normals is not None, lanes),
+            _make_transmit_adjoint(normals is not None, lanes),
             dim,
             cost=2 * cost,
             inputs=[points, normals, spheres, cells, ends, result, adj_result],

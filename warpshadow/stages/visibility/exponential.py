@@ -2,25 +2,27 @@
 
 exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
 
-Where many spheres overlap, the truncated sum of their logs has lobes above 0, and their exponential grows without
-bound: with 10 000 spheres in one direction, beyond float64. So squarings are *held* where they are no longer those of
-a visibility. Squares of numbers from 0 to 1 are, in the mean, no more than the numbers; so with d = ⟨v²⟩ − ⟨v⟩, means
-over directions,
+Squarings are *held* where they would explode. Where many spheres overlap, the truncated sum of their logs has lobes
+above 0, and the exponential of those has no bound: with 10 000 spheres in one direction it leaves float64. A visibility
+v has values from 0 to 1, so the mean of v² over all directions is at most the mean of v. Truncation breaks that rule,
+and d = ⟨v²⟩ − ⟨v⟩, which is then above 0, measures by how much. Each squaring is
 
     v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
 
-is plain squaring while |f̂| d ≤ QUIET, and no squaring from LOUD on: the result is then the visibility of a part of
-f, 2^−k of it. The factor |f̂|, which is as large as spheres are deep, holds deep logs earlier: they are dark long
-before all their squarings. QUIET to LOUD are two octaves, since by that or more one squaring raises d: so v moves
-smoothly with f. The mean is the product's first coefficient, and the rule costs nothing.
+While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the result
+is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the squarings of
+such logs earlier; nothing is lost, since those receivers are dark before their last squarings. LOUD is four times
+QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v changes
+smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
 
-The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps with |f̂|, and with it would the value by
-some tenths of a percent, which the difference of two images divides by their distance. So from t = |f̂| / 2^p T = ½ on,
-where p is just enough, the base approximation q of f / 2^p passes into the square of that of f / 2^{p+1},
+The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with it,
+by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
+where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of that of f / 2^{p+1},
 
     (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
 
-which at t = 1 is what p + 1 begins with: v has a continuous derivative. It takes one product more and halves |h|.
+At t = 1, w = 1: there p + 1 squarings take over with the same value, and v has a continuous derivative. It costs one
+product more.
 """
 
 import functools
@@ -96,10 +98,14 @@ def _optimal_table(order: int, device: str) -> wp.array:
 
 @functools.cache
 def _make_measure(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function that measures f.
+    """Make the kernel function that finds out how often f is halved and squared.
 
-    It returns p, 2^−p, |f̂|, |f̂| with the part of f0 above 0 (which no visibility has), the most p of all lanes; of the
-    base e^{…/2}, the share w of the square and its derivative by |f̂|.
+    It returns, for each lane but the fifth:
+        the number of squarings p, and 2^−p;
+        |f̂|; and |f̂| with f0 as one more coefficient where f0 > 0, as in no visibility, from which p follows;
+        the largest p of all lanes;
+        e^{2^−p f0 / 2√4π}, whose square is the constant factor of the base approximation;
+        the share w that blends the number of squarings, and its derivative by |f̂|.
     """
     Lane = lane_type(lanes)
     sqrt = make_lane_functions(lanes).sqrt
@@ -285,7 +291,7 @@ def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
+def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = make_lane_functions(lanes)
     load_rows, store_rows, multiply = fn.load_rows, fn.store_rows, make_multiply(order, lanes)
@@ -354,7 +360,7 @@ def _make_exponentiate_kernel(order: int, base: str, keeps_powers: bool, lanes: 
 
 
 @functools.cache
-def _make_exponentiate_adjoint_kernel(order: int, base: str, lanes: int) -> wp.Kernel:
+def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = make_lane_functions(lanes)
     load_rows, add_rows, multiply = fn.load_rows, fn.add_rows, make_multiply(order, lanes)
@@ -515,7 +521,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     cost = _SQUARING_COST * lanes * order**4
     visibility = differentiable(
         lambda visibility: launch(
-            _make_exponentiate_kernel(order, base, powers is not None, lanes),
+            _make_exponentiate(order, base, powers is not None, lanes),
             row_count,
             cost=cost,
             inputs=[log_sh, threshold, product_table(order, str(device), symmetric=True), optimal],
@@ -524,7 +530,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             sums=[faults],
         ),
         lambda adj_visibility: launch(
-            _make_exponentiate_adjoint_kernel(order, base, lanes),
+            _make_exponentiate_adjoint(order, base, lanes),
             row_count,
             cost=2 * cost,
             inputs=[log_sh, threshold, product_table(order, str(device)), optimal, powers, adj_visibility],

@@ -92,7 +92,7 @@ def _make_cull(order: int, has_horizon: bool, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Band, Task = lane_type(lanes), band_type(order), _task_type(order, lanes)
     Receivers, Seen = receivers_type(lanes), seen_type(lanes)
     fn = make_lane_functions(lanes)
@@ -142,7 +142,7 @@ def _make_accumulate_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Ker
 
 
 @functools.cache
-def _make_accumulate_adjoint_kernel(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal, Band, Cone = lane_type(lanes), zonal_type(order, lanes), band_type(order), cone_type(lanes)
     Receivers, Seen, Pull = receivers_type(lanes), seen_type(lanes), pull_type(lanes)
     Task = _task_type(order, lanes)
@@ -288,7 +288,7 @@ def accumulate(
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2
     return differentiable(
         lambda log_sh: launch(
-            _make_accumulate_kernel(order, normals is not None, lanes),
+            _make_accumulate(order, normals is not None, lanes),
             row_count,
             cost=cost,
             inputs=inputs,
@@ -296,7 +296,7 @@ def accumulate(
             outputs=[log_sh],
         ),
         lambda adj_log_sh: launch(
-            _make_accumulate_adjoint_kernel(order, normals is not None, lanes),
+            _make_accumulate_adjoint(order, normals is not None, lanes),
             row_count,
             cost=2 * cost,
             inputs=[*inputs, adj_log_sh],
@@ -313,7 +313,7 @@ def accumulate(
 
 
 @functools.cache
-def _make_product_kernel(order: int, lanes: int) -> wp.Kernel:
+def _make_multiply_spheres(order: int, lanes: int) -> wp.Kernel:
     Lane, Band = lane_type(lanes), band_type(order)
     fn = make_lane_functions(lanes)
     find_group, load, store_rows, offset = fn.find_group, fn.load, fn.store_rows, fn.offset
@@ -394,7 +394,7 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
     row_count = batch_count * group_count(vertex_count, lanes)
     visibility = wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device)
     launch(
-        _make_product_kernel(order, lanes),
+        _make_multiply_spheres(order, lanes),
         row_count,
         cost=PRODUCT_COST * lanes * radii.shape[1] * order**4,
         inputs=[
