@@ -1,4 +1,4 @@
-"""Warp's tape: adjoints written by hand go under it, and what needs no gradient stays off it.
+"""Warp's tape: each thread may have its own, and adjoints written by hand go on it.
 
 Warp has one tape for the process: launches of all threads land on the tape that any of them has opened. Here a thread
 may have one of its own, which other threads neither see nor close. Tapes that others open by ``with wp.Tape()`` are
@@ -6,8 +6,7 @@ the process's, as they were.
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
 
 import warp as wp
 
@@ -47,26 +46,3 @@ def record(function: Callable[[], None]) -> None:
     tape = current_tape()
     if tape is not None:
         tape.record_func(function, [])
-
-
-def launch(
-    kernel: wp.Kernel, dim: int | Sequence[int], *, inputs: Sequence[Any], outputs: Sequence[wp.array], device: Any
-) -> None:
-    """Launch a kernel, on the tape only if an input requires a gradient.
-
-    Warp records every launch, and playing it back compiles its adjoint and runs it, be a gradient asked for or not.
-    """
-    is_wanted = any(isinstance(value, wp.array) and value.requires_grad for value in inputs)
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_tape=is_wanted)
-
-
-def varies(inputs: Iterable[wp.array]) -> bool:
-    """Whether one of some arrays requires a gradient."""
-    return any(array.requires_grad for array in inputs)
-
-
-def launch_new(kernel: wp.Kernel, dim: tuple[int, ...], dtype: type, inputs: list[wp.array]) -> wp.array:
-    """Launch a kernel whose result has the shape of the launch, on the tape that records."""
-    result = wp.empty(dim, dtype=dtype, device=inputs[0].device, requires_grad=varies(inputs))
-    launch(kernel, dim=dim, inputs=inputs, outputs=[result], device=result.device)
-    return result
