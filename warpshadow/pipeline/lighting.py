@@ -12,7 +12,7 @@ from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import common_batch, concatenate, expand
 from warpshadow.device.constants import constant
-from warpshadow.device.tape import varies
+from warpshadow.device.launch import varies
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.static import Rows, Static

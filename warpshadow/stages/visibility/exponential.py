@@ -17,7 +17,8 @@ smoothly with f. The rule is cheap: the mean of v² is the first coefficient of 
 
 The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with it,
 by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
-where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of that of f / 2^{p+1},
+where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of that of
+f / 2^{p+1},
 
     (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
 
