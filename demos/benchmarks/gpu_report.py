@@ -64,9 +64,8 @@ FLOORS = {
     "transfer": ["transfer, directional"],
     "shading": ["shading, directional"],
     "reflectance": ["albedo"],
-    "exposure": ["exposed"],
-    "contrasts": ["slopes"],
-    "smoothing": ["contrasts and smoothing"],
+    "exposure": ["exposed", "slopes"],
+    "smoothing": ["smoothing"],
 }
 """Stages as a renderer explains them, and as ``kernel_floor.py`` counts them."""
 

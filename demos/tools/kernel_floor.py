@@ -104,7 +104,7 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
         Stage("shading, directional", "receiver", Work(6 * q, 12 + 4 * q, 2), Work(6 * q, 12 + 8 * q, 1)),
         Stage("albedo", "sample", Work(15, 40, 2), Work(15, 40, 1)),
         Stage("exposed", "sample", Work(20, 60, 3), Work(45, 92, 1)),
-        Stage("contrasts and smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 5), Work(60, 64 + 2 * 16 + 64, 5)),
+        Stage("smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 5), Work(60, 64 + 2 * 16 + 64, 5)),
         Stage("slopes", "sample", Work(0, 0, 0), Work(160 + 6 * SPECIAL, 28 + 84, 2)),
         Stage("loss", "sample", Work(8, 32, 2), Work(8, 48, 4)),
         Stage("visibility, log-SH sum", "pair", Work(harmonic_pair, 0, 1), Work(2.5 * harmonic_pair, 0, 1)),

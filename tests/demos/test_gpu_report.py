@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warpshadow as ws
 from demos.benchmarks import gpu_report
+from demos.tools import kernel_floor
 
 REPORT = {
     "device": "a device",
@@ -40,6 +42,15 @@ def test_a_device_is_compared_in_its_image_and_every_gradient(monkeypatch):
 def test_every_gradient_that_is_compared_is_one(monkeypatch):
     results = gpu_report.image_and_gradients(gpu_report.small_scene("directional", "vertex"), "cpu")
     assert all(np.isfinite(value).all() and np.abs(value).max() > 0 for value in results.values())
+
+
+def test_floors_belong_to_stages_of_a_renderer():
+    scene = gpu_report.small_scene("directional", "vertex")
+    renderer = ws.Renderer(scene)
+    explained = renderer.explain(geometry=renderer.geometry())
+    assert set(gpu_report.FLOORS) <= set(explained.stages)
+    counted = {stage.name for stage in kernel_floor.stages(kernel_floor.Size(1, 1, 1, 16, 1), 1.0, 1.0)}
+    assert {part for parts in gpu_report.FLOORS.values() for part in parts} <= counted
 
 
 def test_what_is_not_finite_agrees_with_nothing():
