@@ -56,7 +56,8 @@ def scene_of(method: str = "directional", *, still_blocks: bool = True, size: in
     ground = ws.Body(ws.plane(5.0, 16), texture=texture, blockers=0)
     sky = ws.synthetic_sky((-0.6, 0.6, 0.3), height=32, sun_radius=8)
     camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.5, 0), size=(size, size))
-    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4, "samples": 256} | options)
+    rays = {"samples": 256} if method == "ray-traced" else {}
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4} | rays | options)
     return ws.Scene((*balls, ground), sky, camera, visibility)
 
 

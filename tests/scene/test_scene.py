@@ -82,7 +82,7 @@ SETTINGS = (
 @pytest.mark.parametrize(
     ("method", "read"),
     [
-        ("directional", {"directions": 64, "softness": 1, "merging": 0.5}),
+        ("directional", {"directions": 64, "softness": 1, "merging": 0.5, "samples": 33}),
         ("log-sh", {"order": 4, "log": "cap", "base": "optimal_linear", "merging": 0.5}),
         ("none", {"order": 4}),
         ("ray-traced", {"order": 4, "samples": 33}),
@@ -494,7 +494,7 @@ def test_a_bad_argument_of_visibility_is_named(options):
         ("directional", "order", 4, "'log-sh' or 'none' or 'ray-traced' or 'auto'"),
         ("directional", "log", "cap", "'log-sh'"),
         ("none", "base", "linear", "'log-sh'"),
-        ("log-sh", "samples", 64, "'ray-traced'"),
+        ("log-sh", "samples", 64, "'directional' or 'ray-traced'"),
         ("auto", "directions", 64, "'directional'"),
         ("directional", "error", 0.1, "'auto'"),
     ],

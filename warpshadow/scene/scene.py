@@ -33,7 +33,7 @@ READ_BY = {
     "order": ("log-sh", "none", "ray-traced", AUTO),
     "log": ("log-sh",),
     "base": ("log-sh",),
-    "samples": ("ray-traced",),
+    "samples": ("directional", "ray-traced"),
     "error": (AUTO,),
 }
 """The methods that read each setting of a :class:`Visibility`; "auto" leaves some to what it chooses."""
@@ -73,7 +73,8 @@ class Visibility:
             "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
         base: Base approximation of the exponential of "log-sh": "quadratic", "linear" or "optimal_linear".
-        samples: Number of directions of "ray-traced" for a pixel, dealt to its samples.
+        samples: Number of rays: of "ray-traced" for a pixel, dealt to its samples; of "directional" for a vertex of a
+            static body, where other bodies move.
         error: Largest relative error of shading that "auto" is to accept.
     """
 
