@@ -144,7 +144,7 @@ def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
         (("directions", "direction"), ["scene.toml: [visibility]", "'direction'", "did you mean 'directions'"]),
         (("eye = [0, 2, 4]", ""), ["[camera]", "eye: missing"]),
         (("sky.exr", "night.exr"), ["[light]", "envmap", "night.exr"]),
-        (("scale = 0.6", "scale = -1"), ["[[body]] number 1", "scale: got -1", "positive"]),
+        (("scale = 0.6", "scale = -1"), ["1st [[body]]", "scale: got -1", "positive"]),
         (("[light]", "[light"), ["not valid TOML"]),
     ],
 )
@@ -511,9 +511,9 @@ def test_a_folder_that_another_fit_writes_is_left_to_it(fit_file, tmp_path):
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (("iterations", "iteration"), ["fit.toml: [[stage]] number 1", "did you mean 'iterations'"]),
-        (("photo.exr", "no.exr"), ["fit.toml: [[target]] number 1", "no.exr"]),
-        (("body = 0", "body = 5"), ["fit.toml: [[free.albedo]] number 1", "body: got 5"]),
+        (("iterations", "iteration"), ["fit.toml: 1st [[stage]]", "did you mean 'iterations'"]),
+        (("photo.exr", "no.exr"), ["fit.toml: 1st [[target]]", "no.exr"]),
+        (("body = 0", "body = 5"), ["fit.toml: 1st [[free.albedo]]", "body: got 5"]),
     ],
 )
 def test_a_mistake_in_a_fit_file_is_one_line_and_leaves_no_folder(fit_file, tmp_path, change, parts):

@@ -201,7 +201,7 @@ def test_a_mask_counts_as_it_is_stored(load, tmp_path, name, channel_count):
 def test_a_mask_of_colors_or_with_transparency_is_refused(refused, tmp_path, channels):
     ws.write_image(tmp_path / "mask.png", np.broadcast_to(np.float32(channels), (6, 8, len(channels))))
     text = MINIMAL.replace("[free]", 'mask = "mask.png"\n[free]')
-    refused(text, "[[target]] number 1", "mask: got colors or transparency in", "mask.png, expected gray")
+    refused(text, "1st [[target]]", "mask: got colors or transparency in", "mask.png, expected gray")
 
 
 def test_a_target_may_have_a_camera_of_the_images_size(load):
@@ -233,16 +233,16 @@ def test_several_views_are_several_targets(load, tmp_path):
     ("text", "where", "nearest"),
     [
         (MINIMAL + "[optimiser]\n", "the fit", "optimizer"),
-        (MINIMAL.replace("image", "imege"), "[[target]] number 1", "image"),
-        (MINIMAL.replace("[free]", "[target.camera]\neyes = 1\n[free]"), "[[target]] number 1: camera", "eye"),
+        (MINIMAL.replace("image", "imege"), "1st [[target]]", "image"),
+        (MINIMAL.replace("[free]", "[target.camera]\neyes = 1\n[free]"), "1st [[target]]: camera", "eye"),
         (MINIMAL + "exposur = true\n", "[free]", "exposure"),
         (MINIMAL.replace("true", "{ordr = 3}"), "[free] light", "order"),
         (MINIMAL + "camera = {focus = true}\n", "[free] camera", "focal"),
-        (MINIMAL + "[[free.pose]]\nbody = 0\n[[free.pose]]\nbdy = 1\n", "[[free.pose]] number 2", "body"),
+        (MINIMAL + "[[free.pose]]\nbody = 0\n[[free.pose]]\nbdy = 1\n", "2nd [[free.pose]]", "body"),
         (MINIMAL + '[loss]\nkin = "l1"\n', "[loss]", "kind"),
         (MINIMAL + "[still]\nsample = 3\n", "[still]", "samples"),
         (MINIMAL + "[optimizer]\nbeta = 3\n", "[optimizer]", "betas"),
-        (MINIMAL + "[[stage]]\niteration = 3\n", "[[stage]] number 1", "iterations"),
+        (MINIMAL + "[[stage]]\niteration = 3\n", "1st [[stage]]", "iterations"),
     ],
 )
 def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, where, nearest):
@@ -258,16 +258,16 @@ def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, 
         (MINIMAL.replace("light = true", ""), ["free: got none"]),
         (
             MINIMAL.replace('image = "photo.exr"', ""),
-            ["[[target]] number 1", "image: missing, expected a file name"],
+            ["1st [[target]]", "image: missing, expected a file name"],
         ),
         (MINIMAL + "[free.pose]\nbody = 0\n", ["[free.pose]: expected [[free.pose]]"]),
-        (MINIMAL + "[[free.pose]]\n", ["[[free.pose]] number 1", "body: missing, expected the number of a body"]),
+        (MINIMAL + "[[free.pose]]\n", ["1st [[free.pose]]", "body: missing, expected the number of a body"]),
         (
             MINIMAL + "[[free.pose]]\nbody = 2\n",
-            ["[[free.pose]] number 1", "body: got 2, expected the number of a body, from 0 to 1"],
+            ["1st [[free.pose]]", "body: got 2, expected the number of a body, from 0 to 1"],
         ),
         (MINIMAL + "[[free.pose]]\nbody = 0\n[[free.pose]]\nbody = 0\n", ["free: got pose[0] twice"]),
-        (MINIMAL + "[[free.texture]]\nbody = 0\n", ["[[free.texture]] number 1", "whose mesh has no uvs"]),
+        (MINIMAL + "[[free.texture]]\nbody = 0\n", ["1st [[free.texture]]", "whose mesh has no uvs"]),
         (MINIMAL.replace("true", "3"), ["[free] light", "3", "table"]),
         (MINIMAL.replace("true", "{order = 3, directions = 16}"), ["[free] light", "order, directions", "one of them"]),
         ('stages = "poses"\n' + MINIMAL, ["stages: got 'poses'", "did you mean 'pose'"]),
@@ -332,7 +332,7 @@ def test_a_missing_file_is_named(refused, name):
 
 def test_a_missing_mask_is_named(refused):
     text = MINIMAL.replace("[free]", 'mask = "no.png"\n[free]')
-    refused(text, "[[target]] number 1", "mask: no such file", error=FileNotFoundError)
+    refused(text, "1st [[target]]", "mask: no such file", error=FileNotFoundError)
 
 
 def test_a_missing_fit_file_is_named(tmp_path):
@@ -352,7 +352,7 @@ def test_images_of_other_proportions_need_a_camera(refused, tmp_path):
 
 def test_a_mask_of_another_size_is_refused(refused, tmp_path):
     ws.write_image(tmp_path / "mask.png", linear_to_srgb(np.ones((3, 4, 1), np.float32)))
-    refused(MINIMAL.replace("[free]", 'mask = "mask.png"\n[free]'), "[[target]] number 1", "mask: got shape")
+    refused(MINIMAL.replace("[free]", 'mask = "mask.png"\n[free]'), "1st [[target]]", "mask: got shape")
 
 
 # ---------------------------------------------------------------------------------------------- running it

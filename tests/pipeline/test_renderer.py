@@ -449,7 +449,7 @@ def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
     camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(64, 64))
     scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
     with pytest.warns(
-        UserWarning, match=r"body number 1 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""
+        UserWarning, match=r"body 0 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""
     ):
         ws.render(scene)
     with warnings.catch_warnings():

@@ -172,7 +172,7 @@ def test_scene_files_name_bodies(tmp_path):
     again = ws.load_scene(ws.write_scene(scene, tmp_path / "again")[0])
     assert [body.called for body in again.bodies] == ["Ball №1", "plane"]
     path.write_text(SCENE.replace('"Ball №1"', "3"), encoding="utf-8")
-    with pytest.raises(SceneError, match=r"\[\[body\]\] number 1: name: got 3, expected a name"):
+    with pytest.raises(SceneError, match=r"1st \[\[body\]\]: name: got 3, expected a name"):
         ws.load_scene(path)
 
 
@@ -193,5 +193,5 @@ def test_fit_files_name_bodies(tmp_path):
     (free,) = load_fit(path).problem.free
     assert free == inverse.Albedo(1)
     path.write_text(text.replace('"plane"', '"plain"'), encoding="utf-8")
-    with pytest.raises(FitFileError, match=r"\[\[free.albedo\]\] number 1: body: got 'plain'.*did you mean 'plane'"):
+    with pytest.raises(FitFileError, match=r"1st \[\[free.albedo\]\]: body: got 'plain'.*did you mean 'plane'"):
         load_fit(path)

@@ -176,10 +176,10 @@ def test_a_body_is_scaled_then_rotated_then_translated():
         (MINIMAL.replace("eye", "supersample = 3\neye", 1), "[camera]", "supersampling"),
         (CAMERA + '[light]\nenv_map = "x.exr"\n' + BODY, "[light]", "envmap"),
         (MINIMAL + '[visibility]\nmetod = "none"\n', "[visibility]", "method"),
-        (MINIMAL + "albdo = [1, 1, 1]\n", "[[body]] number 1", "albedo"),
-        (MINIMAL + "radios = 1\n", "[[body]] number 1", "radius"),
-        (MINIMAL + BODY.replace("icosphere", "plane") + "segment = 4\n", "[[body]] number 2", "segments"),
-        (MINIMAL + '[[body]]\nmesh = "x.obj"\nblocker = 3\n', "[[body]] number 2", "blockers"),
+        (MINIMAL + "albdo = [1, 1, 1]\n", "1st [[body]]", "albedo"),
+        (MINIMAL + "radios = 1\n", "1st [[body]]", "radius"),
+        (MINIMAL + BODY.replace("icosphere", "plane") + "segment = 4\n", "2nd [[body]]", "segments"),
+        (MINIMAL + '[[body]]\nmesh = "x.obj"\nblocker = 3\n', "2nd [[body]]", "blockers"),
     ],
 )
 def test_an_unknown_key_of_any_table_names_the_nearest_known_key(load, text, where, nearest):
@@ -200,14 +200,14 @@ def test_a_missing_table_is_named(load, name):
         (MINIMAL.replace("target = [0, 0, 0]", ""), ["[camera]", "target: missing", "expected 3 finite numbers"]),
         (CAMERA + "[light]\n" + BODY, ["[light]", "either envmap", "or sh"]),
         (CAMERA + LIGHT + 'envmap = "x.exr"\n' + BODY, ["[light]", "either envmap", "or sh"]),
-        (CAMERA + LIGHT + "[[body]]\n", ["[[body]] number 1", "either mesh", "or primitive"]),
-        (MINIMAL + 'mesh = "x.obj"\n', ["[[body]] number 1", "either mesh", "'plane', 'icosphere'"]),
-        (MINIMAL + 'albedo = [1, 1, 1]\ntexture = "x.png"\n', ["[[body]] number 1", "either albedo or texture"]),
+        (CAMERA + LIGHT + "[[body]]\n", ["1st [[body]]", "either mesh", "or primitive"]),
+        (MINIMAL + 'mesh = "x.obj"\n', ["1st [[body]]", "either mesh", "'plane', 'icosphere'"]),
+        (MINIMAL + 'albedo = [1, 1, 1]\ntexture = "x.png"\n', ["1st [[body]]", "either albedo or texture"]),
         (MINIMAL.replace('"icosphere"', '"cube"'), ["primitive", "'cube'", "'plane', 'icosphere'"]),
         (MINIMAL.replace("[[body]]", "[body]"), ["expected [[body]]"]),
         (MINIMAL.replace("[camera]", "[[camera]]"), ["[camera]", "a table of keys"]),
         ("visibility = 3\n" + MINIMAL, ["[visibility]", "3", "a table of keys"]),
-        ("body = [1]\n" + CAMERA + LIGHT, ["[[body]] number 1", "a table of keys"]),
+        ("body = [1]\n" + CAMERA + LIGHT, ["1st [[body]]", "a table of keys"]),
         ("body = []\n" + CAMERA + LIGHT, ["bodies: got none"]),
     ],
 )
@@ -257,7 +257,7 @@ def test_a_wrong_value_is_refused_with_its_table_its_key_and_what_is_accepted(lo
     tables = {"camera": CAMERA, "light": LIGHT, "visibility": "[visibility]\n", "body": BODY}
     if table == "plane":
         table, tables["body"] = "body", BODY.replace("icosphere", "plane")
-    where = {"body": "[[body]] number 1"}.get(table, f"[{table}]")
+    where = {"body": "1st [[body]]"}.get(table, f"[{table}]")
     for value in values:
         text = "".join(lines + f"{key} = {value}\n" * (name == table) for name, lines in tables.items())
         refused(load, text, where, f" {key}", "got", "expected")
@@ -286,7 +286,7 @@ def test_sh_light_that_is_not_a_square_number_of_colors_is_refused(load, value):
 
 def test_a_texture_on_a_mesh_without_uvs_is_refused(load, tmp_path):
     ws.write_image(tmp_path / "x.png", np.ones((2, 2, 3), np.float32))
-    refused(load, MINIMAL + 'texture = "x.png"\n', "[[body]] number 1", "texture", "'icosphere' has no uvs")
+    refused(load, MINIMAL + 'texture = "x.png"\n', "1st [[body]]", "texture", "'icosphere' has no uvs")
 
 
 @pytest.mark.parametrize(
@@ -294,8 +294,8 @@ def test_a_texture_on_a_mesh_without_uvs_is_refused(load, tmp_path):
     [
         (CAMERA + '[light]\nenvmap = "no.exr"\n' + BODY, "[light]", "envmap"),
         (CAMERA + '[light]\nenvmap = ""\n' + BODY, "[light]", "envmap"),
-        (CAMERA + LIGHT + '[[body]]\nmesh = "no.obj"\n', "[[body]] number 1", "mesh"),
-        (MINIMAL.replace("icosphere", "plane") + 'texture = "no.png"\n', "[[body]] number 1", "texture"),
+        (CAMERA + LIGHT + '[[body]]\nmesh = "no.obj"\n', "1st [[body]]", "mesh"),
+        (MINIMAL.replace("icosphere", "plane") + 'texture = "no.png"\n', "1st [[body]]", "texture"),
     ],
 )
 def test_a_missing_file_is_named_with_its_key_and_its_whole_path(load, tmp_path, text, where, key):

@@ -288,9 +288,9 @@ def test_a_file_of_spheres_or_colors_that_is_none_is_refused(refused, tmp_path, 
     (tmp_path / "empty").write_bytes(b"")
     for name in ("text", "text.npy"):
         (tmp_path / name).write_text("no numbers at all")
-    refused(TABLES + lines, "[[body]] number 1", *parts)
+    refused(TABLES + lines, "1st [[body]]", *parts)
 
 
 @pytest.mark.parametrize("line", ['spheres = "no.npz"', 'albedo = "no.npy"'])
 def test_a_missing_file_of_spheres_or_colors_is_named(refused, line):
-    refused(TABLES + line, "[[body]] number 1", "no such file", error=FileNotFoundError)
+    refused(TABLES + line, "1st [[body]]", "no such file", error=FileNotFoundError)

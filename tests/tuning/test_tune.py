@@ -212,7 +212,7 @@ def test_the_settings_are_lines_of_a_scene_file(instant, fitted, monkeypatch):
         lines, visibility = tomllib.loads(text), trial.scene.visibility
         assert lines["visibility"].items() <= dataclasses.asdict(visibility).items()
         assert ws.Visibility(**lines["visibility"]).method == visibility.method
-        numbers = [int(number) - 1 for number in re.findall(r"^\[\[body\]\]  # number (\d+), ", text, re.M)]
+        numbers = [int(number) for number in re.findall(r"^\[\[body\]\]  # body (\d+) \('", text, re.M)]
         changes = dict(zip(numbers, lines.get("body", []), strict=True))
         for number, (before, after) in enumerate(zip(scene.bodies, trial.scene.bodies, strict=True)):
             changed = dataclasses.replace(before, **changes.get(number, {}))

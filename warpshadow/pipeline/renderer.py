@@ -324,7 +324,7 @@ class Renderer:
         for number, body in enumerate(bodies):
             if body.receivers == "vertex" and not self._method.lights_samples and pixels_per_face[number] > COARSE_FACE:
                 warnings.warn(
-                    f"body number {number + 1} ({body.mesh.name!r}): a face covers {pixels_per_face[number]:.0f} "
+                    f"body {number} ({body.called!r}): a face covers {pixels_per_face[number]:.0f} "
                     "pixels on average, and light is evaluated at its corners alone; "
                     'receivers = "pixel" evaluates it at every pixel',
                     stacklevel=2,

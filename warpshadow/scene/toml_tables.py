@@ -41,8 +41,9 @@ def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, An
     """Tables of a list, each with what messages call it."""
     if not isinstance(table[key], list):
         raise ValueError(f"[{within}{key}]: expected [[{within}{key}]], since there may be several")
-    for position, item in enumerate(table[key], start=1):
-        yield f"[[{within}{key}]] number {position}", item
+    for place, item in enumerate(table[key], start=1):
+        ending = "th" if place % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(place % 10, "th")
+        yield f"{place}{ending} [[{within}{key}]]", item
 
 
 def make(kind: Callable[..., T], table: Table) -> T:

@@ -110,11 +110,11 @@ class Tuning:
         keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
         chosen = {key: getattr(visibility, key) for key in keys.get(visibility.method, ("method",))}
         blocks = [toml_tables.block("[visibility]", chosen)]
-        for number, (before, after) in enumerate(zip(self.given.bodies, self.scene.bodies, strict=True), start=1):
+        for number, (before, after) in enumerate(zip(self.given.bodies, self.scene.bodies, strict=True)):
             pairs = {key: (getattr(before, key), getattr(after, key)) for key in ("blockers", "receivers")}
             changes = {key: new for key, (old, new) in pairs.items() if new != old}
             if changes:
-                blocks.append(toml_tables.block(f"[[body]]  # number {number}, {before.mesh.name}", changes))
+                blocks.append(toml_tables.block(f"[[body]]  # body {number} ({before.called!r})", changes))
         return "\n".join(blocks)
 
 
