@@ -177,9 +177,6 @@ def _indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarr
     return np.array(faces, dtype=np.int32, order="C")
 
 
-# ------------------------------------------------------------------------------------------------------ files
-
-
 class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates."""
 

@@ -10,8 +10,6 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError
 
-# ------------------------------------------------------------------------------------------------- primitives
-
 
 def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, int] = 64) -> Mesh:
     """Make a grid in the plane y = 0, centered at the origin, facing +y.

@@ -12,8 +12,6 @@ from warpshadow.assets.color import LUMINANCE, srgb_to_linear
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 
-# ---------------------------------------------------------------------------------------- maps from a formula
-
 
 def draw_test_map(height: int = 256) -> EnvironmentMap:
     """Draw a map that shows which way is which: a color for each half-axis, a grid every 15°, and labels."""

@@ -8,8 +8,6 @@ import numpy as np
 
 from warpshadow import check
 
-# --------------------------------------------------------------------------------------------------- topology
-
 _NOT_MANIFOLD = -2
 
 

@@ -9,8 +9,6 @@ import numpy as np
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.topology import edge_neighbors
 
-# ------------------------------------------------------------------------------------------------- unwrapping
-
 
 def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
     """Give a mesh uvs of its own: cut it into charts and lay them out side by side, with xatlas.

@@ -13,9 +13,6 @@ from warpshadow.device.threads import one_at_a_time
 _SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
 
 
-# ---------------------------------------------------------------------------------------------- embedded deformation
-
-
 @wp.kernel
 def _deform_points(
     # in

@@ -10,8 +10,6 @@ import warp as wp
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci
 
-# ---------------------------------------------------------------------------------------------- shading by rays
-
 SET_COUNT = 16
 """Independent sets of directions; neighboring receivers take different ones, so that error is noise, not bands."""
 

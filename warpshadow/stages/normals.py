@@ -7,9 +7,6 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.launch import launch
 
-# ---------------------------------------------------------------------------------------------------- normals
-
-
 _THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
 _SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
 

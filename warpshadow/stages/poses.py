@@ -10,8 +10,6 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.stages.rotations import check_orthonormal
 
-# ---------------------------------------------------------------------------------------------- rigid bodies
-
 
 @wp.kernel
 def _pose_points(

@@ -19,8 +19,6 @@ PARALLEL = 1.0e-6
 NOT_ORTHONORMAL = 0.05
 """Largest entry of |RᵀR − I| of what is taken for a rotation: a step of 0.01 in all nine numbers stays below."""
 
-# ---------------------------------------------------------------------------------------------- rotations
-
 
 @wp.kernel
 def _rotate_by_quaternions(
