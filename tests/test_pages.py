@@ -124,6 +124,16 @@ def resolved(path):
     return False
 
 
+ROLES = re.compile(r":(func|class|meth|data|mod|attr):`~?(warpshadow\.[\w.]+)`")
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "warpshadow").rglob("*.py")), ids=name_of)
+def test_what_docstrings_refer_to_exists(file):
+    for role, path in ROLES.findall(file.read_text("utf-8")):
+        assert resolved(path), path
+        assert (path in sys.modules) == (role == "mod"), path
+
+
 # ------------------------------------------------------------------------------------------------ commands
 
 

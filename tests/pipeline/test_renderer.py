@@ -448,9 +448,7 @@ def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
     floor = ws.Body(ws.plane(4.0, 1), blockers=0)
     camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(64, 64))
     scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
-    with pytest.warns(
-        UserWarning, match=r"body 0 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""
-    ):
+    with pytest.warns(UserWarning, match=r"body 0 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""):
         ws.render(scene)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -121,7 +121,7 @@ def launch_slices(
     sums: Sequence[wp.array | None] = (),
     device: wp.Device,
 ) -> None:
-    """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`warpshadow.device.launch`."""
+    """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
     dim = (dim,) if isinstance(dim, int) else dim
     workers = thread_count()
     rows = workers if device.is_cpu else math.prod(dim)

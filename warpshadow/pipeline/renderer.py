@@ -395,7 +395,7 @@ class Renderer:
 
         Returns:
             Float32 of shape [height, width]: 0 where no sample sees the texel; see
-            :func:`warpshadow.stages.textures.sample.seen_texels`.
+            :func:`warpshadow.stages.textures.seen.seen_texels`.
 
         Raises:
             ValueError: for a body without a texture.
