@@ -1,4 +1,4 @@
-"""Distant light: equirectangular environment maps, what they project to, and maps made from a formula.
+"""Distant light: equirectangular environment maps, and what they project to.
 
 Pixel (row, col) of a map of H × 2H looks along θ = π(row+½)/H, φ = 2π(col+½)/W,
 

@@ -1,4 +1,4 @@
-"""Poses: points, normals and spheres of bodies, moved from their own space into the world."""
+"""Poses: points and spheres of bodies, moved from their own space into the world."""
 
 from dataclasses import dataclass
 

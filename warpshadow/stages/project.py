@@ -80,7 +80,10 @@ def _to_clip(
 
 
 def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
-    """Take world positions to clip space (convention: see the module).
+    """Take world positions to clip space.
+
+    x/w and y/w run from −1 at the left and top of the image to 1 at the right and bottom, z/w from 1 at the near plane
+    to 0 at infinity; w is the depth.
 
     Args:
         positions: World positions [scene units], vec3, shape [batch, vertex].

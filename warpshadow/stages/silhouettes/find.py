@@ -1,18 +1,9 @@
 """Silhouettes: where neighboring samples see different surfaces, one of which ends between them.
 
-A rasterized image jumps there, and does not change while the line between two samples moves. So samples at silhouettes
-are smoothed (after Laine et al. 2020, section 3.5, who take edges as upright): each takes of the other's color what of
-itself lies beyond the line (:mod:`warpshadow.stages.silhouettes.areas`). The line is the edge where the surface of the
-nearer sample ends before the center of the other, or that where two surfaces intersect.
-
-Lines that cut a row of samples are found between neighbors in the row, those that cut a column between neighbors in
-the column, and a line that leans may do both. It counts ω = 1 / (1 + m⁴) where it leans by m samples from one row (or
-column) to the next. A sample of color c, with neighbors of colors c_k and areas e_k beyond the lines, so becomes
-
-    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
-
-which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common: nothing
-if they lie beyond one line, their product if they lie beyond two upright ones.
+The line between two samples is the edge where the surface of the nearer one ends before the center of the other, or
+that where two surfaces intersect. Lines that cut a row of samples are found between neighbors in the row, those that
+cut a column between neighbors in the column, and a line that leans may do both. It
+counts ω = 1 / (1 + m⁴) where it leans by m samples from one row (or column) to the next.
 """
 
 from dataclasses import dataclass

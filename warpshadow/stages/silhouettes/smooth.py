@@ -1,4 +1,15 @@
-"""Smoothing: samples at a silhouette blend, so that an image changes smoothly as it moves."""
+"""Smoothing: samples at a silhouette blend, so that an image changes smoothly as it moves.
+
+A rasterized image jumps at a silhouette, and does not change while the line between two samples moves. So each takes of
+the other's color what of itself lies beyond the line (:mod:`warpshadow.stages.silhouettes.areas`; after Laine et al.
+2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond the
+lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
+
+    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
+
+which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common: nothing
+if they lie beyond one line, their product if they lie beyond two upright ones.
+"""
 
 import functools
 

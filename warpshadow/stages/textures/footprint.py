@@ -1,4 +1,9 @@
-"""Footprints: what part of a texture a sample covers."""
+"""Footprints: what part of a texture a sample covers.
+
+A sample does not see a point of the texture but its *footprint*: to first order an ellipse, the image of the sample
+under the derivative of uv by its position. It is covered by *probes* on a line along its major axis. So a ground seen
+at a grazing angle neither blurs nor aliases.
+"""
 
 import functools
 import math

@@ -1,15 +1,8 @@
-"""Textures: mip levels, and the reflectance that each sample of an image sees of them.
+"""Mip pyramids: textures of any sizes with their levels, in one array.
 
 A texture is an image of linear RGB reflectance with row 0 at v = 1; it repeats outside of [0, 1], and its texels have
 their centers at +0.5. Each mip level is half as large as the one before, and a texel there is the mean of those that
 it covers.
-
-A sample does not see a point of the texture but its *footprint*: to first order an ellipse, the image of the sample
-under the derivative of uv by its position. The footprint is filtered by *probes* on a line along its major axis. A
-probe is bilinear in two mip levels, blended so that their mean texel is as wide as the minor axis. So a ground seen
-at a grazing angle neither blurs nor aliases, and each texel in view gets its share of the gradient: a texture that is
-fitted has no holes. Where a texel is larger than the footprint, one probe of the finest level is left, which is
-bilinear interpolation.
 """
 
 import functools

@@ -1,4 +1,9 @@
-"""Samples of textures: the mean over a footprint, and its adjoint."""
+"""Samples of textures: the mean over a footprint, and its adjoint.
+
+A probe is bilinear in two mip levels, blended so that their mean texel is as wide as the minor axis of the footprint.
+Each texel in view gets its share of the gradient: a texture that is fitted has no holes. Where a texel is larger than
+the footprint, one probe of the finest level is left, which is bilinear interpolation.
+"""
 
 import math
 from collections.abc import Sequence
