@@ -153,7 +153,7 @@ def test_the_adjoint_of_sh_transfer_is_that_of_the_product(order, device):
     def twin(visibility, normals):
         # the kernel's polynomials extend off the unit sphere, so differences are taken of unit normals
         unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return sh.product(visibility, sh.rotate_zonal(zonal, unit))
+        return twins.Product(order)(visibility, twins.turned(zonal, unit))
 
     visibility = rng.normal(size=(4, order**2))
     weights = rng.normal(size=(4, order**2))

@@ -1,4 +1,4 @@
-"""Skies: environment maps made of formulas, and the map that tests orientation."""
+"""Skies: environment maps made of formulas."""
 
 from __future__ import annotations
 
@@ -8,38 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
-from warpshadow.assets.color import LUMINANCE, srgb_to_linear
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
-
-
-def draw_test_map(height: int = 256) -> EnvironmentMap:
-    """Draw a map that shows which way is which: a color for each half-axis, a grid every 15°, and labels."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    width = 2 * height
-    towards = sh.equirectangular_directions(height)
-    axis = np.abs(towards).argmax(axis=-1)
-    negative = np.take_along_axis(towards, axis[..., None], axis=-1)[..., 0] < 0
-    colors = np.array([[(220, 70, 60), (110, 30, 90)], [(90, 190, 240), (90, 70, 40)], [(240, 200, 70), (40, 80, 190)]])
-    picture = Image.fromarray(colors[axis, negative.astype(int)].astype(np.uint8))
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=height / 7)
-    for step in range(24):
-        draw.line([(step * width / 24, 0), (step * width / 24, height)], fill=(60, 60, 60))
-        draw.line([(0, step * height / 12), (width, step * height / 12)], fill=(60, 60, 60))
-    labels = [("-Z", 0, 0.5), ("+X", 0.25, 0.5), ("+Z", 0.5, 0.5), ("-X", 0.75, 0.5), ("-Z", 1, 0.5)]
-    labels += [(text, quarter / 4, row) for text, row in (("+Y", 0.09), ("-Y", 0.91)) for quarter in range(5)]
-    for text, u, v in labels:
-        draw.text(
-            (u * width, v * height),
-            text,
-            fill="white",
-            font=font,
-            anchor="mm",
-            stroke_width=2,
-            stroke_fill="black",
-        )
-    return EnvironmentMap(srgb_to_linear(np.asarray(picture) / 255))
 
 
 def synthetic_sky(

@@ -75,11 +75,6 @@ class Target:
                 f"{self.camera.width} × {self.camera.height}"
             )
 
-    @property
-    def has_coverage(self) -> bool:
-        """Whether the image says what of each pixel is covered."""
-        return self.image.shape[2] == 4
-
     def weights(self) -> np.ndarray:
         """How much each pixel counts, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask

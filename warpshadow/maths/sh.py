@@ -11,7 +11,6 @@ Functions are NumPy in float64; sh_kernels.py has what kernels use.
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +19,6 @@ from warpshadow import check
 
 ORDERS = range(2, 9)
 """Orders (numbers of bands) that the kernels are made for."""
-
-MAX_ORDER = ORDERS[-1]
 
 
 def check_order(order: int) -> None:
@@ -102,21 +99,6 @@ def quadrature(degree: int) -> Quadrature:
     rings = np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z[:, None])
     weights = np.repeat(weight * 2 * np.pi / (degree + 1), degree + 1)
     return Quadrature(np.stack(rings, axis=-1).reshape(-1, 3), weights)
-
-
-def project_function(function: Callable[[np.ndarray], np.ndarray], order: int, degree: int = 128) -> np.ndarray:
-    """Project a function of direction onto the basis.
-
-    Args:
-        function: Maps unit vectors [direction, 3] to values [direction] or [direction, channel].
-        order: Number of bands n.
-        degree: Polynomial degree that the quadrature integrates exactly.
-
-    Returns:
-        Coefficients, shape [order²] or [order², channel].
-    """
-    directions, weights = quadrature(degree)
-    return (evaluate(order, directions) * weights[:, None]).T @ function(directions)
 
 
 def equirectangular_directions(height: int) -> np.ndarray:
@@ -210,21 +192,6 @@ def zonal_basis(order: int, z: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- rotation
 
 
-def rotate_zonal(zonal: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Turn zonal coefficients from the z axis to a direction: f_lm = √(4π/(2l+1)) z_l y_lm(u).
-
-    Args:
-        zonal: Shape [..., order].
-        directions: Unit vectors u, shape [..., 3].
-
-    Returns:
-        Coefficients, shape [..., order²].
-    """
-    order = zonal.shape[-1]
-    band = band_of(order)
-    return np.sqrt(4 * np.pi / (2 * band + 1)) * zonal[..., band] * evaluate(order, directions)
-
-
 def rotation_matrix(order: int, rotation: np.ndarray) -> np.ndarray:
     """Matrix that turns coefficients as ``rotation`` turns directions, block-diagonal in the bands.
 
@@ -280,23 +247,3 @@ def triple_products(order: int, bands_of_j: tuple[int, ...] | None = None, symme
     k, i, j = np.nonzero(tensor.transpose(2, 0, 1))
     first = np.searchsorted(k, np.arange(order**2 + 1))
     return TripleProducts(first, i, j, tensor[i, j, k])
-
-
-def product_matrix(coefficients: np.ndarray) -> np.ndarray:
-    """Matrix of multiplication with an expansion: (f g)_k = Σ_j M_kj g_j, truncated to the order of f.
-
-    Args:
-        coefficients: Expansion f, shape [order²].
-
-    Returns:
-        Shape [order², order²], symmetric.
-    """
-    return np.tensordot(coefficients, triple_product_tensor(order_of("coefficients", coefficients)), 1)
-
-
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Truncated product of two expansions [..., order²], by exact quadrature."""
-    order = int(round(np.sqrt(a.shape[-1])))
-    directions, weights = quadrature(3 * (order - 1))
-    basis = evaluate(order, directions)
-    return ((a @ basis.T) * (b @ basis.T) * weights) @ basis
