@@ -16,6 +16,7 @@ import warpshadow as ws
 from warpshadow.cli import app
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline import renderer as pipeline_renderer
 from warpshadow.scene import blockers
 
 if sys.version_info >= (3, 11):
@@ -208,6 +209,28 @@ def test_the_stage_that_a_page_adds_has_an_adjoint(tmp_path, monkeypatch):
     assert np.array_equal(darkened.numpy()[..., 3], x[..., 3])
     assert (darkened.numpy()[:, 0, 0, :3] < 0.6 * x[:, 0, 0, :3]).all()
     assert np.vdot(w, darkened.numpy()) == pytest.approx(np.vdot(image.grad.numpy(), x), rel=1e-6)
+
+
+def test_the_node_that_a_page_adds_is_one_of_the_image(tmp_path, monkeypatch):
+    """Pasted where the page says; then explain lists it, and the corners are darker."""
+    page = (ROOT / "warpshadow" / "README.md").read_text("utf-8")
+    (snippet,) = blocks(ROOT / "warpshadow" / "README.md", "python")
+    (line,) = re.findall(r"^    (averaged = .*)$", page, re.MULTILINE)
+    source = (ROOT / "warpshadow" / "pipeline" / "view.py").read_text("utf-8")
+    assert source.count("        return averaged\n") == 1
+    (tmp_path / "vignette.py").write_text(snippet, "utf-8")
+    pasted = source.replace("        return averaged\n", f"        {line}\n        return averaged\n")
+    (tmp_path / "darker_view.py").write_text("from vignette import darken_corners\n" + pasted, "utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    camera = ws.Camera.look_at((0, 2, 0.1), (0, 0, 0), size=(8, 8))
+    scene = ws.Scene([ws.Body(ws.plane(9.0, 4), receivers="pixel")], ws.EnvironmentMap.constant(), camera)
+    plain = ws.render(scene)
+    monkeypatch.setattr(pipeline_renderer, "View", importlib.import_module("darker_view").View)
+    renderer = ws.Renderer(scene)
+    assert renderer.explain()["vignette"]
+    darkened = renderer.render()
+    assert (darkened[0, 0, :3] < 0.8 * plain[0, 0, :3]).all()
+    assert np.allclose(darkened[4, 4], plain[4, 4], rtol=0.05)
 
 
 @pytest.mark.slow

@@ -19,6 +19,13 @@ CACHE = ROOT / ".mypy_cache" / "users"
 
 FACADES = ("warpshadow", "warpshadow.torch", "warpshadow.inverse", "warpshadow.stages")
 
+OTHERS = {
+    "warpshadow.device.cuda_graph": ("Captured", "with_gradients"),
+    "warpshadow.device.tape": ("recorded",),
+    "warpshadow.scene.random_scenes": ("RandomScenes",),
+}
+"""Public names of modules that are not public as a whole."""
+
 
 def functions_of(name: str, value: object) -> Iterator[tuple[str, object]]:
     """Public functions behind a name: itself, or a class's own methods and properties."""
@@ -73,6 +80,15 @@ def test_public_signatures_have_types_and_no_any(facade):
     found = [pair for name in module.__all__ for pair in functions_of(name, getattr(module, name))]
     assert len(found) > 2
     assert not [fault for pair in found for fault in faults(*pair)]
+
+
+@pytest.mark.parametrize("module", OTHERS)
+def test_public_names_of_other_modules_have_types_and_no_any(module):
+    values = {name: getattr(importlib.import_module(module), name) for name in OTHERS[module]}
+    found = [pair for name, value in values.items() for pair in functions_of(name, inspect.unwrap(value))]
+    assert not [fault for pair in found for fault in faults(*pair)]
+    page = (ROOT / "warpshadow" / "README.md").read_text("utf-8")
+    assert all(f"`{name}`" in page for name in (module, *values))
 
 
 @pytest.mark.parametrize("facade", FACADES)

@@ -130,9 +130,10 @@ class View(LitPoints):
             samples = samples_of("exposure", _expose, receivers, lit, reflected.samples)
         smooth = _smooth_moving if clip.requires_grad else smooth_silhouettes
         smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, clip)
+        averaged = samples_of("averaging", film.average, smoothed, self._across)
         if self._across == 1:
-            return Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
-        return samples_of("averaging", film.average, smoothed, self._across)
+            averaged = Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
+        return averaged
 
     def _exposed_white(self, lit: Node) -> Node:
         """Node of the samples if every surface were white; kept with the last shading."""
