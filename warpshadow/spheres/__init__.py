@@ -8,7 +8,7 @@
     fit         the stages in order, the search for an error, the cache
 
 Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh. Stage 2 uses the cones of
-warpshadow.stages.visibility.cones and the soft edge of the directional method, so the fit accounts for what a renderer
+warpshadow.stages.visibility.cones and the falloff of the directional method, so the fit accounts for what a renderer
 does at receivers on and inside spheres.
 """
 

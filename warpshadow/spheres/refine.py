@@ -1,7 +1,7 @@
 """Stage 2: spheres that cast the shadows of the mesh.
 
 Receivers are on the mesh, on grounds below it and in a shell around it. Rays tell which directions they see past the
-mesh. Adam moves and scales the spheres until their transmittance, with the soft edge of
+mesh. Adam moves and scales the spheres until their transmittance, with the falloff of
 warpshadow.stages.visibility.directional, agrees with that under lights of several sharpnesses. Spheres that matter
 little are relocated on the way.
 """

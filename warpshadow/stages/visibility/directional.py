@@ -374,8 +374,8 @@ def transmittance(
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf, numbers beyond 1e18 and
-            negative radii. (On a GPU that reads a count back, and is left out while a CUDA graph is captured.)
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
+            is captured, nothing is checked.)
 
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging.
     """

@@ -15,10 +15,9 @@ such logs earlier; nothing is lost, since those receivers are dark before their 
 QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v changes
 smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
 
-The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with it,
-by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
-where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of that of
-f / 2^{p+1},
+The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with
+it, by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
+where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
 
     (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLENDED − ½))
 
@@ -490,9 +489,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         SH visibility, float32 of shape [batch, vertex, order²].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf and numbers beyond 1e18.
-            (Reading the counts waits for the device. While a CUDA graph is captured that cannot be, and nothing is
-            checked.)
+        ValueError: for NaN, Inf and numbers beyond 1e18. (That waits for the device. While a CUDA graph is captured,
+            nothing is checked.)
 
     Differentiable: log_sh.
     """

@@ -270,8 +270,8 @@ def accumulate(
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so for NaN, Inf, numbers beyond 1e18 and
-            negative radii. (On a GPU that reads a count back, and is left out while a CUDA graph is captured.)
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
+            is captured, nothing is checked.)
 
     Differentiable: points, normals, centers, radii.
     """
@@ -381,8 +381,7 @@ def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, or
         SH visibility, float32 of shape [batch, vertex, order²].
 
     Raises:
-        ValueError: naming the argument, what it got and what it accepts; so for hundreds of spheres in one direction,
-            whose product, truncated again and again, overflows.
+        ValueError: for hundreds of spheres in one direction, whose product, truncated again and again, overflows.
 
     Differentiable: no.
     """

@@ -1,7 +1,8 @@
-"""The walk over spheres: which of them a group of receivers can see, found for many at once.
+"""The walk over spheres: a group of receivers visits those that it can see, many at once left out.
 
-Four spheres that follow each other make up a quad, with a sphere of its own (:mod:`~.merging`), and four quads a run.
-A run that is culled is not looked at; then its quads, then its spheres.
+Four spheres that follow each other make up a quad, which has a sphere of its own for receivers far away
+(:mod:`warpshadow.stages.visibility.merging`), and four quads a run. Runs are culled as a whole; then quads; then
+spheres are visited. A method says what culling and a visit are; the walk is generated around them, forward and adjoint.
 """
 
 import functools
@@ -25,10 +26,10 @@ from warpshadow.stages.visibility.merging import (
 )
 
 QUADS = 4
-"""Quads that make up a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
+"""Quads of a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
 
 ALL = -1
-"""In place of the number of candidates: a run is culled against all there is."""
+"""The number of candidates where all there is are: for runs."""
 
 
 @wp.func
