@@ -290,6 +290,39 @@ def test_colors_in_a_batch_make_a_batch_of_images_without_any_texture():
         torch.testing.assert_close(alone.grad, colors.grad[instance])
 
 
+@pytest.mark.parametrize("method", ["directional", "none"])
+def test_colors_in_a_batch_over_one_geometry_have_the_gradients_of_each(method):
+    renderer = TorchRenderer(scene_of(method, ON_BOTH))
+    rotations, translations, scales = renderer.scene_poses()
+    colors = torch.rand(3, 1, 3, generator=torch.Generator().manual_seed(3))
+
+    def gradient(given: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        moved = translations.clone().requires_grad_()
+        image = renderer(albedo=[given, None], geometry=renderer.placed(rotations, moved, scales))
+        (image * weights).sum().backward()
+        return moved.grad
+
+    weights = torch.randn(3, 64, 64, 4, generator=torch.Generator().manual_seed(4))
+    alone = sum(gradient(color, weight) for color, weight in zip(colors, weights, strict=True))
+    torch.testing.assert_close(gradient(colors, weights), alone, rtol=1e-3, atol=1e-3)
+
+
+def test_a_tensor_that_is_read_through_data_is_seen_to_change():
+    renderer = TorchRenderer(scene_of("none", ON_BOTH))
+    geometry = renderer.placed(*renderer.scene_poses())
+    positions = torch.nn.Parameter(geometry.positions.clone())
+
+    def draw() -> torch.Tensor:
+        return renderer(geometry=dataclasses.replace(geometry, positions=positions.data))
+
+    before = draw()
+    with torch.no_grad():
+        positions.add_(0.1)
+    assert not torch.equal(draw(), before)
+    with torch.inference_mode():
+        draw()
+
+
 def test_it_does_not_matter_whether_a_thread_owns_a_row_of_samples_or_one(monkeypatch):
     """Rows are for CPUs; GPUs start a thread for every sample."""
     results = []

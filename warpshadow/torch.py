@@ -555,7 +555,8 @@ def _let_waiting_threads_sleep() -> None:
 def _as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
     array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
-    array.version = tensor._version  # by which a renderer knows what has not been written to
+    if not tensor.is_inference():  # a renderer on a GPU knows by it what has not been written to
+        array.origin, array.version = tensor if tensor._base is None else tensor._base, tensor._version
     return array
 
 

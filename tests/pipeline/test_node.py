@@ -112,19 +112,21 @@ def test_a_write_that_torch_does_not_count_is_seen():
     assert given.numpy()[0, 0] == 2 and Source.renewed("radii", given, first) is not first
 
 
-def test_on_a_gpu_an_array_and_its_version_are_the_same_without_a_look_at_their_values(monkeypatch):
+def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monkeypatch):
     monkeypatch.setattr("warpshadow.pipeline.node.is_readable", lambda device: False)
-    given = array()
-    given.version = 7
-    first = Source.renewed("spheres", (given, given), None)
-    again = wp.array(ptr=given.ptr, shape=given.shape, dtype=given.dtype, device="cpu")
-    again.version = 7
-    with monkeypatch.context() as patch:
-        patch.setattr(np, "array_equal", None)
-        assert Source.renewed("spheres", (again, again), first) is first
-    again.version = 8
-    again.fill_(5.0)
-    assert Source.renewed("spheres", (again, again), first) is not first
+    given, tensor, other = array(), object(), object()
+
+    def again(origin, version):
+        same = wp.array(ptr=given.ptr, shape=given.shape, dtype=given.dtype, device="cpu")
+        same.origin, same.version = origin, version
+        return same
+
+    first = Source.renewed("spheres", (again(tensor, 7),), None)
+    monkeypatch.setattr(np, "array_equal", None)  # values are not looked at
+    assert Source.renewed("spheres", (again(tensor, 7),), first) is first
+    assert Source.renewed("spheres", (again(tensor, 8),), first) is not first
+    assert Source.renewed("spheres", (again(other, 7),), first) is not first  # versions of another begin at 0 again
+    assert Source.renewed("spheres", (given,), first) is not first
 
 
 def test_what_has_a_gradient_is_never_the_same():

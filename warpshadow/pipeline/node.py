@@ -46,8 +46,8 @@ class Source:
     def renewed(cls, name: str, given: Any, last: "Source | None") -> "Source":
         """A source of a copy of what is given now; the last source where that is the same.
 
-        On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same that lies at the
-        same place and has the same ``version``, a number that counts the writes to it; others are not.
+        On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
+        same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
         """
         source = cls(name, given)
         if source.requires_grad:
@@ -87,8 +87,9 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     """Whether an array has the values of a copy; on a GPU, whether it is the array before, not written to since."""
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count; 20 µs for 35,000 vertices
         return np.array_equal(array.numpy(), copy.numpy())
+    origin = getattr(array, "origin", None)
     marks = [(each.ptr, each.shape, each.strides, getattr(each, "version", None)) for each in (array, before)]
-    return before is not array and marks[0] == marks[1] and marks[0][-1] is not None
+    return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
 
 
 class Node:

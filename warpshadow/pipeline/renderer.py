@@ -336,7 +336,7 @@ class Renderer:
     def transfer(self) -> wp.array:
         """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
-        Cameras share the receivers at vertices, for which there is one view.
+        Cameras share the receivers at vertices, for which there is one view. Not to be written to.
         """
         view = self._own_view
         return view.transfers.value(self._call(view))[-1]
@@ -352,7 +352,7 @@ class Renderer:
             view: From :meth:`view` or :meth:`at_points`, by default the scene's own.
 
         Returns:
-            What each receiver, as a white surface, reflects: vec3 of shape [batch, receiver].
+            What each receiver, as a white surface, reflects: vec3 of shape [batch, receiver]. Not to be written to.
 
         Raises:
             ValueError: where rays are asked for a gradient to geometry.
@@ -378,7 +378,7 @@ class Renderer:
             view: By default the scene's own.
 
         Returns:
-            vec3 of shape [batch, height, width].
+            vec3 of shape [batch, height, width]. Not to be written to.
 
         Differentiable: albedo, textures, view.
         """

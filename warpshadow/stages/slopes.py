@@ -91,6 +91,7 @@ def _pull(
         view = instance_in(batch, receiver_face_ids.shape[0])
         reflecting = instance_in(batch, albedo.shape[0])
         of_receivers = shading[instance_in(batch, shading.shape[0])]
+        lit = instance_in(batch, light.shape[0])
         clip = seen.clip_positions[view]
         for sample in range(first, first + run):
             at = view * adj_samples.shape[1] + sample
@@ -103,7 +104,7 @@ def _pull(
             # A sample that is a receiver itself has the gradient of its point instead.
             if receivers[0] != receivers[1] and wp.length_sq(adj_color) > 0.0:
                 adj_light = wp.cw_mul(adj_color, albedo[reflecting, sample])
-                here = light[batch, sample]
+                here = light[lit, sample]
                 color = samples[batch, sample]
                 center = sample_center(at, width, seen.height)
                 entry = entries[at]
@@ -131,7 +132,7 @@ def _pull(
                         elif edge[0] == NOTHING and has_neighbor(at, way, width, seen.height):
                             other = neighbor(sample, way, width)
                             if receiver_face_ids[view, other] >= 0:
-                                rise_of_light = wp.dot(adj_light, light[batch, other] - here)
+                                rise_of_light = wp.dot(adj_light, light[lit, other] - here)
                                 rises[way / 2] += sense(way) * 0.5 * rise_of_light
                                 spans[way / 2] += 0.5
                 slope = wp.cw_mul(wp.cw_div(rises, spans), half)
