@@ -99,7 +99,10 @@ class TorchRenderer(torch.nn.Module):
         """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
         moved = fn(torch.empty(0, device=self.device))
         if moved.dtype != torch.float32:
-            raise ValueError(f"dtype: got {moved.dtype} for a TorchRenderer, expected torch.float32, as it computes in")
+            raise ValueError(
+                f"dtype: got {moved.dtype} for a TorchRenderer, expected torch.float32, as it computes in: "
+                "convert the other modules alone"
+            )
         if moved.device != self.device:
             self.warp = self.warp.moved(str(moved.device))
         return super()._apply(fn, recurse)

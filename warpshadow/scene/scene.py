@@ -360,7 +360,10 @@ class Scene:
         check.choice(argument, body, names)
         if names.count(body) > 1:
             numbers = [number for number, name in enumerate(names) if name == body]
-            raise ValueError(f"{argument}: got {body!r}, as bodies {numbers} are called, expected a number, or names")
+            raise ValueError(
+                f"{argument}: got {body!r}, as bodies {numbers} are called, expected a number, or "
+                'a name of its own for each: Body(…, name="…")'
+            )
         return names.index(body)
 
     def body_numbers(self, bodies: Iterable[BodyLike], argument: str = "bodies") -> tuple[int, ...]:
