@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import numpy as np
 import typer
@@ -91,6 +91,9 @@ def render(
         typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
     ] = None,
     samples: Annotated[Optional[int], typer.Option(help="Directions of the ray-traced method.", min=1)] = None,
+    bounces: Annotated[
+        Optional[int], typer.Option(help="How often light bounces, in place of the scene's.", min=0, max=16)
+    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Render a scene file to an image with soft shadows."""
@@ -108,7 +111,7 @@ def render(
             _check_output(png, *_PICTURES)
         if exposure is not None and not abs(exposure) <= _MOST_STOPS:
             raise ValueError(f"--exposure: got {exposure:g}, expected {-_MOST_STOPS} to {_MOST_STOPS} stops")
-        given = {"method": method, "samples": samples}
+        given: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         parsed = load_scene(scene, **{name: value for name, value in given.items() if value is not None})
         where = _device(device)
         loaded = resolved(parsed, device=where, progress=True)

@@ -230,6 +230,7 @@ NOT_POSITIVE = ("0", "-1")
         ("camera", "near", (*NOT_A_NUMBER, *NOT_POSITIVE)),
         ("camera", "size", ("8", '"8"', "[8]", "[8, 8, 8]", "[8, 8.5]", "[8, true]", '[8, "8"]', "[8, [8]]", "[8, 0]")),
         ("camera", "supersampling", NOT_WHOLE),
+        ("light", "bounces", NOT_WHOLE),
         ("light", "scale", (*NOT_A_NUMBER, "-1")),
         ("light", "rotation", NOT_A_NUMBER),
         ("visibility", "method", ('"rays"', "3", '["none"]')),
@@ -261,6 +262,23 @@ def test_a_wrong_value_is_refused_with_its_table_its_key_and_what_is_accepted(lo
     for value in values:
         text = "".join(lines + f"{key} = {value}\n" * (name == table) for name, lines in tables.items())
         refused(load, text, where, f" {key}", "got", "expected")
+
+
+@pytest.mark.parametrize("value", ["-1", "17"])
+def test_too_many_bounces_are_refused(load, value):
+    refused(load, MINIMAL.replace("[light]", f"[light]\nbounces = {value}"), f"bounces: got {value}, expected a whole")
+
+
+def test_bounces_are_read_and_what_a_call_says_counts(load, tmp_path):
+    assert load(MINIMAL).bounces == 0
+    assert load(MINIMAL.replace("[light]", "[light]\nbounces = 2")).bounces == 2
+    (path,) = tmp_path.glob("*.toml")
+    assert ws.load_scene(path, bounces=3).bounces == 3
+
+
+def test_light_does_not_bounce_without_visibility(load):
+    text = MINIMAL.replace("[light]", "[light]\nbounces = 2")
+    refused(load, text + '[visibility]\nmethod = "none"\n', "bounces: got 2, which 'none' does not find, expected 0")
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "17"])
@@ -442,6 +460,8 @@ def test_an_array_given_to_a_body_is_copied():
         ({"light": np.full((4, 3), np.nan)}, "light: got 12 NaN"),
         ({"supersampling": 0}, "supersampling: got 0"),
         ({"supersampling": True}, "supersampling: got True"),
+        ({"bounces": -1}, "bounces: got -1, expected a whole number from 0 to 16"),
+        ({"bounces": 1.0}, "bounces: got 1.0"),
     ],
 )
 def test_a_bad_argument_of_a_scene_is_named(options, message):

@@ -109,6 +109,9 @@ class Method:
     lights_samples = False
     """Whether every sample is a receiver, whatever its body says."""
 
+    can_bounce = False
+    """Whether it finds light that bounces."""
+
     def __init__(self, assembly: Assembly, own_basis: Basis, basis: Basis | None, *, progress: bool = False):
         self.assembly, self.own_basis, self.progress = assembly, own_basis, progress
         self.basis = own_basis if basis is None else basis

@@ -83,6 +83,10 @@ class Renderer:
         check_basis(basis)
         where = check.device("device", device)
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
+        make_method = METHODS[scene.visibility.method]
+        if scene.bounces and not make_method.can_bounce:
+            method = scene.visibility.method
+            raise ValueError(f"scene.bounces: got {scene.bounces}, which {method!r} does not find yet, expected 0")
         self._arguments = {
             "scene": scene,
             "cameras": cameras,
@@ -97,7 +101,7 @@ class Renderer:
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
         self.clock = Clock()
-        self._method = METHODS[scene.visibility.method](self.assembly, basis, progress=progress)
+        self._method = make_method(self.assembly, basis, progress=progress)
         self._materials = Materials.of_scene(self.assembly)
         self.basis = self._method.basis
         self._vertices = Source("vertices", lambda: self.geometry().positions)

@@ -18,7 +18,7 @@ from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_supersampling
+from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
 
@@ -33,11 +33,12 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: AnyPath, **settings: object) -> Scene:
+def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object) -> Scene:
     """Read a scene file.
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
+        bounces: How often light bounces, in place of the file's.
         settings: Settings of visibility in place of the file's, such as ``method="log-sh"``. A file may hold settings
             for several methods; those that the method does not read are left out.
 
@@ -47,10 +48,10 @@ def load_scene(path: AnyPath, **settings: object) -> Scene:
     """
     path = check.path("path", path)
     with check.located(str(path), SceneError):
-        return _scene(toml_tables.read(path, "scene file"), path.parent, settings)
+        return _scene(toml_tables.read(path, "scene file"), path.parent, bounces, settings)
 
 
-def _scene(scene: Table, folder: Path, settings: Table) -> Scene:
+def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> Scene:
     with check.located("the scene"):
         check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
     for name in ("camera", "light", "body"):
@@ -62,6 +63,9 @@ def _scene(scene: Table, folder: Path, settings: Table) -> Scene:
             bodies.append(_body(table, folder))
     with check.located("[light]"):
         light = _light(scene["light"], folder)
+        if bounces is None:
+            bounces = scene["light"].get("bounces", Scene.bounces)
+            check_bounces(bounces)
     with check.located("[camera]"):
         toml_tables.check_table(scene["camera"])
         check.known_keys("key", scene["camera"], (*_CAMERA_KEYS, "supersampling"))
@@ -74,7 +78,7 @@ def _scene(scene: Table, folder: Path, settings: Table) -> Scene:
         toml_tables.check_table(given)
         visibility = Visibility.of(given | settings)  # a file may hold settings for what --method chooses
     with check.located("the scene"):
-        return Scene(tuple(bodies), light, camera, visibility, supersampling)
+        return Scene(tuple(bodies), light, camera, visibility, supersampling, bounces)
 
 
 def parse_camera(table: Table) -> Camera:
@@ -97,7 +101,7 @@ def parse_camera(table: Table) -> Camera:
 
 def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     toml_tables.check_table(table)
-    check.known_keys("key", table, ("envmap", "sh", "rotation", "scale"))
+    check.known_keys("key", table, ("envmap", "sh", "rotation", "scale", "bounces"))
     if ("envmap" in table) == ("sh" in table):
         raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
     rotation = check.number("rotation", table.get("rotation", 0.0))
@@ -179,6 +183,7 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
         light: Table = {"envmap": "light.exr"}
     else:
         light = {"sh": [_numbers(row) for row in scene.light]}
+    light["bounces"] = int(scene.bounces)
     visibility = asdict(scene.visibility)
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
     path = folder / "scene.toml"

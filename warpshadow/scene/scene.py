@@ -38,6 +38,11 @@ READ_BY = {
 }
 """The methods that read each setting of a :class:`Visibility`; "auto" leaves some to what it chooses."""
 
+BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)
+"""The methods that find light that bounces."""
+
+MOST_BOUNCES = 16
+
 RECEIVERS = ("vertex", "pixel")
 
 SCENE = "a Scene; load_scene(path) reads one"
@@ -288,6 +293,12 @@ def check_supersampling(count: object) -> None:
         raise ValueError(f"supersampling: got {check.described(count)}, expected a whole number from 1 to 16")
 
 
+def check_bounces(count: object) -> None:
+    """Raise ValueError unless it is a number of bounces, 0 to 16."""
+    if not check.is_integer(count) or count not in range(MOST_BOUNCES + 1):
+        raise ValueError(f"bounces: got {check.described(count)}, expected a whole number from 0 to {MOST_BOUNCES}")
+
+
 @dataclass(frozen=True, eq=False, init=False)
 class Scene:
     """What is rendered.
@@ -298,6 +309,8 @@ class Scene:
         camera: The camera.
         visibility: How visibility is computed.
         supersampling: Each pixel averages this many samples across and down, which smooths silhouettes.
+        bounces: How often light bounces between surfaces before it reaches what the camera sees, 0 to 16; 0 is direct
+            light alone, which is the paper's model.
     """
 
     bodies: tuple[Body, ...]
@@ -305,6 +318,7 @@ class Scene:
     camera: Camera
     visibility: Visibility
     supersampling: int = 2
+    bounces: int = 0
 
     def __init__(
         self,
@@ -313,10 +327,11 @@ class Scene:
         camera: Camera,
         visibility: Visibility = _DIRECTIONAL,
         supersampling: int = supersampling,
+        bounces: int = bounces,
     ):
         check.instance("bodies", bodies, Iterable, "a list of one or more: [Body(mesh)]")
         vars(self).update(bodies=tuple(bodies), light=light, camera=camera)
-        vars(self).update(visibility=visibility, supersampling=supersampling)
+        vars(self).update(visibility=visibility, supersampling=supersampling, bounces=bounces)
         if not self.bodies:
             raise ValueError("bodies: got none, expected one or more")
         for number, body in enumerate(self.bodies):
@@ -342,6 +357,13 @@ class Scene:
             light.setflags(write=False)
             object.__setattr__(self, "light", light)
         check_supersampling(self.supersampling)
+        check_bounces(self.bounces)
+        if self.bounces and self.visibility.method not in BOUNCING:
+            finders = ", ".join(map(repr, BOUNCING))
+            raise ValueError(
+                f"bounces: got {self.bounces}, which {self.visibility.method!r} does not find, expected 0, or "
+                f"method = one of {finders}"
+            )
 
     def body_number(self, body: BodyLike, argument: str = "body") -> int:
         """Number of a body, from 0, given that or its name.

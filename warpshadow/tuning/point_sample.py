@@ -61,7 +61,8 @@ class PointSample:
         self._device = wp.get_device(device)
         self._progress = progress
         self._direction_count = direction_count
-        stage = Renderer(replace(scene, visibility=Visibility(method="none"), supersampling=1), device=device)
+        bare = replace(scene, visibility=Visibility(method="none"), supersampling=1, bounces=0)
+        stage = Renderer(bare, device=device)
         self._view = stage.view()
         face_ids = self._view.fragments.face_ids.numpy()[0]
         chosen = _spread(face_ids >= 0, count, seed)

@@ -289,7 +289,8 @@ def _interpolation_error(scene: Scene, sample: PointSample) -> float:
 
 def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     """What "auto" chooses from, the least work first."""
-    yield replace(scene, visibility=scene.visibility.by("none"))
+    if not scene.bounces:  # bounced light needs visibility
+        yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
     own = fitted_counts(scene)
     factor, most = 2, max(own.values(), default=SPHERE_COUNTS[-1])
@@ -312,7 +313,8 @@ def _settings(scene: Scene, is_coarse: np.ndarray, fits: bool, device: wp.Device
     for receivers in dict.fromkeys((own, fine)):
         bodies = tuple(replace(body, receivers=each) for body, each in zip(scene.bodies, receivers, strict=True))
         placed = replace(scene, bodies=bodies)
-        yield replace(placed, visibility=scene.visibility.by("none"))
+        if not scene.bounces:
+            yield replace(placed, visibility=scene.visibility.by("none"))
         for more in _sphere_variants(placed, fits, device):
             for visibility in (*_directional(scene.visibility), *_harmonic(scene.visibility)):
                 yield replace(more, visibility=visibility)
