@@ -15,6 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
+from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
@@ -36,6 +37,7 @@ class LitPoints:
 
     Args:
         method: How their light is blocked.
+        materials: What the scene's bodies reflect.
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
         receivers: The points.
@@ -46,13 +48,14 @@ class LitPoints:
     def __init__(
         self,
         method: "Method",
+        materials: Materials,
         vertices: Source,
         spheres: Source,
         receivers: Node,
         call: Call,
         static: Static | None = None,
     ):
-        self.method, self.assembly = method, method.assembly
+        self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
         self._scene_shading: Node | None = None
@@ -69,24 +72,30 @@ class LitPoints:
         receivers = self.receivers
         return "", receivers.points.size, len(receivers.still)
 
-    def shading(self, light: Light | None) -> Node:
+    def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
         """What the receivers send back as white surfaces, vec3 of shape [batch, receiver]; None is the scene's light.
 
-        What the scene's light and the last other known light make is kept.
+        What the scene's light and the last other known light make is kept. Materials, by default the scene's, matter
+        where light bounces.
         """
         check_light(light)
+        own = self.materials
+        if materials is None or not self.assembly.scene.bounces:
+            materials = own
         if isinstance(light, wp.array):
-            return self.method.free_shading(self, Source("light", light, news="light is given"))
+            return self.method.free_shading(self, Source("light", light, news="light is given"), materials)
         if light is None or light is self.method.light.value():
+            if materials is not own:
+                return self.method.shading(self, self.method.light, materials)
             if self._scene_shading is None:
-                self._scene_shading = self.method.shading(self, self.method.light)
+                self._scene_shading = self.method.shading(self, self.method.light, own)
             return self._scene_shading
         last, node = self._known or (None, None)
         source = Source.renewed("light", light, last)
         if node is None or source is not last:
-            node = self.method.shading(self, source)
+            node = self.method.shading(self, source, own)
             self._known = source, node
-        return node
+        return node if materials is own else self.method.shading(self, source, materials)
 
     @property
     def transfers(self) -> Node:
@@ -135,11 +144,11 @@ class Method:
         faces, can_receive = self.assembly.faces, self.can_receive
         return number_receivers(faces, can_receive[:1]), number_receivers(faces, can_receive)
 
-    def shading(self, points: LitPoints, light: Source) -> Node:
-        """Shading of points in known light."""
+    def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """Shading of points in known light, which bounces from the materials."""
         raise NotImplementedError
 
-    def free_shading(self, points: LitPoints, light: Source) -> Node:
+    def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in free light, which is converted where the transfer vectors are not."""
         matrix = self.own_from_basis if points.transfers.requires_grad else None
         items = functools.partial(receiver_words, points)
@@ -260,8 +269,8 @@ class SphereMethod(Method):
     def _in_scene_light(self) -> Node:
         return Node("", self.in_known, self.light)
 
-    def shading(self, points: LitPoints, light: Source) -> Node:
-        """Shading of points in known light."""
+    def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """Shading of points in known light, which bounces from the materials."""
         own = self._in_scene_light if light is self.light else Node("", self.in_known, light)
         return InParts(self, points, own, light, joined)
 

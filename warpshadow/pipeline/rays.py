@@ -8,6 +8,7 @@ from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Fixed, Node, Source
+from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
 from warpshadow.stages.receivers import Receivers
@@ -24,7 +25,7 @@ class Rays(Method):
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
 
-    def shading(self, points: LitPoints, light: Source) -> Node:
+    def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn."""
         return Node(
             "shading",

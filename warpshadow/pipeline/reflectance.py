@@ -67,7 +67,10 @@ class Materials:
         return cls(assembly, albedo, textures)
 
     def replaced(self, albedo: Given, textures: Given) -> "Materials":
-        """A copy that has what is given in place of some, checked; nodes of the others are the same."""
+        """A copy that has what is given in place of some, checked; nodes of the others are the same.
+
+        Itself where nothing is given.
+        """
         bodies = self.assembly.scene.bodies
         colors, images = list(self.albedo.value()), list(self.textures.value())
         for number, color in enumerate(albedo or ()):
@@ -85,10 +88,15 @@ class Materials:
                     raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
                 check.finite_arrays({f"textures[{number}]": image})
                 images[number] = image
+        has_colors, has_images = (
+            all(map(operator.is_, *each)) for each in ((colors, self.albedo.value()), (images, self.textures.value()))
+        )
+        if has_colors and has_images:
+            return self
         materials = copy.copy(self)
-        if not all(map(operator.is_, colors, self.albedo.value())):
+        if not has_colors:
             materials._take_albedo(Source("albedo", colors, news="albedo is given"))
-        if not all(map(operator.is_, images, self.textures.value())):
+        if not has_images:
             materials._take_textures(Source("textures", images, news="textures are given"))
         return materials
 
@@ -136,10 +144,10 @@ class SeenSurfaces:
         self._reflection: Reflection | None = None  # of the scene's materials
         self._footprints: tuple[tuple, Node, Node] = (), Node("", None), Node("", None)
 
-    def reflect(self, albedo: Given, textures: Given) -> Reflection:
+    def reflect(self, materials: Materials) -> Reflection:
         """Wire what samples reflect; that of the scene's materials is kept."""
-        materials, own = self._materials.replaced(albedo, textures), self._materials
-        if materials.albedo is not own.albedo or materials.textures is not own.textures:
+        own = self._materials
+        if materials is not own:
             return self._reflect(materials)
         if self._reflection is None:
             self._reflection = self._reflect(own)
@@ -189,6 +197,6 @@ class SeenSurfaces:
         has_texture = [size is not None for size in self._materials.sizes]
         if not has_texture[number]:
             raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
-        reflection = self.reflect(None, None)
+        reflection = self.reflect(self._materials)
         textures, footprints = (node.value(self._call) for node in (reflection.pyramids, reflection.footprints))
         return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)

@@ -291,7 +291,7 @@ class Renderer:
             vertices = Source("vertices", geometry.positions)
             spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
-        return LitPoints(self._method, vertices, spheres, node, self._call())
+        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call())
 
     @functools.cached_property
     def _own_view(self) -> View:
@@ -388,7 +388,7 @@ class Renderer:
         """
         view = self._own(view)
         albedo, textures = self._per_body(albedo, textures)
-        return view.surfaces.reflect(albedo, textures).samples.value(self._call(view))
+        return view.surfaces.reflect(view.materials.replaced(albedo, textures)).samples.value(self._call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:

@@ -63,7 +63,7 @@ class View(LitPoints):
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         receivers = self._wire(method, vertices, cameras, static)
-        super().__init__(method, vertices, spheres, receivers, call, static)
+        super().__init__(method, materials, vertices, spheres, receivers, call, static)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
@@ -116,7 +116,8 @@ class View(LitPoints):
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         words, clip, receivers, fragments = self._samples, self.clip_positions, self.receivers_node, self.fragments_node
-        lit, reflected = self.shading(light), self.surfaces.reflect(albedo, textures)
+        materials = self.materials.replaced(albedo, textures)
+        lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
         samples_of = functools.partial(Node, items=words, keeps=False)
         if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
             found = (Node("reflectance", None, idle="found as samples are exposed"),)
