@@ -12,7 +12,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages import ray_tracing
 from warpshadow.stages.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
-from warpshadow.stages.ray_tracing import trace_cells, trace_shading, trace_transfer, trace_visibility
+from warpshadow.stages.ray_tracing import nearest, trace_cells, trace_shading, trace_transfer, trace_visibility
 
 SEED = 5
 
@@ -193,6 +193,81 @@ def test_faces_without_area_stop_no_ray(device):
     mesh = warp_mesh(Mesh(corners, np.array([[0, 1, 2], [0, 0, 3], [1, 1, 2]])), device)
     up = np.array([[0.0, 1.0, 0.0]])
     assert trace(mesh, np.array([[[0.5, 0, 0], [0.5, 1, 0]]]), np.tile(up, (1, 2, 1)), up, device).all()
+
+
+# ---------------------------------------------------------------------------------------------- nearest hits
+
+
+@wp.kernel(enable_backward=False)
+def _find_nearest(
+    # in
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    # out
+    faces: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.vec3),
+    is_back: wp.array(dtype=wp.bool),
+):
+    """A thread owns a ray."""
+    i = wp.tid()
+    hit = nearest(mesh, points[i], normals[i], directions[i])
+    faces[i] = hit.face
+    weights[i] = hit.weights
+    is_back[i] = hit.is_back
+
+
+def find_nearest(mesh: Mesh, points, normals, directions, device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Face, barycentrics, and whether it is met from behind, of the nearest hit of each ray."""
+    count = len(points)
+    outputs = [wp.empty(count, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3, wp.bool)]
+    rays = [vectors(values, device) for values in (points, normals, directions)]
+    hierarchy = warp_mesh(mesh, device)
+    wp.launch(_find_nearest, count, inputs=[hierarchy.id, *rays], outputs=outputs, device=device)
+    return tuple(output.numpy() for output in outputs)
+
+
+def test_rays_meet_the_face_that_is_nearest_of_all(device):
+    """Against the intersection of each ray with each face, in float64."""
+    ball = icosphere(1.0, 2)
+    mesh = Mesh(ball.positions * [1.5, 0.3, 1.0] + np.sin(3 * ball.positions[:, ::-1]), ball.faces)
+    rng = np.random.default_rng(SEED)
+    points, directions = rng.uniform(-2, 2, size=(2, 600, 3)).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    faces, weights, is_back = find_nearest(mesh, points, directions, directions, device)
+
+    a, b, c = np.moveaxis(mesh.positions[mesh.faces].astype(np.float64), 1, 0)
+    matrices = np.stack(np.broadcast_arrays(-directions[:, None], b - a, c - a), axis=-1)  # [ray, face, 3, 3]
+    distance, v, w = np.moveaxis(np.linalg.solve(matrices, (points[:, None] - a)[..., None])[..., 0], -1, 0)
+    is_hit = (distance > 0) & (np.minimum(v, w) > 0) & (v + w < 1)
+    expected = np.where(is_hit, distance, np.inf).argmin(axis=1)
+    expected[~is_hit.any(axis=1)] = -1
+    assert 0.1 < (expected >= 0).mean() < 0.9
+    same = faces == expected
+    assert same.mean() > 0.995  # rays through edges may go either way
+    hit, face = np.flatnonzero(same & (faces >= 0)), faces[same & (faces >= 0)]
+    exact = np.stack([1 - v - w, v, w], axis=-1)[hit, face]
+    np.testing.assert_allclose(weights[hit], exact, atol=2e-5)  # of float32 rays that graze faces
+    from_behind = (np.cross(b - a, c - a)[face] * directions[hit]).sum(axis=1) > 0
+    np.testing.assert_array_equal(is_back[hit], from_behind)
+    assert 0.1 < from_behind.mean() < 0.9
+
+
+def test_rays_below_the_face_that_a_receiver_lies_on_meet_nothing(device):
+    """Not that face, and not what lies behind it; above it they meet what is there."""
+    sheets = joined(*(plane(2.0, 1).transformed(translation=[0, height, 0]) for height in (-1.0, 0.0, 1.0)))
+    normal = np.array([0.6, 0.8, 0.0])
+    directions = fibonacci(256)
+    directions = directions[(directions @ normal > 0) & (np.abs(directions[:, 1]) > 0.01)]
+    points = np.tile([0.1, 0.0, 0.2], (len(directions), 1))
+    faces, _, is_back = find_nearest(sheets, points, np.tile(normal, (len(directions), 1)), directions, device)
+    from_behind = directions[:, 1] < 0
+    assert from_behind.sum() > 20 and (faces[from_behind] == -1).all()
+    reached = points + directions / np.abs(directions[:, 1:2])
+    inside = (np.abs(reached[:, [0, 2]]) < 1).all(axis=1)
+    np.testing.assert_array_equal(faces[~from_behind] >= 4, inside[~from_behind])
+    assert inside[~from_behind].sum() > 20 and is_back[~from_behind & inside].all()
 
 
 # ---------------------------------------------------------------------------------------------- shading by rays

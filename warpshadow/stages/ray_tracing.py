@@ -28,12 +28,15 @@ _RAISE = 1.0e-4
 
 
 @wp.func
-def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
-    """Whether a ray from a receiver meets a face, in float64, where coordinates and their differences are exact.
+def _seen_from(point: wp.vec3, normal: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
+    """A face as a receiver sees it: corners relative to it and their normal, in float64, where they are exact.
 
     A receiver on a face, to float32's rounding, is put slightly above it, on the side of its own normal. It so gets no
     shadow from the face and its neighbors in the plane, but does where light comes from behind them. For all other
     faces rays start at the receiver itself, so that nothing is too thin or too near to cast a shadow.
+
+    Returns:
+        The corners, their normal times twice the area, and whether the receiver lies on the face; not at its foot.
     """
     a = wp.vec3d(corner_a) - wp.vec3d(point)
     b = wp.vec3d(corner_b) - wp.vec3d(point)
@@ -41,44 +44,104 @@ def _is_met(point: wp.vec3, normal: wp.vec3, toward: wp.vec3, corner_a: wp.vec3,
     across = wp.cross(b - a, c - a)
     drop = wp.dot(across, a)  # from the plane to the receiver, times |across|
     largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
+    lies_on = bool(False)
     if wp.abs(drop) <= wp.float64(_ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
         length = wp.length(across)
-        is_behind = wp.dot(across, wp.vec3d(normal)) < wp.float64(-_UPRIGHT) * length
-        height = wp.where(is_behind, -_RAISE, _RAISE)
+        upward = wp.dot(across, wp.vec3d(normal))
+        lies_on = wp.abs(upward) >= wp.float64(_UPRIGHT) * length
+        height = wp.where(upward < wp.float64(-_UPRIGHT) * length, -_RAISE, _RAISE)
         move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
         a -= move
         b -= move
         c -= move
-        drop = wp.dot(across, a)
-    ray = wp.vec3d(toward)
-    u = wp.dot(ray, wp.cross(c, b))
-    v = wp.dot(ray, wp.cross(a, c))
-    w = wp.dot(ray, wp.cross(b, a))
-    least = wp.min(u, wp.min(v, w))
-    most = wp.max(u, wp.max(v, w))
-    return (least >= wp.float64(0.0) or most <= wp.float64(0.0)) and drop * wp.dot(across, ray) > wp.float64(0.0)
+    return a, b, c, across, lies_on
 
 
 @wp.func
-def _escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
-    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
-    if mesh == wp.uint64(0):
-        return True
-    # the boxes' slabs need a slope
-    slope = wp.vec3(
+def _volumes(toward: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Barycentrics of where a line meets the plane of a face, not normalized: of one sign where it meets the face."""
+    ray = wp.vec3d(toward)
+    return wp.vec3d(wp.dot(ray, wp.cross(c, b)), wp.dot(ray, wp.cross(a, c)), wp.dot(ray, wp.cross(b, a)))
+
+
+@wp.func
+def _meets(toward: wp.vec3, a: wp.vec3d, across: wp.vec3d, volumes: wp.vec3d):
+    """Whether a ray meets a face."""
+    is_inside = wp.min(volumes) >= wp.float64(0.0) or wp.max(volumes) <= wp.float64(0.0)
+    return is_inside and wp.dot(across, a) * wp.dot(across, wp.vec3d(toward)) > wp.float64(0.0)
+
+
+@wp.func
+def _slope(toward: wp.vec3):
+    """A ray's direction for the boxes, whose slabs need a slope."""
+    return wp.vec3(
         wp.where(toward[0] == 0.0, 1.0e-20, toward[0]),
         wp.where(toward[1] == 0.0, 1.0e-20, toward[1]),
         wp.where(toward[2] == 0.0, 1.0e-20, toward[2]),
     )
-    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, slope)
+
+
+@wp.func
+def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
+    if mesh == wp.uint64(0):
+        return True
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
     face = int(0)
     while wp.bvh_query_next(query, face):
-        a = wp.mesh_get_point(mesh, 3 * face)
-        b = wp.mesh_get_point(mesh, 3 * face + 1)
-        c = wp.mesh_get_point(mesh, 3 * face + 2)
-        if _is_met(point, normal, toward, a, b, c):
+        a, b, c, across, _lies_on = _seen_from(
+            point,
+            normal,
+            wp.mesh_get_point(mesh, 3 * face),
+            wp.mesh_get_point(mesh, 3 * face + 1),
+            wp.mesh_get_point(mesh, 3 * face + 2),
+        )
+        if _meets(toward, a, across, _volumes(toward, a, b, c)):
             return False
     return True
+
+
+@wp.struct
+class Hit:
+    """What a ray meets first."""
+
+    face: int
+    """Number of the face, -1 for none."""
+    weights: wp.vec3
+    """Barycentrics on it."""
+    is_back: bool
+    """Whether it is met from behind."""
+
+
+@wp.func
+def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """What a ray from a receiver meets first; nothing where it leaves below the face that the receiver lies on.
+
+    Such rays are those of smooth normals, which lean away from faces. Direct light has none from there, too.
+    """
+    hit = Hit()
+    hit.face = -1
+    distance = float(wp.inf)
+    query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
+    face = int(0)
+    while wp.bvh_query_next(query, face, distance):
+        a, b, c, across, lies_on = _seen_from(
+            point,
+            normal,
+            wp.mesh_get_point(mesh, 3 * face),
+            wp.mesh_get_point(mesh, 3 * face + 1),
+            wp.mesh_get_point(mesh, 3 * face + 2),
+        )
+        volumes = _volumes(toward, a, b, c)
+        if _meets(toward, a, across, volumes):
+            slope = wp.dot(across, wp.vec3d(toward))
+            reached = float(wp.dot(across, a) / slope)
+            if reached < distance:
+                distance = reached
+                hit.face = wp.where(lies_on, -1, face)
+                hit.weights = wp.vec3(volumes / (volumes[0] + volumes[1] + volumes[2]))
+                hit.is_back = slope > wp.float64(0.0)
+    return hit
 
 
 @wp.kernel(enable_backward=False)
@@ -98,10 +161,10 @@ def _trace_visibility(
     batch, vertex = split_row(first_row + row, points.shape[1])
     normal = normals[batch, vertex]
     toward = directions[direction]
-    escapes = wp.uint8(0)
-    if wp.dot(normal, toward) > 0.0 and _escapes(mesh, points[batch, vertex], normal, toward):
-        escapes = wp.uint8(1)
-    visibility[batch, vertex, direction] = escapes
+    is_seen = wp.uint8(0)
+    if wp.dot(normal, toward) > 0.0 and escapes(mesh, points[batch, vertex], normal, toward):
+        is_seen = wp.uint8(1)
+    visibility[batch, vertex, direction] = is_seen
 
 
 def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, directions: wp.array) -> wp.array:
@@ -158,7 +221,7 @@ def _trace_shading(
     for sample in range(directions.shape[1]):
         toward = directions[chosen, sample]
         cosine = wp.dot(normal, toward)
-        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
+        if cosine > 0.0 and escapes(mesh, point, normal, toward):
             total += cosine * radiance[chosen, sample]
     shading[receiver] = total / wp.pi
 
@@ -254,7 +317,7 @@ def _trace_cells(
     for sample in range(directions.shape[1]):
         toward = directions[chosen, sample]
         cosine = wp.dot(normal, toward) / wp.pi
-        if cosine > 0.0 and _escapes(mesh, point, normal, toward):
+        if cosine > 0.0 and escapes(mesh, point, normal, toward):
             cell = cells[chosen, sample]
             for channel in range(light.shape[1]):
                 light[receiver, channel, cell] = (
