@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.mesh import Mesh
+from warpshadow.maths.plane import plane_normal
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 
@@ -68,20 +69,14 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
     solid angle that the mesh does.
     """
     corners = mesh.positions[mesh.faces].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
-    if not others or not normal.any():
+    normal = plane_normal(corners) if others else None
+    if normal is None:
         return None
-    normal /= np.linalg.norm(normal)
-    points = corners.reshape(-1, 3)
-    middle = points.mean(axis=0)
-    *_, axes = np.linalg.svd(points - middle, full_matrices=False)
-    seen_from = np.concatenate(others)
-    size = np.ptp((points - middle) @ axes.T, axis=0)
-    is_flat = np.ptp(points @ normal) < 1e-4 * size[0]
+    middle = corners.reshape(-1, 3).mean(axis=0)
     # a body may stand in the ground, and a fit may start with one deep in it
-    is_in_front = all(np.mean((other - middle) @ normal) > 0 for other in others)
-    if not is_flat or not is_in_front:
+    if not all(np.mean((other - middle) @ normal) > 0 for other in others):
         return None
+    seen_from = np.concatenate(others)
     height = np.mean((seen_from - middle) @ normal)
     a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
     length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))

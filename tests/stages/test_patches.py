@@ -1,0 +1,187 @@
+"""Patches of bodies and grids of flat ones: what they cover, and where they are lit."""
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from demos.scenes import shipped_mesh
+from warpshadow.stages.bounces.patches import find_flat_patches, find_patches, squeezed, stretched
+
+ROUNDING = 1e-5
+
+
+def box(size=(1.0, 1.0, 1.0)):
+    """A box of 12 large faces that look outward."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) * size
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    return ws.Mesh(corners, faces)
+
+
+def patches_of(mesh, **options):
+    return find_patches(mesh.positions, mesh.surface.faces, is_two_sided=not mesh.surface.is_closed, **options)
+
+
+def area_of(mesh):
+    corners = mesh.positions[mesh.faces].astype(float)
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+
+
+def source_points(patches, mesh):
+    sources = patches.sources
+    return np.einsum("sk,skx->sx", sources.barycentrics, mesh.positions[mesh.surface.faces[sources.faces]])
+
+
+@pytest.fixture(scope="module", params=["bunny", "rocks", "box"])
+def mesh(request):
+    return box() if request.param == "box" else shipped_mesh(request.param)
+
+
+def test_patches_cover_the_surface_of_each_side_once(mesh):
+    patches = patches_of(mesh)
+    sides = 1 if mesh.surface.is_closed else 2
+    assert 32 // sides <= patches.count <= 256
+    np.testing.assert_allclose(patches.areas.sum(), sides * area_of(mesh), rtol=ROUNDING)
+    assert patches.areas.min() > 0
+    front, back = patches.of_pieces
+    assert set(front) == set(range(patches.count // sides))
+    np.testing.assert_array_equal(back, front + patches.count // 2 if sides == 2 else -1)
+    pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
+    areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
+    np.testing.assert_allclose(np.bincount(front, areas), patches.areas[: patches.count // sides], rtol=ROUNDING)
+
+
+def test_every_patch_has_up_to_four_sources_on_it_that_weigh_one(mesh):
+    patches = patches_of(mesh)
+    sources = patches.sources
+    assert (np.diff(sources.patches) >= 0).all()
+    counts = np.bincount(sources.patches, minlength=patches.count)
+    assert counts.min() >= 1 and counts.max() <= 4
+    np.testing.assert_allclose(np.bincount(sources.patches, sources.weights), 1, rtol=ROUNDING)
+    np.testing.assert_allclose(sources.barycentrics.sum(axis=1), 1, rtol=ROUNDING)
+    assert sources.barycentrics.min() >= 0
+    # a source is nearer to its patch's middle than the patch is wide
+    distance = np.linalg.norm(source_points(patches, mesh) - patches.centers[sources.patches], axis=1)
+    assert (distance < 2 * np.sqrt(patches.areas[sources.patches])).mean() > 0.95
+    np.testing.assert_array_equal(sources.is_back, sources.patches >= len(set(patches.of_pieces[0])))
+
+
+def test_sources_lie_on_large_faces_not_at_their_corners():
+    """A vertex of a box sees three of its sides, and none as a patch does."""
+    patches = patches_of(box())
+    assert patches.sources.barycentrics.max() < 0.99
+    assert np.abs(patches.normals).max(axis=1).min() > 1 - ROUNDING  # none goes around an edge
+
+
+def test_sources_of_small_faces_are_vertices():
+    patches = patches_of(shipped_mesh("bunny"))
+    assert (patches.sources.barycentrics.max(axis=1) == 1).all()
+
+
+def test_needles_do_not_make_pieces_without_end():
+    needles = np.array([[[0, y, 0], [100, y, 0], [0, y + 1e-4, 0]] for y in range(50)]).reshape(-1, 3)
+    positions = np.concatenate([needles, [[0, 0, 1], [1, 0, 1], [0, 1, 1]]])
+    patches = find_patches(positions, np.arange(len(positions)).reshape(-1, 3), is_two_sided=True)
+    assert len(patches.pieces.faces) < 20 * 256
+    assert patches.areas.sum() == pytest.approx(2 * (0.5 + 50 * 100 * 1e-4 / 2))
+
+
+def test_patches_are_the_same_again():
+    mesh = shipped_mesh("bear")
+    first, second = patches_of(mesh), patches_of(mesh)
+    np.testing.assert_array_equal(first.of_pieces, second.of_pieces)
+    np.testing.assert_array_equal(first.sources.faces, second.sources.faces)
+
+
+def test_a_mesh_without_area_has_no_patches():
+    patches = find_patches(np.zeros((3, 3)), np.array([[0, 1, 2]]), is_two_sided=True)
+    assert patches.count == 0 and patches.of_pieces.shape == (2, 0) and not len(patches.sources.faces)
+
+
+def test_patches_belong_to_the_sphere_whose_surface_is_nearest():
+    patches = patches_of(box())
+    small, large = [0.4, 0.5, 0.5], [9.0, 0.5, 0.5]  # surfaces at x = 0.5 and x = 1
+    nearest = patches.nearest_spheres(np.array([small, large]), np.array([0.1, 8.0]))
+    x = patches.centers[:, 0]
+    assert (nearest[x < 0.5] == 0).all() and (nearest[x > 0.9] == 1).all()
+
+
+def flat_patches_of(mesh, **options):
+    return find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, **options)
+
+
+def test_a_stretch_undoes_a_squeeze():
+    z = np.linspace(-50, 50, 41)
+    np.testing.assert_allclose(stretched(squeezed(z)), z, atol=1e-12)
+
+
+def test_a_body_that_is_not_flat_has_no_grid():
+    assert flat_patches_of(box()) is None
+
+
+@pytest.mark.parametrize("segments", [1, 16])
+def test_an_even_grid_has_its_nodes_in_the_middles_of_equal_texels(segments):
+    mesh = ws.plane(3.0, segments).transformed(scale=(2, 1, 1), translation=(5, -1, 2))
+    patches = flat_patches_of(mesh)
+    grid = patches.grid
+    assert grid.covered.shape in [(16, 32), (32, 16)] and grid.covered.min() == 1
+    np.testing.assert_allclose(patches.areas, 18 / 512, rtol=1e-3)
+    np.testing.assert_allclose(patches.centers.mean(axis=0), [5, -1, 2], atol=1e-4)
+    np.testing.assert_allclose(patches.normals, [[0, 1, 0]] * 512, atol=ROUNDING)
+    np.testing.assert_allclose(source_points(patches, mesh), patches.centers, atol=1e-4)
+    np.testing.assert_array_equal(patches.sources.patches, np.arange(512))
+
+
+def test_a_grid_is_finer_near_other_bodies():
+    mesh = ws.plane(20.0, 1)
+    others = np.array([[-4.0, 0, 2], [-2, 3, 4]])
+    grid = flat_patches_of(mesh, others=others).grid
+    assert grid.spread == pytest.approx(1)
+    np.testing.assert_allclose(grid.origin, [-3, 0, 3], atol=ROUNDING)
+    nodes, sizes = grid.nodes(), grid.texel_sizes().prod(axis=-1)
+    assert np.linalg.norm(nodes.reshape(-1, 2)[sizes.argmin()]) < 0.5
+    assert sizes.sum() == pytest.approx(400)
+    assert sizes.max() > 20 * sizes.min()
+
+
+def test_a_square_that_is_turned_has_a_grid_of_its_own_size():
+    angle = 0.5
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    grid = flat_patches_of(ws.plane(2.0, 4).transformed(rotation=rotation)).grid
+    assert grid.texel_sizes().sum(axis=(0, 1)) == pytest.approx([2 * 32, 2 * 32], rel=1e-3)
+    assert grid.covered.min() == 1
+    assert np.linalg.det(grid.frame) == pytest.approx(1)
+
+
+def test_nodes_off_the_mesh_have_no_sources():
+    """An L of three squares."""
+    corners = np.array([[x, 0, z] for x in range(3) for z in range(3)], float)
+    squares = [(0, 1), (0, 0), (1, 0)]
+    faces = [[3 * i + j, 3 * i + j + 1, 3 * i + j + 4] for i, j in squares]
+    faces += [[3 * i + j, 3 * i + j + 4, 3 * i + j + 3] for i, j in squares]
+    mesh = ws.Mesh(corners, faces)
+    patches = flat_patches_of(mesh)
+    assert patches.areas.sum() == pytest.approx(3, rel=0.02)
+    has_source = np.isin(np.arange(patches.count), patches.sources.patches)
+    np.testing.assert_array_equal(has_source, patches.areas > 0)
+    points = source_points(patches, mesh)
+    assert not ((points[:, 0] > 1 + ROUNDING) & (points[:, 2] > 1 + ROUNDING)).any()
+
+
+def test_both_sides_of_a_grid_have_patches():
+    mesh = ws.plane(1.0, 2)
+    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
+    assert patches.count == 2 * 32 * 32 and patches.grid.sides == 2
+    np.testing.assert_allclose(patches.normals[1024:], [[0, -1, 0]] * 1024, atol=ROUNDING)
+    assert patches.sources.is_back[1024:].all() and not patches.sources.is_back[:1024].any()
+
+
+def test_pieces_of_a_flat_body_belong_to_the_texels_in_which_they_lie():
+    mesh = ws.plane(4.0, 1)
+    patches = flat_patches_of(mesh, others=np.array([[0.0, 0, 0], [0.5, 1, 0.5]]))
+    pieces = patches.pieces.positions(mesh.positions, mesh.surface.faces)
+    areas = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
+    assert areas.sum() == pytest.approx(16)
+    away = np.linalg.norm(pieces.mean(axis=1) - patches.centers[patches.of_pieces[0]], axis=1)
+    assert (away < np.sqrt(patches.areas[patches.of_pieces[0]]) * 1.5).all()
+    assert (patches.of_pieces[1] == -1).all()

@@ -1,0 +1,1 @@
+"""Light that bounces: patches of bodies, and what they send to receivers."""

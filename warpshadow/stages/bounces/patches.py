@@ -1,0 +1,456 @@
+"""Patches: parts of a body's surface that send light as one, and the points at which they are lit.
+
+Most bodies are cut into pieces of about one size, and k-means of position and normal makes patches of them. A body that
+lies in a plane has a grid instead, finer near the other bodies, whose shadows it shows. All is found once, in the
+body's own frame and at rest; patches move with the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
+
+from warpshadow.maths.plane import plane_normal
+
+_LEAST_PATCHES = 32
+"""Patches of a body of few faces: each side of a box has some."""
+
+_PIECES = 8
+"""Pieces of each patch, at least."""
+
+_NEEDLE = 0.01
+"""Area of a piece that stays whole however long it is, in squares of the length that it should have: so the number of
+pieces is bounded."""
+
+_SOURCES = 4
+"""Sources of a patch, at most."""
+
+_NORMAL_WEIGHT = 0.4
+"""How far apart opposite normals are, in halves of the body's size."""
+
+_LLOYD_STEPS = 8
+
+_LEARNED = 20_000
+"""Pieces that k-means looks at, at most."""
+
+_GRID = 32
+"""Nodes along a grid's longer side."""
+
+_EVEN = 1e3
+"""Spread of a grid that is even, in sizes of its body."""
+
+_ROUNDING = 1e-6
+"""How far off a face a node may lie and still count as on it, as a part of the face or texel."""
+
+_TESTED = 3
+"""Points along each side of a node's texel that are tested to lie on the mesh; odd, so that the node is one."""
+
+
+class Pieces(NamedTuple):
+    """Small triangles that faces are cut into; most are whole faces."""
+
+    faces: np.ndarray
+    """The face that each is a part of, int32 of shape [piece]."""
+    corners: np.ndarray
+    """Barycentric coordinates of its corners in that face, float32 of shape [piece, 3, 3]."""
+
+    def positions(self, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Corners of all pieces, float64 of shape [piece, 3, 3]."""
+        return self.corners.astype(np.float64) @ positions.astype(np.float64)[faces[self.faces]]
+
+
+class Sources(NamedTuple):
+    """Points of a mesh at which its patches are lit, those of a patch after one another; a vertex is a special case."""
+
+    faces: np.ndarray
+    """Face that each lies on, int32 of shape [source]."""
+    barycentrics: np.ndarray
+    """And where on it, float32 of shape [source, 3]."""
+    is_back: np.ndarray
+    """Whether it is lit from the face's back, bool of shape [source]."""
+    patches: np.ndarray
+    """Patch that each belongs to, ascending, int32 of shape [source]."""
+    weights: np.ndarray
+    """Share of that patch, which add up to 1 in each, float32 of shape [source]."""
+
+
+class Grid(NamedTuple):
+    """Nodes in a plane, even in coordinates that are stretched far from the middle.
+
+    A point has the coordinates (a, b, d) = frame (x − origin). A node is the middle of a texel of
+
+        ξ = g(a / spread),  η = g(b / spread),  g(z) = z / √(1 + |z|)
+
+    and the texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
+    """
+
+    frame: np.ndarray
+    """Rows: both axes and the normal, float64 of shape [3, 3]."""
+    origin: np.ndarray
+    """Point of the plane around which nodes are dense, float64 of shape [3]."""
+    spread: float
+    """Distance from there within which nodes are about even [units of the body]."""
+    low: np.ndarray
+    high: np.ndarray
+    """Corners of the rectangle in (ξ, η), float64 of shape [2]."""
+    covered: np.ndarray
+    """Share of each node's texel that the mesh covers, float32 of shape [row, column]."""
+    sides: int
+    """1 if the front alone sends light, 2 if the back does, too; its patches follow those of the front."""
+
+    def nodes(self) -> np.ndarray:
+        """Nodes in the plane, (a, b), float64 of shape [row, column, 2]."""
+        return self.points(1)
+
+    def texel_sizes(self) -> np.ndarray:
+        """Widths and heights of the texels at the nodes, [row, column, 2]."""
+        count = np.array(self.covered.shape[::-1])
+        edges = [
+            self.spread * stretched(np.linspace(low, high, number + 1))
+            for low, high, number in zip(self.low, self.high, count, strict=True)
+        ]
+        return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
+
+    def texels_of(self, points: np.ndarray) -> np.ndarray:
+        """Number of the texel that is nearest to each point (a, b) [point, 2]."""
+        height, width = self.covered.shape
+        place = (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
+        column, row = np.clip(place.astype(int), 0, (width - 1, height - 1)).T
+        return row * width + column
+
+    def points(self, split: int) -> np.ndarray:
+        """Points evenly over every texel, ``split`` along each side: [row · split, column · split, 2]."""
+        height, width = self.covered.shape
+        axes = [
+            self.spread * stretched(low + (high - low) * (np.arange(number) + 0.5) / number)
+            for low, high, number in zip(self.low, self.high, (width * split, height * split), strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Patches of a body in its own frame.
+
+    Args:
+        areas: Area of each, float32 of shape [patch].
+        centers: Mean position, float32 of shape [patch, 3].
+        normals: Mean normal, of unit length, float32 of shape [patch, 3].
+        sources: Where they are lit.
+        pieces: What they consist of.
+        of_pieces: Patch of each piece's front and back, int32 of shape [2, piece]; −1 for sides that send nothing.
+        grid: How those of a body in a plane lie, None for others.
+    """
+
+    areas: np.ndarray
+    centers: np.ndarray
+    normals: np.ndarray
+    sources: Sources
+    pieces: Pieces
+    of_pieces: np.ndarray
+    grid: Grid | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of patches."""
+        return len(self.areas)
+
+    def nearest_spheres(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """The sphere whose surface is nearest to each patch, of spheres [sphere, 3], [sphere]: int32 [patch]."""
+        gaps = np.linalg.norm(self.centers[:, None] - centers, axis=2) - radii
+        return np.abs(gaps).argmin(axis=1).astype(np.int32)
+
+
+def squeezed(z: np.ndarray) -> np.ndarray:
+    """g(z) = z / √(1 + |z|): about z near 0, and √z far from it."""
+    return z / np.sqrt(1 + np.abs(z))
+
+
+def stretched(y: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`squeezed`."""
+    size = np.abs(y)
+    return np.sign(y) * (size**2 + size * np.sqrt(size**2 + 4)) / 2
+
+
+def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, count: int = 256) -> Patches:
+    """Find the patches of a body, by k-means of position and normal.
+
+    Args:
+        positions: Vertices [units of the body], shape [vertex, 3].
+        faces: Faces that wind alike, shape [face, 3].
+        is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
+        count: Number of patches, at most. A body of few faces has fewer.
+
+    Returns:
+        Patches; none where no face has an area.
+    """
+    sides = 2 if is_two_sided else 1
+    count = min(count, max(_LEAST_PATCHES, len(faces) // _PIECES)) // sides
+    total = np.linalg.norm(_areas(positions.astype(np.float64)[faces]), axis=1).sum()
+    longest = 2 * np.sqrt(total / (_PIECES * count))  # as in right triangles
+    cut = _cut(positions, faces, lambda middles: np.full(len(middles), longest))
+    areas = np.linalg.norm(cut.areas, axis=1)
+    half_size = np.linalg.norm(np.ptp(cut.middles, axis=0)) / 2 if len(areas) else 1.0
+    features = np.concatenate([cut.middles / half_size, _NORMAL_WEIGHT * cut.areas / areas[:, None]], axis=1)
+    labels = _clusters(features, areas, count)
+    found: list[tuple[int, np.ndarray, int, float]] = []
+    for patch, members in enumerate(_members(labels)):
+        for group in _split(members, cut.middles, areas, _SOURCES):
+            middle = np.average(cut.middles[group], axis=0, weights=areas[group])
+            piece = group[np.linalg.norm(cut.middles[group] - middle, axis=1).argmin()]
+            barycentrics = cut.pieces.corners[piece]
+            if np.array_equal(barycentrics, np.eye(3)):  # a vertex has its own visibility, a point has that of three
+                corners = positions[faces[cut.pieces.faces[piece]]]
+                barycentrics = barycentrics[np.linalg.norm(corners - middle, axis=1).argmin()]
+            else:
+                barycentrics = barycentrics.mean(axis=0)
+            found.append((cut.pieces.faces[piece], barycentrics, patch, areas[group].sum() / areas[members].sum()))
+    sums = _sums(labels, np.concatenate([areas[:, None] * cut.middles, cut.areas, areas[:, None]], axis=1))
+    return Patches(
+        *_on_sides(sides, sums[:, 6], sums[:, :3] / sums[:, 6:], _unit(sums[:, 3:6])),
+        _sources_of(found, sides, len(sums)),
+        cut.pieces,
+        _of_sides(labels, sides, len(sums)),
+    )
+
+
+def find_flat_patches(
+    positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
+) -> Patches | None:
+    """Find the patches of a body that lies in a plane: the nodes of a grid over its smallest rectangle.
+
+    Args:
+        positions: Vertices [units of the body], shape [vertex, 3].
+        faces: Faces that wind alike, shape [face, 3].
+        is_two_sided: Whether the back sends light, too.
+        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: nodes are dense near them.
+            None for an even grid.
+
+    Returns:
+        Patches, row by row: nodes off the mesh have no area and no source. None for a body that is not flat.
+    """
+    corners = positions.astype(np.float64)[faces]
+    normal = plane_normal(corners)
+    if normal is None:
+        return None
+    frame = _smallest_rectangle(corners.reshape(-1, 3), normal)
+    points = corners.reshape(-1, 3) @ frame.T
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    middle, spread = (low + high) / 2, _EVEN * (high - low).max()
+    if others is not None and len(others):
+        near = others @ frame.T[:, :2]
+        reach = np.ptp(near, axis=0).max() / 2
+        if reach > 0:
+            middle, spread = (near.min(axis=0) + near.max(axis=0)) / 2, min(reach, spread)
+    origin = frame.T @ [*middle, points[:, 2].mean()]
+    low, high = squeezed((low - middle) / spread), squeezed((high - middle) / spread)
+    width, height = np.maximum(np.rint(_GRID * (high - low) / (high - low).max()), 1).astype(int)
+    sides = 2 if is_two_sided else 1
+    grid = Grid(frame, origin, float(spread), low, high, np.ones((height, width), np.float32), sides)
+    corners = ((corners - origin) @ frame.T)[..., :2]
+    covered, found = _find_nodes(grid, corners)
+    grid = grid._replace(covered=covered)
+    texels = grid.texel_sizes().reshape(-1, 2)
+
+    def longest(middles: np.ndarray) -> np.ndarray:
+        return texels[grid.texels_of((middles - origin) @ frame.T[:, :2])].min(axis=1)
+
+    cut = _cut(positions, faces, longest)
+    labels = grid.texels_of((cut.middles - origin) @ frame.T[:, :2])
+    centers = origin + grid.nodes().reshape(-1, 2) @ frame[:2]
+    areas = covered.ravel() * texels.prod(axis=1)
+    return Patches(
+        *_on_sides(sides, areas, centers, np.tile(normal, (len(areas), 1))),
+        _sources_of(found, sides, len(areas)),
+        cut.pieces,
+        _of_sides(labels, sides, len(areas)),
+        grid,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- pieces
+
+
+class _Cut(NamedTuple):
+    """A mesh cut into pieces."""
+
+    pieces: Pieces
+    middles: np.ndarray  # [piece, 3]
+    areas: np.ndarray  # normals as long as areas, [piece, 3]
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles, as long as their areas are large."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+
+
+def _cut(positions: np.ndarray, faces: np.ndarray, longest: Callable[[np.ndarray], np.ndarray]) -> _Cut:
+    """Halve faces across their longest edges, until these are as short as is asked for where the pieces are."""
+    whole = positions.astype(np.float64)[faces]
+    owners = np.flatnonzero(_areas(whole).any(axis=1)).astype(np.int32)
+    corners = np.tile(np.eye(3), (len(owners), 1, 1))
+    parts = []
+    while len(owners):
+        places = corners @ whole[owners]
+        edges = np.linalg.norm(np.roll(places, -1, axis=1) - np.roll(places, -2, axis=1), axis=2)
+        most = longest(places.mean(axis=1))
+        is_long = (edges.max(axis=1) > most) & (np.linalg.norm(_areas(places), axis=1) > _NEEDLE * most**2)
+        parts.append((owners[~is_long], corners[~is_long]))
+        opposite = edges[is_long].argmax(axis=1)[:, None]
+        a, b, c = np.moveaxis(np.take_along_axis(corners[is_long], (opposite + np.arange(3))[..., None] % 3, 1), 1, 0)
+        middle = (b + c) / 2
+        owners = np.tile(owners[is_long], 2)
+        corners = np.concatenate([np.stack([a, b, middle], axis=1), np.stack([a, middle, c], axis=1)])
+    owners, corners = (np.concatenate(each) for each in zip((owners, corners), *parts, strict=True))
+    order = np.argsort(owners, kind="stable")
+    pieces = Pieces(owners[order], corners[order].astype(np.float32))
+    places = corners[order] @ whole[owners[order]]
+    return _Cut(pieces, places.mean(axis=1), _areas(places))
+
+
+# ---------------------------------------------------------------------------------------------------- clusters
+
+
+def _clusters(features: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+    """K-means [Lloyd 1982], from halves of halves: the cluster of each item, none empty."""
+    learned = np.arange(0, len(features), max(1, len(features) // _LEARNED))
+    groups = _split(learned, features, weights, count)
+    centers = np.array([np.average(features[group], axis=0, weights=weights[group]) for group in groups])
+    if not len(centers):
+        return np.zeros(0, int)
+    for _ in range(_LLOYD_STEPS):
+        _, nearest = cKDTree(centers).query(features[learned])
+        sums = _sums(nearest, weights[learned, None] * features[learned], len(centers))
+        total = np.bincount(nearest, weights[learned], len(centers))[:, None]
+        centers = np.where(total > 0, sums / np.where(total > 0, total, 1), centers)
+    _, nearest = cKDTree(centers).query(features)
+    return np.unique(nearest, return_inverse=True)[1]
+
+
+def _split(items: np.ndarray, points: np.ndarray, weights: np.ndarray, count: int) -> list[np.ndarray]:
+    """Split items into at most ``count`` groups of about one weight, along the axes on which they extend most."""
+    if count <= 1 or len(items) <= 1:
+        return [items] if len(items) else []
+    offsets = points[items] - points[items].mean(axis=0)
+    _, axes = np.linalg.eigh(offsets.T @ offsets)
+    order = items[np.argsort(offsets @ axes[:, -1], kind="stable")]
+    below = np.cumsum(weights[order])
+    cut = np.searchsorted(below, below[-1] * (count // 2) / count) + 1
+    cut = min(cut, len(order) - 1)
+    first, second = _split(order[:cut], points, weights, count // 2), order[cut:]
+    return first + _split(second, points, weights, count - count // 2)
+
+
+def _members(labels: np.ndarray) -> list[np.ndarray]:
+    """Items of each cluster."""
+    if not len(labels):
+        return []
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+
+
+def _sums(labels: np.ndarray, values: np.ndarray, count: int = 0) -> np.ndarray:
+    """Sums of values [item, n] over the items of each cluster, [cluster, n]."""
+    return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors of length 1; those without a direction stay 0."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
+
+
+# ---------------------------------------------------------------------------------------------------- sides
+
+
+def _on_sides(
+    sides: int, areas: np.ndarray, centers: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Areas, centers and normals of the patches of all sides."""
+    turned = np.concatenate([normals, -normals][:sides])
+    return (
+        np.tile(areas, sides).astype(np.float32),
+        np.tile(centers, (sides, 1)).astype(np.float32),
+        turned.astype(np.float32),
+    )
+
+
+def _of_sides(labels: np.ndarray, sides: int, count: int) -> np.ndarray:
+    """Patch of each piece's front and back."""
+    return np.stack([labels, labels + count if sides == 2 else np.full_like(labels, -1)]).astype(np.int32)
+
+
+def _sources_of(found: list[tuple[int, np.ndarray, int, float]], sides: int, count: int) -> Sources:
+    """Sources on all sides from those on the front: face, barycentrics, patch and weight of each."""
+    faces, barycentrics, patches, weights = zip(*found, strict=True) if found else ([], [], [], [])
+    number = len(found)
+    owners = np.array(patches, np.int32)
+    return Sources(
+        np.tile(np.array(faces, np.int32), sides),
+        np.tile(np.array(barycentrics, np.float32).reshape(-1, 3), (sides, 1)),
+        np.repeat([False, True][:sides], number),
+        np.concatenate([owners, owners + np.int32(count)][:sides]),
+        np.tile(np.array(weights, np.float32), sides),
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- grids
+
+
+def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Axes of the smallest rectangle around points of a plane, and its normal, as rows."""
+    aside = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    basis = np.stack([aside, np.cross(normal, aside)]) / np.linalg.norm(aside)
+    flat = points @ basis.T
+    hull = flat[ConvexHull(flat).vertices]
+    edges = _unit(np.roll(hull, -1, axis=0) - hull)
+    across = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+    sizes = np.ptp(hull @ edges.T, axis=0) * np.ptp(hull @ across.T, axis=0)
+    best = np.flatnonzero(sizes < sizes.min() * (1 + 1e-6))[0]
+    return np.stack([edges[best] @ basis, across[best] @ basis, normal])
+
+
+def _find_nodes(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[tuple[int, np.ndarray, int, float]]]:
+    """Find which share of each texel the faces [face, 3, 2] cover, and a source for each that is not empty."""
+    height, width = grid.covered.shape
+    points = grid.points(_TESTED)
+    shape = np.array([width, height]) * _TESTED
+    places = (squeezed(corners / grid.spread) - grid.low) / (grid.high - grid.low) * shape - 0.5
+    first = np.maximum(np.ceil(places.min(axis=1) - _ROUNDING), 0).astype(int)
+    last = np.minimum(np.floor(places.max(axis=1) + _ROUNDING), shape - 1).astype(int)
+    counts = np.maximum(last - first + 1, 0)
+    faces = np.repeat(np.arange(len(corners)), counts.prod(axis=1))
+    number = np.arange(len(faces)) - np.repeat(
+        np.cumsum(counts.prod(axis=1)) - counts.prod(axis=1), counts.prod(axis=1)
+    )
+    column = first[faces, 0] + number % counts[faces, 0]
+    row = first[faces, 1] + number // counts[faces, 0]
+    barycentrics = _barycentrics(corners[faces], points[row, column])
+    inside = (barycentrics > -_ROUNDING).all(axis=1)
+    owner = np.full(points.shape[:2], -1)
+    owner[row[inside], column[inside]] = np.flatnonzero(inside)
+    tested = owner.reshape(height, _TESTED, width, _TESTED).swapaxes(1, 2).reshape(height * width, -1)
+    covered = (tested >= 0).mean(axis=1)
+    from_middle = np.abs(np.arange(_TESTED**2) - _TESTED**2 // 2).argsort(kind="stable")
+    best = (tested[:, from_middle] >= 0).argmax(axis=1)
+    chosen = tested[np.arange(len(tested)), from_middle[best]]
+    found = [
+        (faces[item], np.maximum(barycentrics[item], 0), texel, 1.0) for texel, item in enumerate(chosen) if item >= 0
+    ]
+    return covered.reshape(height, width).astype(np.float32), found
+
+
+def _barycentrics(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates of points [item, 2] in triangles [item, 3, 2]; NaN in those without an area."""
+    a, b, c = np.moveaxis(triangles - points[:, None], 1, 0)
+    parts = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+    total = parts.sum(axis=1, keepdims=True)
+    return parts / np.where(total != 0, total, np.nan)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,0 +1,62 @@
+"""Radiosity of patches: what they send of the light that their sources get."""
+
+import numpy as np
+import warp as wp
+from scipy.sparse import csr_matrix
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+
+
+def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike) -> SparseMatrix:
+    """The matrix of means of patches over their sources.
+
+    Args:
+        patches: Patch of each source, shape [source].
+        weights: Share of its patch that each source has, shape [source].
+        count: Number of patches; one without sources has a mean of 0.
+        device: Where the matrix is used.
+    """
+    entries = (weights, (patches, np.arange(len(patches))))
+    return SparseMatrix.of(csr_matrix(entries, shape=(count, len(patches))), device=device)
+
+
+@wp.kernel
+def _reflect(
+    # in
+    albedo: wp.array2d(dtype=wp.vec3),
+    light: wp.array2d(dtype=wp.vec3),
+    # out
+    radiosity: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a patch of an instance."""
+    batch, patch = wp.tid()
+    reflectance = albedo[instance_in(batch, albedo.shape[0]), patch]
+    radiosity[batch, patch] = wp.cw_mul(reflectance, light[instance_in(batch, light.shape[0]), patch])
+
+
+def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp.array:
+    """Radiosity of patches: albedo times the mean light of their sources.
+
+        B_p = a_p Σ_s w_ps (S_s + I_s)
+
+    A white patch under a radiance of 1 has radiosity 1, as receivers have.
+
+    Args:
+        albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
+        light: What each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
+        mean: The weights w, from :func:`mean_over_sources`.
+
+    Returns:
+        vec3 of shape [batch, patch]; the batch of albedo or light may be 1, and then serves every instance.
+
+    Differentiable: albedo, light.
+    """
+    check.shape("albedo", albedo.shape, ("batch", mean.shape[0]))
+    means = multiply(mean, light)
+    instances = common_batch({"albedo": albedo, "light": light})
+    radiosity = wp.empty((instances, mean.shape[0]), dtype=wp.vec3, device=light.device)
+    launch(_reflect, radiosity.shape, inputs=[albedo, means], outputs=[radiosity])
+    return radiosity

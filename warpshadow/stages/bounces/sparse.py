@@ -1,0 +1,107 @@
+"""Sparse matrices that are multiplied with colors: what patches get of sources, sites of patches, texels of nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+from scipy.sparse import csr_matrix, sparray, spmatrix
+
+from warpshadow import check
+from warpshadow.device.batch import instance_in
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import split_row
+
+_ITEM_COST = 2.0
+"""Nanoseconds that an entry takes."""
+
+
+class Rows(NamedTuple):
+    """Entries of a sparse matrix, those of a row after one another."""
+
+    starts: wp.array  # [row + 1] int32
+    columns: wp.array  # [entry] int32
+    weights: wp.array  # [entry] float32
+
+
+@dataclass(frozen=True, eq=False)
+class SparseMatrix:
+    """A matrix by its rows, and by its columns for the adjoint, which so needs no sums across threads.
+
+    Args:
+        shape: Number of rows and columns.
+        rows: Its entries by rows.
+        columns: The rows of its transpose.
+    """
+
+    shape: tuple[int, int]
+    rows: Rows
+    columns: Rows
+
+    @staticmethod
+    def of(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
+        """Give a matrix of SciPy, or NumPy, to a device, without its zeros."""
+        by_rows = csr_matrix(matrix)
+        return SparseMatrix(by_rows.shape, _rows(by_rows, device), _rows(by_rows.T.tocsr(), device))
+
+
+def _rows(matrix: csr_matrix, device: wp.DeviceLike) -> Rows:
+    matrix.eliminate_zeros()
+    return Rows(
+        wp.array(matrix.indptr, dtype=wp.int32, device=device),
+        wp.array(matrix.indices, dtype=wp.int32, device=device),
+        wp.array(matrix.data, dtype=wp.float32, device=device),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _multiply(
+    first_row: int,
+    worker: int,
+    # in
+    starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.vec3),
+    adds: int,
+    # out
+    products: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a row of an instance; it writes its product, or adds it."""
+    batch, row = split_row(first_row + wp.tid(), starts.shape[0] - 1)
+    total = wp.vec3()
+    if adds != 0:
+        total = products[batch, row]
+    of_instance = instance_in(batch, values.shape[0])
+    for entry in range(starts[row], starts[row + 1]):
+        total += weights[entry] * values[of_instance, columns[entry]]
+    products[batch, row] = total
+
+
+def multiply(matrix: SparseMatrix, values: wp.array) -> wp.array:
+    """Multiply a sparse matrix with colors.
+
+    Args:
+        matrix: Of shape [row, column].
+        values: vec3 of shape [batch, column].
+
+    Returns:
+        vec3 of shape [batch, row].
+
+    Differentiable: values. Exact, being linear. Not: the matrix.
+    """
+    check.shape("values", values.shape, ("batch", matrix.shape[1]))
+
+    def times(entries: Rows, factors: wp.array, products: wp.array, *, adds: bool) -> None:
+        cost = _ITEM_COST * (entries.columns.size / max(products.shape[1], 1) + 1)
+        inputs = [*entries, factors, int(adds)]
+        launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
+
+    return differentiable(
+        lambda products: times(matrix.rows, values, products, adds=False),
+        lambda adj_products: times(matrix.columns, adj_products, values.grad, adds=True),
+        result=wp.empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
+        variables=[values],
+    )
