@@ -114,3 +114,32 @@ def test_gradients_through_receivers_are_central_differences(device, verified_ta
         losses.append(sum((w * r.numpy().astype(float)).sum() for w, r in zip(weights, results, strict=True)))
     products = positions.grad.numpy() * direction
     assert abs(products.sum() - (losses[0] - losses[1]) / 4e-3) < GRADIENT * np.linalg.norm(products)
+
+
+@pytest.mark.parametrize("wants_samples", [(False, False), (True, False), (False, True), (True, True)])
+def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants_samples):
+    """The order differs, and nothing else; each span has receivers of its body alone."""
+    positions, faces, matrices = two_triangles(device, 3)
+    normals, wants = vertex_normals(positions, faces), np.array(wants_samples)
+    fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
+    bodies = np.array([1, -1])
+    numbering = number_receivers(faces, np.repeat(~wants, 3)[None], bodies=np.repeat(bodies, 3))
+    found = find_receivers(positions, normals, faces, fragments, numbering, wants, bodies)
+    got = interpolate(found.fragments, found.faces, found.points).numpy()
+    assert np.abs(got - interpolate(fragments, faces, positions).numpy()).max() < FLOAT32
+    assert [span.first for span in found.spans] == [0, *(span.end for span in found.spans[:-1])]
+    assert found.spans[-1].end == found.points.shape[1]
+    at_vertices = found.vertices.size
+    for body, first, end in found.spans:
+        face = bodies.tolist().index(body)
+        if first < at_vertices:
+            assert set(found.vertices.numpy()[first:end] // 3) == {face}
+        else:
+            sides = found.seen.face_ids.numpy()[:, first - at_vertices : end - at_vertices]
+            assert set(sides[sides >= 0]) == {face}
+            corners = positions.numpy()[0][faces.numpy()[sides]]
+            at = np.einsum(
+                "brk,brkx->brx", found.seen.barycentrics.numpy()[:, first - at_vertices : end - at_vertices], corners
+            )
+            gaps = np.abs(at - found.points.numpy()[:, first:end])[sides >= 0]
+            assert gaps.max() < FLOAT32

@@ -72,6 +72,14 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     return whole
 
 
+def cut(array: wp.array, first: int, end: int) -> wp.array:
+    """Items of an array [batch, item] from one up to another, in memory of their own; all as they are.
+
+    Differentiable: array.
+    """
+    return array if (first, end) == (0, array.shape[1]) else concatenate([array[:, first:end]], [end - first])
+
+
 def expand(array: wp.array, instances: int) -> wp.array:
     """Repeat an array of shape [1, item] for every instance; one that has the instances stays as it is.
 

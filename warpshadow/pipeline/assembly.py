@@ -224,6 +224,18 @@ class Assembly:
             moving=tuple(bodies),
         )
 
+    def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of some bodies, of those of all. Differentiable: spheres."""
+        runs = self.runs(self.first_sphere, bodies)
+        if runs == [(0, spheres[1].shape[1])]:
+            return spheres
+        if not runs:
+            centers, radii = (wp.empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
+            return centers, radii
+        counts = [end - first for first, end in runs]
+        centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
+        return centers, radii
+
     @staticmethod
     def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
         """Where the items of some bodies begin and end, consecutive bodies together and those without items left out.

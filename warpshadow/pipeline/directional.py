@@ -11,7 +11,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import Group, KnownLight, SphereMethod
+from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
@@ -49,23 +49,27 @@ class Directional(SphereMethod):
         """Number of coefficients that take part: all."""
         return len(self._directions)
 
-    def see(self, group: Group, light: Cells) -> wp.array:
+    def see(self, group: Group, light: Cells) -> Seen:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
-        points, normals, centers, radii, kept = group
+        points, normals, centers, radii, kept = group[:5]
         if not (radii.shape[1] and points.size):
-            return wp.full((*points.shape, len(light.directions)), 1.0, dtype=wp.float32, device=points.device)
+            full = wp.full((*points.shape, len(light.directions)), 1.0, dtype=wp.float32, device=points.device)
+            return Seen(full)
         softness, merging = self.visibility.softness, self.visibility.merging
         # kept cells have light although their middles are below the horizon
         facing = normals if kept is None else None
-        return directional.transmittance(
-            points, facing, centers, radii, light.directions, softness=softness, merging=merging
+        return Seen(
+            directional.transmittance(
+                points, facing, centers, radii, light.directions, softness=softness, merging=merging
+            )
         )
 
-    def transfer(self, seen: wp.array, group: Group, light: Cells) -> wp.array:
+    def transfer(self, seen: Seen, group: Group, light: Cells) -> wp.array:
         """Transfer vectors; the transmittance as it is where kept cells hold known light."""
+        assert seen.through is not None
         if group.kept is None:
-            return directional_transfer(seen, group.normals, light.directions)
-        return seen if _has_light(group.kept) else cell_transfer(seen, group.kept)
+            return directional_transfer(seen.through, group.normals, light.directions)
+        return seen.through if _has_light(group.kept) else cell_transfer(seen.through, group.kept)
 
     def light_part(self, transfer: wp.array, group: Group, light: Cells) -> wp.array:
         """Shading of a part, vec3 of shape [batch, receiver]."""

@@ -10,14 +10,16 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.batch import common_batch, concatenate, expand
+from warpshadow.device.batch import common_batch, concatenate, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
+from warpshadow.pipeline.own_shadows import OwnShadows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows
+from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
 from warpshadow.stages.shading import shade
 
@@ -202,30 +204,45 @@ def joined(parts: list[wp.array]) -> wp.array:
 
 
 class Group(NamedTuple):
-    """Receivers that the same spheres block."""
+    """Receivers that the same spheres block: those of all bodies, or of those other than the receivers' own."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     kept: KeptRows | None = None  # of static bodies, which block their light, too
+    body: int | None = None  # whose receivers they are, where bodies are told apart
+    places: Places | None = None  # where they lie on that body
 
     def parts(self) -> Iterator["Group"]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept = self
+        points, normals, centers, radii, kept, _, places = self
         size = points.shape[1]
         if radii.shape[1]:
             count = common_batch({"points": points, "centers": centers, "radii": radii})
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
         if kept is not None or size <= PART or varies(self[:4]):
-            yield Group(points, normals, centers, radii, kept)
+            yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
             return
         for start in range(0, size, PART):
             part = slice(start, min(start + PART, size))
-            yield Group(points[:, part].contiguous(), normals[:, part].contiguous(), centers, radii)
+            yield self._replace(
+                points=points[:, part].contiguous(),
+                normals=normals[:, part].contiguous(),
+                centers=centers,
+                radii=radii,
+                places=None if places is None else places.part(part),
+            )
+
+
+class Seen(NamedTuple):
+    """What a group sees of the light."""
+
+    through: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
+    own: wp.array | None = None  # the share that its own body lets through, which is in it; None where that is all
 
 
 class SphereMethod(Method):
@@ -249,11 +266,11 @@ class SphereMethod(Method):
         """Number of coefficients of known light that take part; None for free light."""
         raise NotImplementedError
 
-    def see(self, group: Group, light: Any) -> wp.array | None:
-        """Visibility, or transmittance, of a group's spheres."""
+    def see(self, group: Group, light: Any) -> Seen:
+        """Visibility, or transmittance, past a group's spheres and its own body."""
         raise NotImplementedError
 
-    def transfer(self, seen: wp.array | None, group: Group, light: Any) -> wp.array:
+    def transfer(self, seen: Seen, group: Group, light: Any) -> wp.array:
         """Transfer vectors of a group."""
         raise NotImplementedError
 
@@ -264,6 +281,11 @@ class SphereMethod(Method):
     def kept_rows(self, static: Static, light: Source | None) -> Rows:
         """Rows of what static bodies block, of known light or of any."""
         raise NotImplementedError
+
+    @functools.cached_property
+    def own(self) -> OwnShadows:
+        """The bodies' shadows on themselves."""
+        return OwnShadows(self.assembly, self.samples_receive)
 
     @functools.cached_property
     def _in_scene_light(self) -> Node:
@@ -312,6 +334,7 @@ class InParts(Node):
         keeps: bool = True,
     ):
         self._static, self._finish, self._progress = points.static, finish, method.progress and light is not None
+        self._method = method
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         self._visibility = Node(
             "visibility",
@@ -343,7 +366,7 @@ class InParts(Node):
         from tqdm import tqdm
 
         receivers, spheres, own, kept = self.values(call)
-        groups = [Group(receivers.points, receivers.normals, *spheres)]
+        groups = list(self._groups(receivers, spheres))
         if self._static is not None and len(receivers.still):
             on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
             group = Group(*on_static, *self._static.moving_spheres(spheres), kept)
@@ -359,6 +382,23 @@ class InParts(Node):
                     results.append(result)
                     bar.update(part.points.shape[1])
         return self._finish(results)
+
+    def _groups(self, receivers: Receivers, spheres: tuple[wp.array, wp.array]) -> Iterator[Group]:
+        """Receivers that may move, in groups that the same spheres block."""
+        if not receivers.spans:
+            yield Group(receivers.points, receivers.normals, *spheres)
+        bodies = range(len(self._method.assembly.scene.bodies))
+        for span in receivers.spans:
+            points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
+            if span.body < 0:
+                yield Group(points, normals, *spheres)
+                continue
+            others = [body for body in bodies if body != span.body]
+            blocking, places = (
+                self._method.assembly.spheres_of(others, spheres),
+                self._method.own.places(receivers, span),
+            )
+            yield Group(points, normals, *blocking, body=span.body, places=places)
 
 
 def _pairs(method: SphereMethod, points: LitPoints) -> str:

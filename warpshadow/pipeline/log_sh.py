@@ -9,7 +9,7 @@ from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import Group, KnownLight, SphereMethod
+from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import add_rows
@@ -49,22 +49,22 @@ class LogSH(SphereMethod):
         """Number of coefficients that take part."""
         return (self.in_free.bands if light is None else self._band_count(light.value())) ** 2
 
-    def see(self, group: Group, light: Bands) -> wp.array | None:
+    def see(self, group: Group, light: Bands) -> Seen:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
-        points, _, _, radii, kept = group
+        points, _, _, radii, kept = group[:5]
         if not points.size or (kept is None and not radii.shape[1]):
-            return None
+            return Seen(None)
         if radii.shape[1]:
             log = self._logs(*group[:4])
         else:
             log = wp.zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if kept is not None:
             add_rows(kept, log)
-        return exponential.exponentiate(log, base=self.visibility.base)
+        return Seen(exponential.exponentiate(log, base=self.visibility.base))
 
-    def transfer(self, seen: wp.array | None, group: Group, light: Bands) -> wp.array:
+    def transfer(self, seen: Seen, group: Group, light: Bands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
-        return sh_transfer(seen, group.normals, order=self._order, bands=light.bands)
+        return sh_transfer(seen.through, group.normals, order=self._order, bands=light.bands)
 
     def kept_rows(self, static: Static, light: Source | None) -> Rows:
         """The log-visibility of the static spheres, [row, 1, order²], for any light."""

@@ -14,7 +14,6 @@ from collections.abc import Callable, Hashable
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.assembly import Assembly, Geometry, exchanged
 from warpshadow.pipeline.node import Node, Source
@@ -54,7 +53,6 @@ class Static:
                 "name all that do"
             )
         self._vertex_runs = assembly.runs(assembly.first_vertex, self.moving)
-        self._sphere_runs = assembly.runs(assembly.first_sphere, self.moving)
         self.normals = Node("", vertex_normals, self._geometry.positions, assembly.faces)
         self._clip_positions: Node | None = None
         self._gathered: tuple = (None,)  # vertices, and points and normals of them
@@ -117,12 +115,11 @@ class Static:
     @functools.cached_property
     def spheres(self) -> tuple[wp.array, wp.array]:
         """Centers and radii of their spheres."""
-        own = self._geometry.centers, self._geometry.radii
-        return _of_runs(own, self._assembly.runs(self._assembly.first_sphere, self.bodies))
+        return self._assembly.spheres_of(self.bodies, (self._geometry.centers, self._geometry.radii))
 
     def moving_spheres(self, spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of what moves, of those of all bodies. Differentiable: spheres."""
-        return _of_runs(spheres, self._sphere_runs)
+        return self._assembly.spheres_of(self.moving, spheres)
 
     @functools.cached_property
     def mesh(self) -> wp.Mesh | None:
@@ -149,18 +146,6 @@ def _first_instance(array: wp.array) -> wp.array:
     if array.size:
         wp.copy(first, array[:1])
     return first
-
-
-def _of_runs(spheres: tuple[wp.array, wp.array], runs: list[tuple[int, int]]) -> tuple[wp.array, wp.array]:
-    """Centers and radii of some spheres, in runs of consecutive ones."""
-    if runs == [(0, spheres[1].shape[1])]:
-        return spheres
-    if not runs:
-        centers, radii = (wp.empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
-        return centers, radii
-    counts = [end - first for first, end in runs]
-    centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
-    return centers, radii
 
 
 class Rows:

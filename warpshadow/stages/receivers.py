@@ -4,6 +4,7 @@ Receivers are vertices of visible faces, or for some bodies the points that samp
 (:mod:`warpshadow.stages.sides`) has receivers of its own, at the same points, with opposite normals.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,14 @@ from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
+
+
+class Span(NamedTuple):
+    """Receivers of one body that follow each other; of body −1 are those of all that share what blocks them."""
+
+    body: int
+    first: int
+    end: int
 
 
 class Receivers(NamedTuple):
@@ -31,6 +40,9 @@ class Receivers(NamedTuple):
     of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     still: np.ndarray = np.empty(0, int)  # [still], the vertices that the first receivers are
+    spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
+    vertices: wp.array | None = None  # [vertex receiver] int32, the vertices and backs that the first of them are, …
+    seen: Fragments | None = None  # … and what the rest see: sides and barycentrics, [batch, own]; −1 for none
 
 
 @wp.kernel
@@ -70,6 +82,27 @@ def _gather(
 
 
 @wp.kernel
+def _gather_seen(
+    # in
+    sides: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    samples: wp.array2d(dtype=wp.int32),
+    # out
+    seen_sides: wp.array2d(dtype=wp.int32),
+    seen_barycentrics: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver at a sample's point, −1 for none."""
+    view, own = wp.tid()
+    sample = samples[view, own]
+    if sample >= 0:
+        seen_sides[view, own] = sides[view, sample]
+        seen_barycentrics[view, own] = barycentrics[view, sample]
+    else:
+        seen_sides[view, own] = -1
+        seen_barycentrics[view, own] = wp.vec3(1.0, 0.0, 0.0)
+
+
+@wp.kernel
 def _weigh_own(
     # in
     is_own: wp.array(dtype=wp.bool),
@@ -92,11 +125,17 @@ class Numbering(NamedTuple):
     still: np.ndarray  # [still], those on static bodies, which are the first receivers
     faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
+    spans: tuple[Span, ...] = ()  # of those not on static bodies, where bodies are told apart
+
+    @property
+    def moving_count(self) -> int:
+        """Number of receivers at vertices that are not on static bodies."""
+        return self.of_vertices.size if self.vertices is None else self.vertices.size
 
     @property
     def receiver_count(self) -> int:
         """Number of receivers at vertices."""
-        return len(self.still) + (self.of_vertices.size if self.vertices is None else self.vertices.size)
+        return len(self.still) + self.moving_count
 
 
 def number_receivers(
@@ -104,6 +143,7 @@ def number_receivers(
     keeps_vertex: np.ndarray,
     is_static: np.ndarray | None = None,
     sequence: np.ndarray | None = None,
+    bodies: np.ndarray | None = None,
 ) -> Numbering:
     """Choose the vertices that are receivers.
 
@@ -113,15 +153,20 @@ def number_receivers(
         is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
         sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
+        bodies: Body of each vertex, −1 for those that need not be told apart, shape [vertex]: receivers of a body then
+            follow each other. None where all share what blocks them.
     """
     device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
-    if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None:
+    if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
         of_vertices = constant(np.arange(vertex_count), wp.int32, device)
         return Numbering(None, np.empty(0, int), faces, of_vertices)
     is_static = np.zeros(vertex_count, bool) if is_static is None else is_static
     sequence = np.arange(vertex_count) if sequence is None else sequence
     shifts = vertex_count * np.arange(side_count)
     sequence = (sequence + shifts[:, None]).ravel()
+    if bodies is not None:
+        bodies = np.tile(bodies, side_count)
+        sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
     stays, moves = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
     still, vertices = sequence[stays[sequence]], sequence[moves[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
@@ -132,7 +177,15 @@ def number_receivers(
         still,
         wp.array(corners, dtype=wp.vec3i, device=device),
         wp.array(of_vertices, dtype=wp.int32, device=device),
+        () if bodies is None else _spans(bodies[vertices]),
     )
+
+
+def _spans(bodies: np.ndarray) -> tuple[Span, ...]:
+    """Runs of the same body."""
+    changes = np.flatnonzero(np.diff(bodies)) + 1
+    bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
+    return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
 def find_receivers(
@@ -142,6 +195,7 @@ def find_receivers(
     fragments: Fragments,
     numbering: Numbering,
     wants_samples: np.ndarray,
+    bodies: np.ndarray | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -153,6 +207,8 @@ def find_receivers(
         numbering: The vertices that are receivers: all of those of a face that a sample sees, unless the face wants
             samples; with their backs where fragments have sides.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
+        bodies: Body of each face, −1 for those that need not be told apart, shape [face]; None where all share what
+            blocks them, as for :func:`number_receivers`.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them.
@@ -160,7 +216,7 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
-    vertices, still, receiver_faces, of_vertices = numbering
+    vertices, still, receiver_faces, of_vertices, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
     samples, own_count = None, 0
@@ -168,9 +224,12 @@ def find_receivers(
     has_own = wants_samples.any()
     if has_own:
         batch_count = common_batch({"positions": positions, "fragments": sides})
-        own_samples, receiver_fragments = _own_samples(
-            receiver_fragments, np.resize(wants_samples, len(receiver_faces))
+        side_count = len(receiver_faces)
+        keys = np.zeros(side_count, int) if bodies is None else np.resize(bodies, side_count)
+        own_samples, receiver_fragments, own_spans = _own_samples(
+            receiver_fragments, np.resize(wants_samples, side_count), keys, numbering.moving_count
         )
+        spans += own_spans
         own_count, samples = own_samples.shape[1], wp.array(own_samples, dtype=wp.int32, device=device)
         own_faces = np.repeat(numbering.receiver_count + np.arange(own_count)[:, None], 3, axis=1)
         own_faces = np.concatenate([receiver_faces.numpy(), own_faces])
@@ -188,7 +247,18 @@ def find_receivers(
         inputs=[positions, normals, faces, rows(sides), weights, vertices, samples],
         outputs=[points, point_normals],
     )
-    return Receivers(points, point_normals, receiver_faces, of_vertices, receiver_fragments, still)
+    found = Receivers(points, point_normals, receiver_faces, of_vertices, receiver_fragments, still)
+    if bodies is None:
+        return found
+    return found._replace(spans=spans, vertices=vertices, seen=_seen(sides, fragments, samples) if has_own else None)
+
+
+def _seen(sides: wp.array, fragments: Fragments, samples: wp.array) -> Fragments:
+    """Sides and barycentrics [batch, own] of some samples. Differentiable: barycentrics of the fragments."""
+    seen = Fragments(*(wp.empty(samples.shape, dtype=dtype, device=sides.device) for dtype in (wp.int32, wp.vec3)))
+    inputs = [rows(sides), rows(fragments.barycentrics), samples]
+    launch(_gather_seen, samples.shape, inputs=inputs, outputs=[seen.face_ids, seen.barycentrics])
+    return seen
 
 
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
@@ -220,18 +290,32 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
     return takes_part
 
 
-def _own_samples(fragments: Fragments, wants_samples: np.ndarray) -> tuple[np.ndarray, Fragments]:
-    """Samples of each view that have receivers of their own, −1 after the last, and fragments that see those."""
+def _own_samples(
+    fragments: Fragments, wants_samples: np.ndarray, bodies: np.ndarray, first: int
+) -> tuple[np.ndarray, Fragments, tuple[Span, ...]]:
+    """Samples of each view that have receivers of their own, body by body, −1 after the last of a body.
+
+    Returns them, fragments that see those, and the spans of bodies among receivers, counted from ``first`` on.
+    """
     device = fragments.face_ids.device
     face_ids = fragments.face_ids.numpy()
     is_own = (face_ids >= 0) & wants_samples[face_ids]
-    samples, own_counts = _ragged(is_own.reshape(len(is_own), -1))
     own_face_ids = face_ids.copy()
-    own_face_ids[is_own] = len(wants_samples) + np.concatenate([np.arange(count) for count in own_counts])
+    samples, spans, end = [], [], 0
+    for body in np.unique(bodies[wants_samples]):
+        is_bodys = is_own & (bodies[face_ids] == body)
+        columns, own_counts = _ragged(is_bodys.reshape(len(is_bodys), -1))
+        numbers = [len(wants_samples) + end + np.arange(count) for count in own_counts]
+        own_face_ids[is_bodys] = np.concatenate(numbers)
+        samples.append(columns)
+        start, end = end, end + columns.shape[1]
+        if end > start:
+            spans.append(Span(int(body), first + start, first + end))
     weights = wp.empty(face_ids.size, dtype=wp.vec3, device=device)
     own = wp.array(is_own.ravel(), dtype=wp.bool, device=device)
     launch(_weigh_own, weights.shape, inputs=[own, fragments.barycentrics.flatten()], outputs=[weights])
-    return samples, Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights.reshape(face_ids.shape))
+    seen = Fragments(wp.array(own_face_ids, dtype=wp.int32, device=device), weights.reshape(face_ids.shape))
+    return np.concatenate(samples, axis=1), seen, tuple(spans)
 
 
 def _ragged(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,90 @@
+"""Sites of a body, and where receivers lie among them."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warpshadow.stages.own_shadows.sites import Sites, SiteTable, cuts_of, find_sites
+from warpshadow.stages.rasterize import Fragments
+
+# Interpolated float32 positions of size 1.
+FLOAT32 = 1e-6
+# Central differences of float32 weights, which are linear in barycentrics.
+GRADIENT = 2e-3
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+POSITIONS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0.5)], np.float32)
+NORMALS = np.tile(np.float32([[0, 0, 1]]), (4, 1))
+FACES = np.array([(0, 1, 2), (3, 2, 1)])
+
+
+def table_of(sites: Sites, device, *, first_vertex=0, vertex_count=4, first_face=0, face_count=2) -> SiteTable:
+    corners = wp.array(sites.corners, dtype=wp.int32, device=device)
+    return SiteTable(first_vertex, vertex_count, first_face, face_count, len(sites.positions), corners, sites.cuts)
+
+
+def seen_at(faces, barycentrics, device, requires_grad=False) -> Fragments:
+    return Fragments(
+        wp.array(np.asarray(faces)[None], dtype=wp.int32, device=device),
+        wp.array(np.asarray(barycentrics)[None], dtype=wp.vec3, device=device, requires_grad=requires_grad),
+    )
+
+
+@pytest.mark.parametrize("cuts", [1, 2, 3, 5])
+def test_faces_share_the_sites_of_their_common_edge_and_vertices_come_first(cuts):
+    sites = find_sites(POSITIONS, NORMALS, FACES, cuts)
+    assert len(sites.positions) == (cuts + 1) ** 2
+    np.testing.assert_array_equal(sites.positions[:4], POSITIONS)
+    np.testing.assert_allclose(np.linalg.norm(sites.normals, axis=1), 1, atol=FLOAT32)
+
+
+@pytest.mark.parametrize("cuts", [1, 2, 3, 5])
+def test_sites_interpolate_positions_where_samples_see_a_face(device, cuts):
+    sites = find_sites(POSITIONS, NORMALS, FACES, cuts)
+    rng = np.random.default_rng(0)
+    faces = rng.integers(0, 2, 300)
+    barycentrics = rng.dirichlet([1, 1, 1], 300).astype(np.float32)
+    barycentrics[:5] = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0.5, 0.5), (0.5, 0.5, 0)]
+    rows, weights = (
+        array.numpy()[0] for array in table_of(sites, device).of_samples(seen_at(faces, barycentrics, device))
+    )
+    expected = np.einsum("rk,rkx->rx", barycentrics, POSITIONS[FACES[faces]])
+    np.testing.assert_allclose(np.einsum("rk,rkx->rx", weights, sites.positions[rows]), expected, atol=FLOAT32)
+    assert weights.min() >= 0 and np.abs(weights.sum(axis=1) - 1).max() < FLOAT32
+
+
+def test_vertices_and_backs_of_a_body_among_others_have_its_own_numbers(device):
+    sites = find_sites(POSITIONS, NORMALS, FACES, 2)
+    table = table_of(sites, device, first_vertex=10, vertex_count=100, first_face=7, face_count=50)
+    rows, weights = table.of_vertices(wp.array([10, 13, 112], dtype=wp.int32, device=device))
+    np.testing.assert_array_equal(rows.numpy()[0], [[0] * 3, [3] * 3, [9 + 2] * 3])
+    np.testing.assert_array_equal(weights.numpy()[0, :, 0], 1)
+    front, back = table.of_samples(seen_at([7, 57, -1], [(0.2, 0.3, 0.5)] * 3, device)).rows.numpy()[0, :2]
+    np.testing.assert_array_equal(back, front + 9)
+
+
+def test_gradients_to_barycentrics_are_central_differences(device, verified_tape):
+    table = table_of(find_sites(POSITIONS, NORMALS, FACES, 3), device)
+    rng = np.random.default_rng(1)
+    faces, barycentrics = rng.integers(0, 2, 50), rng.dirichlet([1, 1, 1], 50)
+    values = rng.normal(size=16)  # of each site
+    seen = seen_at(faces, barycentrics, device, requires_grad=True)
+    with wp.Tape() as tape:
+        places = table.of_samples(seen)
+    seeds = values[places.rows.numpy()].astype(np.float32)
+    tape.backward(grads={places.weights: wp.array(seeds, dtype=wp.vec3, device=device)})
+    step = 1e-4 * rng.normal(size=(50, 3))
+    step -= step.mean(axis=1, keepdims=True)  # they sum to 1
+    ends = []
+    for sign in (1, -1):
+        moved = table.of_samples(seen_at(faces, barycentrics + sign * step, device))
+        ends.append((values[moved.rows.numpy()[0]] * moved.weights.numpy()[0]).sum(axis=1))
+    products = (seen.barycentrics.grad.numpy()[0] * step).sum(axis=1)
+    same_piece = np.abs(products - (ends[0] - ends[1]) / 2) < GRADIENT * np.abs(step).max() * 50
+    assert same_piece.mean() > 0.95  # the others cross from one small face to the next
+
+
+@pytest.mark.parametrize(("faces", "cuts"), [(1, 100), (968, 4), (10_000, 1), (12_200, 1)])
+def test_coarse_meshes_are_cut(faces, cuts):
+    assert cuts_of(faces) == cuts
