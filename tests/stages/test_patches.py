@@ -124,12 +124,12 @@ def test_an_even_grid_has_its_nodes_in_the_middles_of_equal_texels(segments):
     mesh = ws.plane(3.0, segments).transformed(scale=(2, 1, 1), translation=(5, -1, 2))
     patches = flat_patches_of(mesh)
     grid = patches.grid
-    assert grid.covered.shape in [(16, 32), (32, 16)] and grid.covered.min() == 1
-    np.testing.assert_allclose(patches.areas, 18 / 512, rtol=1e-3)
+    assert grid.covered.shape in [(12, 24), (24, 12)] and grid.covered.min() == 1
+    np.testing.assert_allclose(patches.areas, 18 / 288, rtol=1e-3)
     np.testing.assert_allclose(patches.centers.mean(axis=0), [5, -1, 2], atol=1e-4)
-    np.testing.assert_allclose(patches.normals, [[0, 1, 0]] * 512, atol=ROUNDING)
+    np.testing.assert_allclose(patches.normals, [[0, 1, 0]] * 288, atol=ROUNDING)
     np.testing.assert_allclose(source_points(patches, mesh), patches.centers, atol=1e-4)
-    np.testing.assert_array_equal(patches.sources.patches, np.arange(512))
+    np.testing.assert_array_equal(patches.sources.patches, np.arange(288))
 
 
 def test_a_grid_is_finer_near_other_bodies():
@@ -148,7 +148,7 @@ def test_a_square_that_is_turned_has_a_grid_of_its_own_size():
     angle = 0.5
     rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     grid = flat_patches_of(ws.plane(2.0, 4).transformed(rotation=rotation)).grid
-    assert grid.texel_sizes().sum(axis=(0, 1)) == pytest.approx([2 * 32, 2 * 32], rel=1e-3)
+    assert grid.texel_sizes().sum(axis=(0, 1)) == pytest.approx([2 * 24, 2 * 24], rel=1e-3)
     assert grid.covered.min() == 1
     assert np.linalg.det(grid.frame) == pytest.approx(1)
 
@@ -171,9 +171,9 @@ def test_nodes_off_the_mesh_have_no_sources():
 def test_both_sides_of_a_grid_have_patches():
     mesh = ws.plane(1.0, 2)
     patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
-    assert patches.count == 2 * 32 * 32 and patches.grid.sides == 2
-    np.testing.assert_allclose(patches.normals[1024:], [[0, -1, 0]] * 1024, atol=ROUNDING)
-    assert patches.sources.is_back[1024:].all() and not patches.sources.is_back[:1024].any()
+    assert patches.count == 2 * 24 * 24 and patches.grid.sides == 2
+    np.testing.assert_allclose(patches.normals[576:], [[0, -1, 0]] * 576, atol=ROUNDING)
+    assert patches.sources.is_back[576:].all() and not patches.sources.is_back[:576].any()
 
 
 def test_pieces_of_a_flat_body_belong_to_the_texels_in_which_they_lie():

@@ -13,7 +13,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.light_samples import CellSamples, LightSamples
 
-_RAY_COST = 200.0
+RAY_COST = 200.0
 """Nanoseconds that a ray takes."""
 
 _ROUNDING = 2.0**-21
@@ -191,7 +191,7 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     check.shape("directions", directions.shape, ("direction",))
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     inputs = [_id(mesh), points, normals, directions]
-    launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=_RAY_COST)
+    launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=RAY_COST)
     return visibility
 
 
@@ -247,13 +247,13 @@ def trace_shading(
     directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
     shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
-    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+    for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_shading,
             part.stop - part.start,
             inputs=[_id(mesh), points[part], normals[part], directions, radiance],
             outputs=[shading[part]],
-            cost=_RAY_COST * directions.shape[1],
+            cost=RAY_COST * directions.shape[1],
         )
     return shading
 
@@ -287,7 +287,7 @@ def trace_transfer(
     towards = wp.array(directions, dtype=wp.vec3, device=points.device)
     values = (4 / len(directions) * functions(directions)).astype(np.float32)
     transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
-    for part in _parts(points.shape[0], 2**22 // len(directions), progress):
+    for part in parts(points.shape[0], 2**22 // len(directions), progress):
         visibility = trace_visibility(mesh, points[part].reshape((1, -1)), normals[part].reshape((1, -1)), towards)
         cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
         transfer[part] = (visibility.numpy()[0] * cosine) @ values
@@ -351,18 +351,18 @@ def trace_cells(
     """
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
     light = wp.zeros(shape, dtype=wp.float32, device=points.device)
-    for part in _parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
+    for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_cells,
             part.stop - part.start,
             inputs=[_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
             outputs=[light[part]],
-            cost=_RAY_COST * samples.directions.shape[1],
+            cost=RAY_COST * samples.directions.shape[1],
         )
     return light
 
 
-def _parts(total: int, size: int, progress: bool) -> Iterator[slice]:
+def parts(total: int, size: int, progress: bool) -> Iterator[slice]:
     """Cut a range into slices of at most ``size``, with a progress bar over them."""
     from tqdm import tqdm
 

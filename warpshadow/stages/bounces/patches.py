@@ -37,7 +37,7 @@ _LLOYD_STEPS = 8
 _LEARNED = 20_000
 """Pieces that k-means looks at, at most."""
 
-_GRID = 32
+_GRID = 24
 """Nodes along a grid's longer side."""
 
 _EVEN = 1e3

@@ -1,0 +1,117 @@
+"""Form factors by rays: which share of a receiver's hemisphere each patch takes, weighted by the cosine."""
+
+import numpy as np
+import warp as wp
+from scipy.sparse import csr_matrix, vstack
+
+from warpshadow import check
+from warpshadow.device.launch import launch
+from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
+
+_COUNTED = 1 << 22
+"""Counts that are held at once [sites × patches]."""
+
+GOLDEN = (5**0.5 - 1) / 2
+"""Turn from ray to ray, as a part of a full turn."""
+
+
+@wp.kernel(enable_backward=False)
+def _count_hits(
+    first_row: int,
+    worker: int,
+    # in
+    mesh: wp.uint64,
+    of_faces: wp.array2d(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    first_site: int,
+    ray_count: int,
+    # out
+    counts: wp.array2d(dtype=wp.int32),
+):
+    """A thread owns a site, whose counts are zero before."""
+    site = first_row + wp.tid()
+    point = points[site]
+    normal = normals[site]
+    if wp.length_sq(normal) == 0.0:
+        return
+    sign = wp.where(normal[2] < 0.0, -1.0, 1.0)  # [Duff et al. 2017]
+    p = -1.0 / (sign + normal[2])
+    q = normal[0] * normal[1] * p
+    tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * p, sign * q, -sign * normal[0])
+    bitangent = wp.vec3(q, sign + normal[1] * normal[1] * p, -normal[1])
+    turn = wp.randf(wp.rand_init(29, first_site + site))
+    for ray in range(ray_count):
+        # a Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large
+        square = (float(ray) + 0.5) / float(ray_count)
+        angle = 2.0 * wp.pi * (turn + wp.frac(float(ray) * GOLDEN))
+        radius = wp.sqrt(square)
+        toward = radius * wp.cos(angle) * tangent + radius * wp.sin(angle) * bitangent + wp.sqrt(1.0 - square) * normal
+        hit = nearest(mesh, point, normal, toward)
+        if hit.face >= 0:
+            patch = of_faces[wp.where(hit.is_back, 1, 0), hit.face]
+            if patch >= 0:
+                counts[site, patch] = counts[site, patch] + 1
+
+
+def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
+    """Make the mesh of the pieces of a body, for rays: its face is a piece.
+
+    Args:
+        patches: Has the pieces.
+        positions, faces: The mesh that they are pieces of, NumPy.
+        device: Where rays are traced.
+    """
+    corners = patches.pieces.positions(positions, faces).reshape(-1, 3)
+    indices = np.arange(len(corners), dtype=np.int32)
+    return wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), wp.array(indices, dtype=wp.int32, device=device))
+
+
+def trace_factors(
+    mesh: wp.Mesh,
+    of_faces: np.ndarray,
+    count: int,
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    rays: int = 512,
+    progress: bool = False,
+) -> csr_matrix:
+    """Trace which patches receivers see.
+
+        F_xp = 1/π ∫ [p is what x sees towards ω] max(n·ω, 0) dω
+
+    so that Σ_p F_xp B_p is what x reflects of the radiosity B of patches if it is white. Rays are as dense as the
+    cosine, on a lattice that is turned at random for each receiver; an F has a standard error of at most
+    √(F (1 − F) / rays), and less, since a lattice is even.
+
+    Args:
+        mesh: What rays meet; :func:`patch_mesh` makes it of a body.
+        of_faces: Patch of the front and the back of each of its faces, −1 for black, shape [2, face].
+        count: Number of patches.
+        points: Receivers, which may lie on the mesh, shape [site, 3].
+        normals: Unit normals, shape [site, 3]. Where one is zero nothing is seen.
+        rays: Rays of each receiver.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        F, float32 of shape [site, patch].
+
+    Differentiable: no.
+    """
+    check.shape("of_faces", of_faces.shape, (2, "face"))
+    check.shape("points", points.shape, ("site", 3))
+    check.shape("normals", normals.shape, points.shape)
+    device = mesh.device
+    owners = wp.array(of_faces, dtype=wp.int32, device=device)
+    found = []
+    for part in parts(len(points), _COUNTED // max(count, 1), progress):
+        counts = wp.zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
+        at = [wp.array(values[part], dtype=wp.vec3, device=device) for values in (points, normals)]
+        inputs = [mesh.id, owners, *at, part.start, rays]
+        launch(_count_hits, len(at[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)
+        found.append(csr_matrix(counts.numpy()))
+    if not found:
+        return csr_matrix((0, count), dtype=np.float32)
+    return (vstack(found, format="csr") / rays).astype(np.float32)
