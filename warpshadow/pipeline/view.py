@@ -111,7 +111,8 @@ class View(LitPoints):
         else:
             numbering = number_receivers(assembly.faces, keeps_vertex, is_static)
         wants_samples = method.samples_receive[assembly.body_of_face]
-        return find_receivers(positions, normals, assembly.faces, fragments, numbering, wants_samples)
+        given = positions, normals, assembly.faces, fragments, numbering, wants_samples
+        return find_receivers(*given, across=self._across)
 
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
