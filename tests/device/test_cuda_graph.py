@@ -1,5 +1,7 @@
 """Captured iterations: replays compute what calls do, on inputs that changed since. Captures are of the CPU's."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -118,13 +120,15 @@ def squared_difference(image, target):
 
 
 @pytest.mark.usefixtures("captures")
-@pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
-def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, scene, device, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "receivers"), [("directional", "vertex"), ("log-sh", "vertex"), ("none", "vertex"), ("none", "pixel")]
+)
+def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, receivers, scene, device, monkeypatch):
     """As on a GPU, all vertices are receivers."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
-    scene = ws.Scene(
-        scene.bodies, scene.light, scene.camera, ws.Visibility.of({"method": method, "directions": 32, "order": 3})
-    )
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
+    bodies = [dataclasses.replace(body, receivers=receivers) for body in scene.bodies]
+    scene = ws.Scene(bodies, scene.light, scene.camera, visibility)
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
     target = wp.clone(pose.draw(), requires_grad=False).flatten()
     evaluate = with_gradients(lambda: squared_difference(pose.draw(), target), [pose.turn, pose.translation])

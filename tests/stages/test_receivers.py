@@ -34,7 +34,9 @@ def receivers_of(positions, faces, matrices, wants_samples, across=1):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     wants = np.array(wants_samples)
     numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
-    found = find_receivers(positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, across)
+    found = find_receivers(
+        positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, across=across
+    )
     return found, fragments
 
 
@@ -84,7 +86,7 @@ def test_while_a_graph_is_captured_every_sample_has_room_for_a_receiver(device):
     wants = np.array([True, False])
     numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
     with wp.ScopedCapture(device=device) as capture:
-        found = find_receivers(positions, normals, faces, fragments, numbering, wants, 2)
+        found = find_receivers(positions, normals, faces, fragments, numbering, wants, across=2)
     wp.capture_launch(capture.graph)
     assert found.points.shape[1] == 3 + 12 * 12
     for own, others in ((found.points, expected.points), (found.normals, expected.normals)):

@@ -126,7 +126,7 @@ def _find_sharing(
             sample = corner + i // across * width + i % across
             side = sides[view, sample]
             first = int(-1)
-            if side >= 0 and wants_samples[wp.max(side, 0)]:
+            if side >= 0 and wants_samples[wp.max(side, 0) % wants_samples.shape[0]]:
                 first = sample
                 for k in range(i):
                     other = corner + k // across * width + k % across
@@ -166,21 +166,22 @@ def _see_own(
     firsts: wp.array2d(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.int32),
     rooms: wp.array(dtype=wp.int32),
+    side_count: int,
     # out
     own_sides: wp.array2d(dtype=wp.int32),
     samples: wp.array2d(dtype=wp.int32),
 ):
-    """A thread owns a sample. Receivers have numbers, or else a room each in those of their side's body."""
+    """A thread owns a sample. Receivers have numbers, or else a room each in those of their face's body."""
     view, sample = wp.tid()
     side = sides[view, sample]
     first = firsts[view, sample]
     if first >= 0:
-        number = rooms[side] * sides.shape[1] + first
+        number = rooms[side % rooms.shape[0]] * sides.shape[1] + first
         if numbers:
             number = numbers[view, first]
         if first == sample:
             samples[view, number] = sample
-        side = rooms.shape[0] + number
+        side = side_count + number
     own_sides[view, sample] = side
 
 
@@ -310,9 +311,8 @@ def find_receivers(
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
         side_count = len(receiver_faces)
-        keys = np.zeros(side_count, int) if bodies is None else np.resize(bodies, side_count)
-        wants = np.resize(wants_samples, side_count)
-        own, own_spans = _find_own(receiver_fragments, wants, keys, across, numbering.moving_count)
+        keys = np.zeros(len(faces), int) if bodies is None else bodies
+        own, own_spans = _find_own(receiver_fragments, side_count, wants_samples, keys, across, numbering.moving_count)
         spans += own_spans
         own_count = own.samples.shape[1]
         all_faces = wp.empty(side_count + own_count, dtype=wp.vec3i, device=device)
@@ -384,7 +384,7 @@ class _Own(NamedTuple):
 
 
 def _find_own(
-    fragments: Fragments, wants_samples: np.ndarray, bodies: np.ndarray, across: int, first: int
+    fragments: Fragments, side_count: int, wants_samples: np.ndarray, bodies: np.ndarray, across: int, first: int
 ) -> tuple[_Own, tuple[Span, ...]]:
     """Let samples of a pixel that see the same side share a receiver. Differentiable: barycentrics.
 
@@ -392,7 +392,8 @@ def _find_own(
     one at every sample.
 
     Args:
-        wants_samples, bodies: Of sides.
+        side_count: Faces that receivers at vertices have.
+        wants_samples, bodies: Of faces.
         across: Samples of a pixel across and down.
         first: What the receivers in the spans of bodies, which are returned, too, are counted from.
     """
@@ -411,7 +412,7 @@ def _find_own(
     else:
         is_first = firsts.numpy() == np.arange(sample_count)
         numbers_of, columns, ends = np.zeros(sides.shape, int), [], [0]
-        bodies_seen = bodies[sides.numpy()]
+        bodies_seen = bodies[sides.numpy() % len(bodies)]
         for name in names:
             is_bodys = is_first & (bodies_seen == name)
             numbers_of[is_bodys] = ends[-1] + (np.cumsum(is_bodys, axis=1) - 1)[is_bodys]
@@ -419,7 +420,7 @@ def _find_own(
             ends.append(ends[-1] + columns[-1].shape[1])
         samples = wp.array(np.concatenate(columns, axis=1), dtype=wp.int32, device=device)
         numbers = wp.array(numbers_of, dtype=wp.int32, device=device)
-    inputs = [sides, firsts, numbers, rooms]
+    inputs = [sides, firsts, numbers, rooms, side_count]
     launch(_see_own, sides.shape, inputs=inputs, outputs=[own_sides, samples])
     means, weights = (wp.zeros(sides.shape, dtype=wp.vec3, device=device) for _ in range(2))
     launch(_share, sides.shape, inputs=[firsts, counts, rows(fragments.barycentrics)], outputs=[means, weights])
