@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,7 @@ from warpshadow.pipeline.own_shadows import OwnShadows
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows
+from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
 from warpshadow.stages.shading import shade
@@ -45,6 +46,7 @@ class LitPoints:
         receivers: The points.
         call: Has what of them may not be kept.
         static: The static bodies among moving ones; None where any may move.
+        normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
     """
 
     def __init__(
@@ -56,10 +58,12 @@ class LitPoints:
         receivers: Node,
         call: Call,
         static: Static | None = None,
+        normals: Node | None = None,
     ):
         self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
+        self.normals = Node("", vertex_normals, vertices, method.assembly.faces) if normals is None else normals
         self._scene_shading: Node | None = None
         self._known: tuple[Source, Node] | None = None
         self._transfers: Node | None = None
@@ -245,18 +249,30 @@ class Seen(NamedTuple):
     own: wp.array | None = None  # the share that its own body lets through, which is in it; None where that is all
 
 
+class Bouncing(Protocol):
+    """How light bounces in a scene: what is added to a method of spheres."""
+
+    def shading(self, points: LitPoints, own: Node, light: Source, materials: Materials) -> Node:
+        """Shading of points, direct and bounced, given what the method takes of the light."""
+
+
 class SphereMethod(Method):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
 
     Attributes:
         in_free: What the method takes of any free light.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
+        bounces: How light bounces; None where it does not.
+        flats: Bodies whose spheres block nothing, since what bounces knows better what they block.
         joins_kept: Whether visibility is found of kept rows and of what moves together.
     """
 
     in_free: Any
     why_no_shadows = ""
     joins_kept = False
+
+    bounces: "Bouncing | None" = None
+    flats: tuple[int, ...] = ()
 
     def in_known(self, light: KnownLight) -> Any:
         """What the method takes of known light: its coefficients, and what they belong to."""
@@ -294,6 +310,8 @@ class SphereMethod(Method):
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         own = self._in_scene_light if light is self.light else Node("", self.in_known, light)
+        if self.bounces is not None:
+            return self.bounces.shading(points, own, light, materials)
         return InParts(self, points, own, light, joined)
 
     def transfers(self, points: LitPoints) -> Node:
@@ -321,6 +339,9 @@ class InParts(Node):
         light: Known light, in which parts are shaded; None to end with transfer vectors.
         finish: What is made of the list of those of all parts.
         keeps: As for :class:`Node`.
+        where: Put after the names of its stages, where others have those names.
+        extra: More that parts depend on.
+        beside: As for :class:`Node`.
     """
 
     def __init__(
@@ -332,12 +353,15 @@ class InParts(Node):
         finish: Callable[[list[wp.array]], Any],
         *,
         keeps: bool = True,
+        where: str = "",
+        extra: tuple[Node, ...] = (),
+        beside: tuple[Node, ...] = (),
     ):
         self._static, self._finish, self._progress = points.static, finish, method.progress and light is not None
         self._method = method
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         self._visibility = Node(
-            "visibility",
+            f"visibility{where}",
             method.see,
             receivers,
             spheres,
@@ -347,7 +371,7 @@ class InParts(Node):
             keeps=False,
         )
         self._transfer = result = Node(
-            "transfer",
+            f"transfer{where}",
             method.transfer,
             self._visibility,
             own,
@@ -356,16 +380,18 @@ class InParts(Node):
         )
         self._shading = None
         if light is not None:
-            self._shading = result = Node("shading", method.light_part, self._transfer, own, items=words, keeps=False)
+            given = self._transfer, own
+            self._shading = result = Node(f"shading{where}", method.light_part, *given, items=words, keeps=False)
         shadows = _static_shadows(method, points, light)
         kept = shadows if shadows.function else None
-        super().__init__("", None, receivers, spheres, own, kept, beside=(shadows, result), keeps=keeps)
+        given = receivers, spheres, own, kept, *extra
+        super().__init__("", None, *given, beside=(shadows, result, *beside), keeps=keeps)
 
     def compute(self, call: Call) -> Any:
         """Find it for one part after another."""
         from tqdm import tqdm
 
-        receivers, spheres, own, kept = self.values(call)
+        receivers, spheres, own, kept, *extra = self.values(call)
         groups = list(self._groups(receivers, spheres))
         if self._static is not None and len(receivers.still):
             on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
@@ -375,23 +401,32 @@ class InParts(Node):
         with tqdm(total=total, desc="shading", unit="receiver", delay=1, disable=not self._progress) as bar:
             for group in groups:
                 for part in group.parts():
-                    seen = self._visibility.run(call, part, own)
-                    result = self._transfer.run(call, seen, part, own)
-                    if self._shading is not None:
-                        result = self._shading.run(call, result, part, own)
-                    results.append(result)
+                    results.append(self.find(call, part, own, spheres, *extra))
                     bar.update(part.points.shape[1])
         return self._finish(results)
 
+    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *_: Any) -> Any:
+        """Find it for a part, given what the method takes of the light, all spheres, and values of what is extra."""
+        return self.light(call, part, self.see(call, part, own), own)
+
+    def see(self, call: Call, part: Group, own: Any) -> Seen:
+        """What a part sees."""
+        return self._visibility.run(call, part, own)
+
+    def light(self, call: Call, part: Group, seen: Seen, own: Any) -> wp.array:
+        """Transfer vectors of a part that sees something, or its shading."""
+        transfer = self._transfer.run(call, seen, part, own)
+        return transfer if self._shading is None else self._shading.run(call, transfer, part, own)
+
     def _groups(self, receivers: Receivers, spheres: tuple[wp.array, wp.array]) -> Iterator[Group]:
         """Receivers that may move, in groups that the same spheres block."""
+        bodies = [body for body in range(len(self._method.assembly.scene.bodies)) if body not in self._method.flats]
         if not receivers.spans:
-            yield Group(receivers.points, receivers.normals, *spheres)
-        bodies = range(len(self._method.assembly.scene.bodies))
+            yield Group(receivers.points, receivers.normals, *self._method.assembly.spheres_of(bodies, spheres))
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
             if span.body < 0:
-                yield Group(points, normals, *spheres)
+                yield Group(points, normals, *self._method.assembly.spheres_of(bodies, spheres))
                 continue
             others = [body for body in bodies if body != span.body]
             blocking, places = (

@@ -43,6 +43,7 @@ class Materials:
         self.assembly = assembly
         self._take_albedo(albedo)
         self._take_textures(textures)
+        self._of_scene = list(albedo.value()), list(textures.value())
 
     def _take_albedo(self, albedo: Source) -> None:
         counts = np.diff(self.assembly.first_vertex).tolist()
@@ -65,6 +66,13 @@ class Materials:
         albedo = Source("albedo", [array(np.atleast_2d(body.albedo)) for body in bodies])
         textures = Source("textures", [None if body.texture is None else array(body.texture) for body in bodies])
         return cls(assembly, albedo, textures)
+
+    def is_black(self, number: int) -> bool:
+        """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
+        colors, images = self._of_scene
+        given = self.albedo.value()[number] is not colors[number] or self.textures.value()[number] is not images[number]
+        body = self.assembly.scene.bodies[number]
+        return not given and not np.any(body.albedo if body.texture is None else body.texture)
 
     def replaced(self, albedo: Given, textures: Given) -> "Materials":
         """A copy that has what is given in place of some, checked; nodes of the others are the same.
@@ -161,7 +169,7 @@ class SeenSurfaces:
             samples = Node("reflectance", interpolate, *seen, items=items, beside=tuple(none))
             return Reflection(samples, vertex_albedo, *none)
         pyramids = materials.pyramids
-        if materials.textures is not self._materials.textures:
+        if materials.textures is not self._materials.textures and not materials.assembly.scene.bounces:
             pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
         if self._footprints[0] != materials.sizes:
             has_texture = np.array([size is not None for size in materials.sizes])

@@ -62,13 +62,13 @@ class View(LitPoints):
         self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
-        receivers = self._wire(method, vertices, cameras, static)
-        super().__init__(method, materials, vertices, spheres, receivers, call, static)
+        normals, receivers = self._wire(method, vertices, cameras, static)
+        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
-    def _wire(self, method: Method, vertices: Source, cameras: Source, static: Static | None) -> Node:
-        """From the vertices to the receivers."""
+    def _wire(self, method: Method, vertices: Source, cameras: Source, static: Static | None) -> tuple[Node, Node]:
+        """From the vertices to their normals and to the receivers."""
         assembly, samples, corners = method.assembly, self._samples, self._vertices
         faces, two_sided = assembly.faces, assembly.two_sided_faces
         if static is None or cameras.requires_grad:
@@ -93,7 +93,7 @@ class View(LitPoints):
         words = functools.partial(receiver_words, self)
         receivers = Node("receivers", self._receive, vertices, normals, seen, Fixed(silhouettes), items=words)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
-        return receivers
+        return normals, receivers
 
     def _receive(
         self, positions: wp.array, normals: wp.array, fragments: Fragments, silhouettes: Silhouettes
@@ -103,16 +103,19 @@ class View(LitPoints):
         has_backs = fragments.sides is not None
         keeps_vertex = method.can_receive[: 1 + has_backs]
         is_static = None if self.static is None else self.static.has_vertex
+        of_vertices = of_faces = None
+        if assembly.scene.bounces:
+            of_vertices, of_faces = assembly.body_of_vertex, assembly.body_of_face
         if is_readable(assembly.device):
             keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
-            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order)
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order, of_vertices)
         elif is_static is None:
             numbering = method.numberings[has_backs]
         else:
-            numbering = number_receivers(assembly.faces, keeps_vertex, is_static)
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, bodies=of_vertices)
         wants_samples = method.samples_receive[assembly.body_of_face]
         given = positions, normals, assembly.faces, fragments, numbering, wants_samples
-        return find_receivers(*given, across=self._across)
+        return find_receivers(*given, bodies=of_faces, across=self._across)
 
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""

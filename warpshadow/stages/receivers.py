@@ -337,6 +337,35 @@ def find_receivers(
     return found._replace(spans=spans, vertices=vertices, seen=_seen(sides, own) if own_count else None)
 
 
+def points_on_faces(
+    positions: wp.array, normals: wp.array, faces: wp.array, sides: wp.array, barycentrics: wp.array
+) -> tuple[wp.array, wp.array]:
+    """Gather points on faces, and their normals.
+
+    Args:
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
+        faces: Vertex indices, vec3i of shape [face].
+        sides: Faces, from the front or from behind, int32 of shape [1, point].
+        barycentrics: Where on them, vec3 of shape [1, point].
+
+    Returns:
+        Points and unit normals, vec3 of shape [batch, point]; normals of backs are turned over.
+
+    Differentiable: positions, normals, barycentrics.
+    """
+    device, count = positions.device, sides.shape[1]
+    points, point_normals = (wp.empty((len(positions), count), dtype=wp.vec3, device=device) for _ in range(2))
+    none, all_of_them = (constant(np.arange(number), wp.int32, device) for number in (0, count))
+    launch(
+        _gather,
+        points.shape,
+        inputs=[positions, normals, faces, sides, barycentrics, none, all_of_them.reshape((1, count))],
+        outputs=[points, point_normals],
+    )
+    return points, point_normals
+
+
 def _seen(sides: wp.array, own: "_Own") -> Fragments:
     """What own receivers see: sides and barycentrics [batch, own]. Differentiable: barycentrics."""
     shape = own.samples.shape

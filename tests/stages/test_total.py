@@ -1,0 +1,26 @@
+"""Sums of light on several ways, and their gradients."""
+
+import numpy as np
+import warp as wp
+
+from warpshadow.stages.bounces.total import total_light
+
+
+def test_light_adds_up_and_its_gradient_goes_to_every_part(device):
+    random = np.random.default_rng(0)
+    values = [random.normal(size=shape).astype(np.float32) for shape in ((2, 5, 3), (1, 5, 3), (2, 5, 3))]
+    parts = [wp.array(each, dtype=wp.vec3, device=device, requires_grad=True) for each in values]
+    with wp.Tape() as tape:
+        total = total_light(parts)
+    np.testing.assert_allclose(total.numpy(), sum(values), rtol=1e-6)
+    seed = random.normal(size=total.numpy().shape).astype(np.float32)
+    total.grad.assign(seed)
+    tape.backward()
+    for part in parts:
+        expected = seed if len(part) == 2 else seed.sum(axis=0, keepdims=True)
+        np.testing.assert_allclose(part.grad.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_one_part_is_the_total(device):
+    part = wp.ones((1, 3), dtype=wp.vec3, device=device)
+    assert total_light([part]) is part

@@ -1,0 +1,182 @@
+"""Patches of a scene: the bodies that send bounced light, where they are lit, and what they reflect."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import concatenate
+from warpshadow.device.constants import constant
+from warpshadow.maths.plane import plane_normal
+from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
+from warpshadow.stages.bounces.patches import Patches, find_flat_patches, find_patches
+from warpshadow.stages.bounces.radiosity import mean_over_sources
+from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.receivers import Receivers, Span, points_on_faces
+from warpshadow.stages.textures.pyramid import Textures
+
+
+class ScenePatches:
+    """The patches of a scene's bodies; each body's are found when they are first asked for.
+
+    Args:
+        assembly: The bodies.
+    """
+
+    def __init__(self, assembly: Assembly):
+        self._assembly = assembly
+        self._of_body: dict[int, Patches] = {}
+        self._means: dict[tuple, SparseMatrix] = {}
+        self._senders: dict[tuple[int, ...], Senders] = {}
+
+    def of_body(self, number: int) -> Patches:
+        """Patches of a body in its own frame; those of a flat one are a grid."""
+        if number not in self._of_body:
+            mesh, is_two_sided = self._assembly.scene.bodies[number].mesh, bool(self._assembly.is_two_sided[number])
+            corners, found = (mesh.positions, mesh.surface.faces), None
+            if number in self.flats:
+                others = self._others_in_frame(number)
+                normal = plane_normal(mesh.positions[mesh.surface.faces].astype(np.float64))
+                heights = [(points - mesh.positions[mesh.surface.faces[0, 0]]) @ normal for points in others]
+                # nobody sees the back of a ground
+                is_two_sided = is_two_sided and (not others or bool(min(map(np.mean, heights)) < 0))
+                points = np.concatenate(others) if others else None
+                found = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
+            self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided) if found is None else found
+        return self._of_body[number]
+
+    def _others_in_frame(self, number: int) -> list[np.ndarray]:
+        """Vertices of each other body where the scene has it, in a body's frame."""
+        bodies = self._assembly.scene.bodies
+        own = bodies[number]
+        return [
+            (body.world_mesh().positions - own.translation) @ own.rotation_matrix() / own.scale
+            for other, body in enumerate(bodies)
+            if other != number
+        ]
+
+    @functools.cached_property
+    def flats(self) -> tuple[int, ...]:
+        """Bodies that lie in a plane."""
+        surfaces = [body.mesh for body in self._assembly.scene.bodies]
+        corners = [mesh.positions[mesh.surface.faces].astype(np.float64) for mesh in surfaces]
+        return tuple(number for number, each in enumerate(corners) if plane_normal(each) is not None)
+
+    def senders(self, materials: Materials) -> Senders:
+        """The bodies that are not known to be black, with their patches."""
+        bodies = tuple(number for number in range(len(self._assembly.scene.bodies)) if not materials.is_black(number))
+        if bodies not in self._senders:
+            self._senders[bodies] = Senders(self._assembly, bodies, [self.of_body(n) for n in bodies])
+        return self._senders[bodies]
+
+    # ------------------------------------------------------------------------------------------ albedo
+
+    def albedo(self, materials: Materials, bodies: Sequence[int]) -> Node:
+        """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch]."""
+        counts = [self.of_body(number).count for number in bodies]
+        pyramids = materials.pyramids if any(materials.sizes[number] for number in bodies) else None
+
+        def means(colors: Sequence[wp.array], textures: Textures | None) -> wp.array:
+            parts = []
+            for number in bodies:
+                if materials.sizes[number] is not None:
+                    assert textures is not None
+                    parts.append(multiply(self._mean_of_texels(number, materials, textures), textures.texels))
+                elif colors[number].shape[1] == 1:
+                    parts.append(colors[number])
+                else:
+                    parts.append(multiply(self._mean_of_vertices(number), colors[number]))
+            return concatenate(parts, counts)
+
+        return Node("patch albedo", means, materials.albedo, pyramids, items=f"{sum(counts):,} patches")
+
+    def _mean_of_vertices(self, number: int) -> SparseMatrix:
+        key = (number,)
+        if key not in self._means:
+            mesh = self._assembly.scene.bodies[number].mesh
+            matrix = mean_over_vertices(self.of_body(number), mesh.positions, mesh.surface.faces)
+            self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
+        return self._means[key]
+
+    def _mean_of_texels(self, number: int, materials: Materials, textures: Textures) -> SparseMatrix:
+        key = (number, materials.sizes)
+        if key not in self._means:
+            texture = sum(size is not None for size in materials.sizes[:number])
+            count = int(textures.level_counts.numpy()[texture])
+            mesh = self._assembly.scene.bodies[number].mesh
+            assert mesh.uvs is not None and mesh.surface.uv_faces is not None
+            matrix = mean_over_texels(
+                self.of_body(number),
+                mesh.positions,
+                mesh.surface.faces,
+                mesh.uvs,
+                mesh.surface.uv_faces,
+                textures.levels.numpy()[texture, :count],
+                textures.texels.shape[1],
+            )
+            self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
+        return self._means[key]
+
+
+class Senders:
+    """Bodies that send light, and their patches one after another.
+
+    Args:
+        assembly: All bodies.
+        bodies: Those that reflect.
+        patches: Of each of them.
+
+    Attributes:
+        bodies, patches: As given.
+        first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].
+        areas: Of all patches, in units of their bodies, float32 of shape [patch].
+        sides: Side of a face that each source lies on, int32 of shape [source].
+        barycentrics: And where on it, float32 of shape [source, 3].
+        mean: The matrix of means over sources, [patch, source].
+    """
+
+    def __init__(self, assembly: Assembly, bodies: tuple[int, ...], patches: list[Patches]):
+        self._assembly, self.bodies, self.patches = assembly, bodies, patches
+        self.first = np.cumsum([0, *(each.count for each in patches)])
+        face_count = int(assembly.first_face[-1])
+        sides = [
+            each.sources.faces + int(assembly.first_face[number]) + face_count * each.sources.is_back
+            for number, each in zip(bodies, patches, strict=True)
+        ]
+        owners = [each.sources.patches + first for each, first in zip(patches, self.first[:-1], strict=True)]
+        self.sides = _joined(sides, np.int32)
+        self.barycentrics = _joined([each.sources.barycentrics for each in patches], np.float32).reshape(-1, 3)
+        self.areas = _joined([each.areas for each in patches], np.float32)
+        weights = _joined([each.sources.weights for each in patches], np.float32)
+        counts = np.cumsum([0, *map(len, sides)]).tolist()
+        self._spans = tuple(
+            Span(*each) for each in zip(bodies, counts[:-1], counts[1:], strict=True) if each[2] > each[1]
+        )
+        self.mean = mean_over_sources(_joined(owners, np.int32), weights, int(self.first[-1]), device=assembly.device)
+
+    def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
+        """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""
+        device, faces = positions.device, self._assembly.faces
+        sides = constant(self.sides[None], wp.int32, device)
+        barycentrics = constant(self.barycentrics[None], wp.vec3, device)
+        none = constant(np.empty(0, np.int32), wp.int32, device)
+        return Receivers(
+            *points_on_faces(positions, normals, faces, sides, barycentrics),
+            faces,
+            none,
+            Fragments(sides, barycentrics),
+            spans=self._spans,
+            vertices=none,
+            seen=Fragments(sides, barycentrics),
+        )
+
+
+def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+    return np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)

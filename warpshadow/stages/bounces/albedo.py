@@ -1,0 +1,93 @@
+"""Albedo of patches: the matrices that take colors of vertices, or texels, to their means over patches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpshadow.stages.bounces.patches import Patches
+
+if TYPE_CHECKING:  # it is imported where a matrix is made
+    from scipy.sparse import csr_matrix
+
+
+def mean_over_vertices(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """The matrix of means over patches of what is interpolated between vertices.
+
+    Args:
+        patches: Of a body.
+        positions: Its vertices [units of the body], shape [vertex, 3].
+        faces: Its faces, shape [face, 3].
+
+    Returns:
+        Shape [patch, vertex]; rows sum to 1, those of patches without an area are empty.
+    """
+    weights = patches.pieces.corners.mean(axis=1)
+    columns = faces[patches.pieces.faces]
+    return _mean(patches, _piece_areas(patches, positions, faces), columns, weights, len(positions))
+
+
+def mean_over_texels(
+    patches: Patches,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    uvs: np.ndarray,
+    uv_faces: np.ndarray,
+    levels: np.ndarray,
+    texel_count: int,
+) -> csr_matrix:
+    """The matrix of means over patches of a texture, from the texels of its mip levels.
+
+    A piece of a patch takes the level whose texels are about as large as it, in its middle, bilinearly.
+
+    Args:
+        patches: Of a body.
+        positions: Its vertices [units of the body], shape [vertex, 3].
+        faces: Its faces, shape [face, 3].
+        uvs: Texture coordinates, shape [uv, 2].
+        uv_faces: Indices of them, shape [face, 3].
+        levels: First texel, width and height of each level, the finest first, shape [level, 3]: as in
+            :class:`warpshadow.stages.textures.pyramid.Textures`.
+        texel_count: Number of columns.
+
+    Returns:
+        Shape [patch, texel]; rows sum to 1, those of patches without an area are empty.
+    """
+    corners = patches.pieces.corners.astype(np.float64) @ uvs.astype(np.float64)[uv_faces[patches.pieces.faces]]
+    along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    texels = np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2 * levels[0, 1] * levels[0, 2]
+    level = np.rint(np.log2(np.maximum(texels, 1)) / 2).astype(int)
+    first, width, height = levels[np.minimum(level, len(levels) - 1)].T
+    u, v = np.moveaxis(corners.mean(axis=1) % 1, -1, 0)
+    x, y = u * width - 0.5, (1 - v) * height - 0.5
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    columns, weights = [], []
+    for down, below in ((0, 1 - (y - top)), (1, y - top)):
+        for right, beside in ((0, 1 - (x - left)), (1, x - left)):
+            columns.append(first + (top + down) % height * width + (left + right) % width)
+            weights.append(below * beside)
+    areas = _piece_areas(patches, positions, faces)
+    return _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), texel_count)
+
+
+def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = np.moveaxis(patches.pieces.positions(positions, faces), 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def _mean(
+    patches: Patches, areas: np.ndarray, columns: np.ndarray, weights: np.ndarray, column_count: int
+) -> csr_matrix:
+    """Means by area of what pieces [piece] take from some columns [piece, n]."""
+    from scipy.sparse import csr_matrix
+
+    entries = areas[:, None] * weights
+    parts = []
+    for of_pieces in patches.of_pieces:
+        counts = of_pieces >= 0
+        rows = np.repeat(of_pieces[counts], columns.shape[1])
+        parts.append((rows, columns[counts].ravel(), entries[counts].ravel()))
+    rows, chosen, values = (np.concatenate(each) for each in zip(*parts, strict=True))
+    totals = np.bincount(rows, values, patches.count)
+    return csr_matrix((values / totals[rows], (rows, chosen)), shape=(patches.count, column_count))
