@@ -1,13 +1,19 @@
 """Form factors by rays: which share of a receiver's hemisphere each patch takes, weighted by the cosine."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
-from scipy.sparse import csr_matrix, vstack
 
 from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 _COUNTED = 1 << 22
 """Counts that are held at once [sites × patches]."""
@@ -100,6 +106,8 @@ def trace_factors(
 
     Differentiable: no.
     """
+    from scipy.sparse import csr_matrix, vstack
+
     check.shape("of_faces", of_faces.shape, (2, "face"))
     check.shape("points", points.shape, ("site", 3))
     check.shape("normals", normals.shape, points.shape)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, cKDTree
 
 from warpshadow.maths.plane import plane_normal
 
@@ -317,6 +316,8 @@ def _cut(positions: np.ndarray, faces: np.ndarray, longest: Callable[[np.ndarray
 
 def _clusters(features: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     """K-means [Lloyd 1982], from halves of halves: the cluster of each item, none empty."""
+    from scipy.spatial import cKDTree
+
     learned = np.arange(0, len(features), max(1, len(features) // _LEARNED))
     groups = _split(learned, features, weights, count)
     centers = np.array([np.average(features[group], axis=0, weights=weights[group]) for group in groups])
@@ -403,6 +404,8 @@ def _sources_of(found: list[tuple[int, np.ndarray, int, float]], sides: int, cou
 
 def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Axes of the smallest rectangle around points of a plane, and its normal, as rows."""
+    from scipy.spatial import ConvexHull
+
     aside = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     basis = np.stack([aside, np.cross(normal, aside)]) / np.linalg.norm(aside)
     flat = points @ basis.T

@@ -2,7 +2,6 @@
 
 import numpy as np
 import warp as wp
-from scipy.sparse import csr_matrix
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
@@ -19,6 +18,8 @@ def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, d
         count: Number of patches; one without sources has a mean of 0.
         device: Where the matrix is used.
     """
+    from scipy.sparse import csr_matrix
+
     entries = (weights, (patches, np.arange(len(patches))))
     return SparseMatrix.of(csr_matrix(entries, shape=(count, len(patches))), device=device)
 

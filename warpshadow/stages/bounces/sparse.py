@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
-from scipy.sparse import csr_matrix, sparray, spmatrix
 
 from warpshadow import check
 from warpshadow.device.batch import instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix, sparray, spmatrix
 
 _ITEM_COST = 2.0
 """Nanoseconds that an entry takes."""
@@ -43,6 +45,8 @@ class SparseMatrix:
     @staticmethod
     def of(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
         """Give a matrix of SciPy, or NumPy, to a device, without its zeros."""
+        from scipy.sparse import csr_matrix
+
         by_rows = csr_matrix(matrix)
         return SparseMatrix(by_rows.shape, _rows(by_rows, device), _rows(by_rows.T.tocsr(), device))
 
