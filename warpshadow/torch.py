@@ -382,7 +382,7 @@ class _Arguments:
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
-        self._moving: dict[str, tuple[int, ...] | None] = {}  # of geometries
+        self._bodies: dict[str, dict[str, Any]] = {}  # of geometries, those that move and those that are deformed
 
     def add(
         self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...], meaning: str = ""
@@ -404,15 +404,19 @@ class _Arguments:
     def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> None:
         """Add the tensors of a geometry, of which arrays there are as many items as of another."""
         geometry, own = as_geometry(name, geometry), like.arrays()
-        self._moving[name] = geometry.moving
+        self._bodies[name] = {"moving": geometry.moving, "deformed": geometry.deformed}
         for part, tensor in geometry.arrays().items():
             self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:])
+        if geometry.rotations is not None:
+            assert like.rotations is not None
+            self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
 
     def geometry(self, name: str, arrays: Mapping[str, wp.array]) -> Geometry[wp.array] | None:
         """A geometry that was added, of arrays; None if none was."""
-        if name not in self._moving:
+        if name not in self._bodies:
             return None
-        return Geometry(*(arrays[f"{name}.{part}"] for part in GEOMETRY_DTYPES), moving=self._moving[name])
+        parts = (arrays[f"{name}.{part}"] for part in GEOMETRY_DTYPES)
+        return Geometry(*parts, rotations=arrays.get(f"{name}.rotations"), **self._bodies[name])
 
     def arrays(self) -> dict[str, wp.array]:
         """The tensors as arrays, which require a gradient as they do."""
@@ -443,9 +447,18 @@ class _Arguments:
 
         def make(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
             made.append(function(arrays))
-            return tuple(made[0].arrays().values())
+            rotations = made[0].rotations
+            return (*made[0].arrays().values(), *([] if rotations is None else [rotations]))
 
-        return Geometry(*self.apply(make), moving=made[0].moving)
+        positions, centers, radii, *rotations = self.apply(make)
+        return Geometry(
+            positions,
+            centers,
+            radii,
+            moving=made[0].moving,
+            rotations=rotations[0] if rotations else None,
+            deformed=made[0].deformed,
+        )
 
     def _common_batch(self) -> int:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})

@@ -458,9 +458,12 @@ SHADOWS = ("static shadows", VISIBILITY)
 def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     """The stage that a kernel with some inputs belongs to; None for copies, and for poses, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
-    if module in ("device.batch", "stages.poses"):
+    if module in ("device.batch", "stages.poses", "stages.own_shadows.sites"):
         return None
-    if module.startswith("stages.visibility") or module == "stages.ray_tracing" or key == "_add_rows":
+    if module in ("stages.own_shadows.trace", "stages.own_shadows.lookup"):
+        return "own shadows"
+    of_visibility = "stages.visibility", "stages.own_shadows.gather", "stages.ray_tracing"
+    if module.startswith(of_visibility) or key == "_add_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
         after = {
@@ -642,10 +645,10 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
     lines = str(explain()).splitlines()
-    assert [line.split()[0] for line in (lines[0], lines[17])] == ["forward", "backward"]
-    (rasterization,) = (line for line in lines[:17] if "rasterization" in line)
+    assert [line.split()[0] for line in (lines[0], lines[18])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:18] if "rasterization" in line)
     assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
-    (exposure,) = (line for line in lines[17:] if "exposure" in line)
+    (exposure,) = (line for line in lines[18:] if "exposure" in line)
     assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
     assert "2,304 samples" in exposure
 

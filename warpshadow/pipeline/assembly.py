@@ -33,25 +33,33 @@ class Geometry(Generic[Array]):
         radii: Spheres' radii [scene units], float32 of shape [batch, sphere].
         moving: Bodies that differ from the scene's, from 0; None where any may. The others are the same in every
             instance, and no gradient to them is asked for.
+        rotations: How each body is turned from its mesh, mat33 of shape [batch, body]; None where that is not known.
+            Whoever changes the shape of a body in another way than by :meth:`Renderer.deformed` leaves them out.
+        deformed: Bodies whose shape is not that of their mesh, from 0.
     """
 
     positions: Array
     centers: Array
     radii: Array
     moving: tuple[int, ...] | None = field(default=None, kw_only=True)
+    rotations: Array | None = field(default=None, kw_only=True)
+    deformed: tuple[int, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Hold the bodies that move in order."""
+        """Hold the bodies in order."""
         if self.moving is not None:
             object.__setattr__(self, "moving", tuple(sorted(set(self.moving))))
+        object.__setattr__(self, "deformed", tuple(sorted(set(self.deformed))))
 
     def arrays(self) -> dict[str, Array]:
-        """The three arrays by their names."""
+        """The arrays of what bodies consist of, by their names."""
         return {"positions": self.positions, "centers": self.centers, "radii": self.radii}
 
     def map(self, function: Callable[[Array], Other]) -> "Geometry[Other]":
         """The geometry of what a function makes of each array."""
-        return Geometry(*map(function, self.arrays().values()), moving=self.moving)
+        rotations = None if self.rotations is None else function(self.rotations)
+        arrays = map(function, self.arrays().values())
+        return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
 
 
 GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32}
@@ -178,6 +186,7 @@ class Assembly:
             self._array(centers[None], wp.vec3),
             self._array(radii[None], wp.float32),
             moving=(),
+            rotations=self._array(np.tile(np.eye(3), (1, len(self.scene.bodies), 1, 1)), wp.mat33),
         )
 
     @functools.cached_property
@@ -204,15 +213,22 @@ class Assembly:
         rest = self.rest if rest is None else as_geometry("rest", rest)
         check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
         numbers = None if moving is None else self.scene.body_numbers(moving, "moving")
+        turned = None if rest.rotations is None else poses.turned(rest.rotations)
         if numbers is None or rest.moving is None:
             return Geometry(
                 poses.points(rest.positions, self._vertex_bodies),
                 poses.points(rest.centers, self._sphere_bodies),
                 poses.radii(rest.radii, self._sphere_bodies),
+                rotations=turned,
+                deformed=rest.deformed,
             )
         bodies = {*numbers, *rest.moving}
         vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
         still = self.scene_geometry
+        if turned is not None:
+            assert still.rotations is not None
+            every, given = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
+            turned = exchanged(still.rotations, every, lambda a, b: given[:, a:b])
         return Geometry(
             exchanged(
                 still.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
@@ -222,6 +238,8 @@ class Assembly:
             ),
             exchanged(still.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
             moving=tuple(bodies),
+            rotations=turned,
+            deformed=rest.deformed,
         )
 
     def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
@@ -279,6 +297,8 @@ class Assembly:
             _spliced("centers", rest.centers, centers, first_sphere),
             _spliced("radii", rest.radii, radii, first_sphere),
             moving=None if rest.moving is None else (*rest.moving, number),
+            rotations=None if rest.rotations is None else exchanged(rest.rotations, [], lambda *_: rest.rotations),
+            deformed=(*rest.deformed, number),
         )
 
     @property

@@ -16,6 +16,7 @@ from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.own_shadows.gather import gather_own, multiply
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
@@ -27,10 +28,13 @@ class Cells(NamedTuple):
 
     directions: np.ndarray  # [direction, 3]
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
+    spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
 
 
 class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
+
+    traces_own = True
 
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(assembly.scene.visibility.directions)
@@ -40,10 +44,10 @@ class Directional(SphereMethod):
     def in_known(self, light: KnownLight) -> Cells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
         if isinstance(light, EnvironmentMap):
-            coefficients, directions, _ = light.cells(self._directions)
+            coefficients, directions, spreads = light.cells(self._directions)
         else:
-            coefficients, directions = self.own_basis.coefficients(light), self._directions
-        return Cells(directions, wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device))
+            coefficients, directions, spreads = self.own_basis.coefficients(light), self._directions, None
+        return Cells(directions, wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device), spreads)
 
     def coefficient_count(self, light: Source | None) -> int:
         """Number of coefficients that take part: all."""
@@ -52,17 +56,25 @@ class Directional(SphereMethod):
     def see(self, group: Group, light: Cells) -> Seen:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
         points, normals, centers, radii, kept = group[:5]
+        own = self._see_own(group)
         if not (radii.shape[1] and points.size):
-            full = wp.full((*points.shape, len(light.directions)), 1.0, dtype=wp.float32, device=points.device)
-            return Seen(full)
+            shape = *points.shape, len(light.directions)
+            return Seen(wp.full(shape, 1.0, dtype=wp.float32, device=points.device) if own is None else own, own)
         softness, merging = self.visibility.softness, self.visibility.merging
         # kept cells have light although their middles are below the horizon
         facing = normals if kept is None else None
-        return Seen(
-            directional.transmittance(
-                points, facing, centers, radii, light.directions, softness=softness, merging=merging
-            )
+        passing = directional.transmittance(
+            points, facing, centers, radii, light.directions, softness=softness, merging=merging
         )
+        return Seen(passing if own is None else multiply(own, passing), own)
+
+    def _see_own(self, group: Group) -> wp.array | None:
+        """What receivers see past their own body."""
+        if group.own is None or not group.points.size:
+            return None
+        assert group.places is not None
+        rows, lookup, supports = group.own
+        return gather_own(group.normals, group.places, lookup, supports, rows)
 
     def transfer(self, seen: Seen, group: Group, light: Cells) -> wp.array:
         """Transfer vectors; the transmittance as it is where kept cells hold known light."""

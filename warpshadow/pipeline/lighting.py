@@ -15,7 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
-from warpshadow.pipeline.own_shadows import OwnShadows
+from warpshadow.pipeline.own_shadows import NOT_TRACED, OwnLookup, OwnShadows, Traced
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows
@@ -47,6 +47,7 @@ class LitPoints:
         call: Has what of them may not be kept.
         static: The static bodies among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
+        traced: The bodies whose own spheres do not block their light.
     """
 
     def __init__(
@@ -59,7 +60,9 @@ class LitPoints:
         call: Call,
         static: Static | None = None,
         normals: Node | None = None,
+        traced: Traced = NOT_TRACED,
     ):
+        self.traced = traced
         self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
@@ -124,6 +127,9 @@ class Method:
     lights_samples = False
     """Whether every sample is a receiver, whatever its body says."""
 
+    traces_own = False
+    """Whether bodies' shadows on themselves may come from rays, where the others' come from spheres."""
+
     can_bounce = False
     """Whether it finds light that bounces."""
 
@@ -132,6 +138,7 @@ class Method:
         self.basis = own_basis if basis is None else basis
         self.visibility = assembly.scene.visibility
         self.light = Source("light", assembly.scene.light)
+        self._numberings: dict[tuple[int, ...], list[Numbering]] = {}
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
@@ -145,10 +152,27 @@ class Method:
         return np.stack([receives[body_of_vertex], (receives & self.assembly.is_two_sided)[body_of_vertex]])
 
     @functools.cached_property
-    def numberings(self) -> tuple[Numbering, Numbering]:
-        """Of all vertices, and of all with their backs; a first call makes both, so that a capture finds them."""
-        faces, can_receive = self.assembly.faces, self.can_receive
-        return number_receivers(faces, can_receive[:1]), number_receivers(faces, can_receive)
+    def own(self) -> OwnShadows:
+        """The bodies' shadows on themselves, from rays."""
+        return OwnShadows(self.assembly, self.samples_receive, progress=self.progress)
+
+    def apart(self, traced: Traced) -> np.ndarray | None:
+        """Bodies whose receivers are groups of their own, −1 for others, shape [body]; None where all share a group."""
+        bodies = np.arange(len(self.assembly.scene.bodies))
+        if self.assembly.scene.bounces:
+            return bodies
+        if not traced.bodies:
+            return None
+        return np.where(np.isin(bodies, traced.bodies), bodies, -1)
+
+    def numbering(self, traced: Traced, has_backs: bool) -> Numbering:
+        """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
+        if traced.bodies not in self._numberings:
+            faces, can_receive, apart = self.assembly.faces, self.can_receive, self.apart(traced)
+            bodies = None if apart is None else apart[self.assembly.body_of_vertex]
+            sides = can_receive[:1], can_receive
+            self._numberings[traced.bodies] = [number_receivers(faces, each, bodies=bodies) for each in sides]
+        return self._numberings[traced.bodies][has_backs]
 
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
@@ -217,18 +241,21 @@ class Group(NamedTuple):
     kept: KeptRows | None = None  # of static bodies, which block their light, too
     body: int | None = None  # whose receivers they are, where bodies are told apart
     places: Places | None = None  # where they lie on that body
+    own: OwnLookup | None = None  # what they see past it, if that is not up to its spheres; None for all
 
     def parts(self) -> Iterator["Group"]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept, _, places = self
+        points, normals, centers, radii, kept, _, places, _ = self
         size = points.shape[1]
-        if radii.shape[1]:
-            count = common_batch({"points": points, "centers": centers, "radii": radii})
+        turns = None if self.own is None else self.own.lookup.counts
+        if radii.shape[1] or turns is not None:
+            count = common_batch({"points": points, "centers": centers, "radii": radii, "rotations": turns})
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
-        if kept is not None or size <= PART or varies(self[:4]):
+        varying = [*self[:4], *([] if self.own is None else [self.own.lookup.weights])]
+        if kept is not None or size <= PART or varies(varying):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
             return
         for start in range(0, size, PART):
@@ -299,11 +326,6 @@ class SphereMethod(Method):
         raise NotImplementedError
 
     @functools.cached_property
-    def own(self) -> OwnShadows:
-        """The bodies' shadows on themselves."""
-        return OwnShadows(self.assembly, self.samples_receive)
-
-    @functools.cached_property
     def _in_scene_light(self) -> Node:
         return Node("", self.in_known, self.light)
 
@@ -358,14 +380,16 @@ class InParts(Node):
         beside: tuple[Node, ...] = (),
     ):
         self._static, self._finish, self._progress = points.static, finish, method.progress and light is not None
-        self._method = method
+        self._method, self._points = method, points
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
+        own_shadows = _own_shadows(method, points, own)
         self._visibility = Node(
             f"visibility{where}",
             method.see,
             receivers,
             spheres,
             own,
+            own_shadows,
             items=lambda: _pairs(method, points),
             idle=lambda: _why_unblocked(method, points),
             keeps=False,
@@ -384,15 +408,16 @@ class InParts(Node):
             self._shading = result = Node(f"shading{where}", method.light_part, *given, items=words, keeps=False)
         shadows = _static_shadows(method, points, light)
         kept = shadows if shadows.function else None
-        given = receivers, spheres, own, kept, *extra
-        super().__init__("", None, *given, beside=(shadows, result, *beside), keeps=keeps)
+        looked_up: Node | dict = own_shadows if own_shadows.function else {}
+        given = receivers, spheres, own, kept, looked_up, *extra
+        super().__init__("", None, *given, beside=(own_shadows, shadows, result, *beside), keeps=keeps)
 
     def compute(self, call: Call) -> Any:
         """Find it for one part after another."""
         from tqdm import tqdm
 
-        receivers, spheres, own, kept, *extra = self.values(call)
-        groups = list(self._groups(receivers, spheres))
+        receivers, spheres, own, kept, looked_up, *extra = self.values(call)
+        groups = list(self._groups(receivers, spheres, looked_up))
         if self._static is not None and len(receivers.still):
             on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
             group = Group(*on_static, *self._static.moving_spheres(spheres), kept)
@@ -418,22 +443,23 @@ class InParts(Node):
         transfer = self._transfer.run(call, seen, part, own)
         return transfer if self._shading is None else self._shading.run(call, transfer, part, own)
 
-    def _groups(self, receivers: Receivers, spheres: tuple[wp.array, wp.array]) -> Iterator[Group]:
+    def _groups(
+        self, receivers: Receivers, spheres: tuple[wp.array, wp.array], looked_up: dict[int, OwnLookup]
+    ) -> Iterator[Group]:
         """Receivers that may move, in groups that the same spheres block."""
-        bodies = [body for body in range(len(self._method.assembly.scene.bodies)) if body not in self._method.flats]
+        method = self._method
+        bodies = [body for body in range(len(method.assembly.scene.bodies)) if body not in method.flats]
         if not receivers.spans:
-            yield Group(receivers.points, receivers.normals, *self._method.assembly.spheres_of(bodies, spheres))
+            yield Group(receivers.points, receivers.normals, *method.assembly.spheres_of(bodies, spheres))
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
-            if span.body < 0:
-                yield Group(points, normals, *self._method.assembly.spheres_of(bodies, spheres))
-                continue
-            others = [body for body in bodies if body != span.body]
-            blocking, places = (
-                self._method.assembly.spheres_of(others, spheres),
-                self._method.own.places(receivers, span),
-            )
-            yield Group(points, normals, *blocking, body=span.body, places=places)
+            is_traced = span.body in self._points.traced.bodies
+            others = [body for body in bodies if not (is_traced and body == span.body)]
+            group = Group(points, normals, *method.assembly.spheres_of(others, spheres))
+            if span.body >= 0:
+                places, own = method.own.places(receivers, span), looked_up.get(span.body)
+                group = group._replace(body=span.body, places=places, own=own)
+            yield group
 
 
 def _pairs(method: SphereMethod, points: LitPoints) -> str:
@@ -454,6 +480,30 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     if moving or (points.static and static and (method.joins_kept or counts[list(points.static.moving)].sum())):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
+
+
+def _own_shadows(method: SphereMethod, points: LitPoints, light: Any) -> Node:
+    """Node of what bodies' receivers look up of their own bodies, by body."""
+    bodies, rotations, _ = points.traced
+    named = [body for body in bodies if not method.own.is_flat[body]]
+    if not named or rotations is None:
+        return Node("own shadows", None, idle=lambda: _why_no_own(method, points))
+
+    def traced() -> str:
+        missing = method.own.missing(bodies)
+        state = f"{missing} to be traced, or read from the cache" if missing else "traced once, kept"
+        return f"{len(named)} {'body' if len(named) == 1 else 'bodies'}: {state}"
+
+    return Node("own shadows", functools.partial(method.own.lookups, bodies), rotations, light, items=traced)
+
+
+def _why_no_own(method: SphereMethod, points: LitPoints) -> str:
+    """Why no body's shadow on itself is looked up."""
+    if not method.traces_own:
+        return "the method takes those of spheres"
+    names = [body.called for body in method.assembly.scene.bodies]
+    whys = {name: why for name, why in zip(names, points.traced.why, strict=False) if why}
+    return "; ".join(f"{name}: {why}" for name, why in whys.items()) or "bodies are flat"
 
 
 def _static_shadows(method: SphereMethod, points: LitPoints, light: Source | None) -> Node:

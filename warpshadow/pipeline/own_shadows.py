@@ -1,14 +1,58 @@
-"""Own shadows: which bodies have their shadows on themselves from rays, and what is kept of them."""
+"""Own shadows: which bodies have their shadows on themselves from rays, and what is kept of them.
+
+What a rigid body blocks of its own light does not change in its own frame. So rays find it once, and it is kept on disk
+beside the spheres that are fitted to the mesh. Other bodies' spheres block their shares of what it leaves.
+"""
+
+import functools
+import hashlib
+import json
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
-from warpshadow.pipeline.assembly import Assembly
+from warpshadow.device.tape import unrecorded
+from warpshadow.pipeline.assembly import Assembly, Geometry
+from warpshadow.pipeline.node import Source
+from warpshadow.spheres.cache import cache_path, remembered
+from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.own_shadows.lookup import Lookup, Supports, find_lookups, find_supports
 from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, cuts_of, find_sites
+from warpshadow.stages.own_shadows.trace import RAYS, OwnRows, ray_count, trace_rows
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers, Span
+
+VERSION = 1
+"""Part of the key of cached rows: raise it whenever they would come out differently."""
+
+_FLAT = 1.0e-5
+"""Thickness of a flat body, as a part of its size."""
+
+
+class Traced(NamedTuple):
+    """The bodies of a geometry whose own spheres do not block their light, and how bodies are turned."""
+
+    bodies: tuple[int, ...] = ()
+    rotations: Source | None = None
+    why: tuple[str, ...] = ()  # the others' do, of each body
+
+
+NOT_TRACED = Traced()
+"""All bodies are blocked by their spheres."""
+
+
+class OwnLookup(NamedTuple):
+    """What receivers of a body look up of it."""
+
+    rows: OwnRows
+    lookup: Lookup
+    supports: Supports
 
 
 class OwnShadows:
@@ -17,23 +61,54 @@ class OwnShadows:
     Args:
         assembly: The bodies.
         samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have sites within faces.
-
-    Attributes:
-        is_traced: Bodies whose own spheres do not block them, bool of shape [body].
+        progress: Show progress where something takes longer than a second.
     """
 
-    def __init__(self, assembly: Assembly, samples_receive: np.ndarray):
-        self._assembly, self._samples_receive = assembly, samples_receive
-        self.is_traced = np.zeros(len(samples_receive), bool)
+    def __init__(self, assembly: Assembly, samples_receive: np.ndarray, *, progress: bool = False):
+        self._assembly, self._samples_receive, self._progress = assembly, samples_receive, progress
+        self._sites: dict[int, Sites] = {}
         self._tables: dict[int, SiteTable] = {}
+        self._rows: dict[int, OwnRows] = {}
+
+    # ------------------------------------------------------------------------------------------ which bodies
+
+    def traced(self, geometry: Geometry | None, rotations: Source | None) -> Traced:
+        """The bodies of a geometry, by default the scene's, whose own spheres do not block their light."""
+        why = tuple(self._why_spheres(body, geometry) for body in range(len(self._samples_receive)))
+        return Traced(tuple(body for body, reason in enumerate(why) if not reason), rotations, why)
+
+    def _why_spheres(self, body: int, geometry: Geometry | None) -> str:
+        """Why a body's own spheres block its light in a geometry, by default the scene's; empty if they do not."""
+        scene = self._assembly.scene
+        if not scene.bodies[body].casts_shadow:
+            return "it casts no shadow"
+        if (scene.bodies[body].self_shadows or scene.visibility.self_shadows) == "spheres":
+            return 'self_shadows = "spheres"'
+        if geometry is not None and body in geometry.deformed:
+            return "its shape is free"
+        if geometry is not None and geometry.rotations is None:
+            return "geometry has no rotations"
+        return ""
+
+    @functools.cached_property
+    def is_flat(self) -> np.ndarray:
+        """Bodies that lie in a plane, which block none of their own light, bool of shape [body]."""
+        return np.array([_is_flat(body.mesh) for body in self._assembly.scene.bodies])
+
+    # ------------------------------------------------------------------------------------------ where
 
     def sites(self, body: int) -> Sites:
-        """The sites of a body in its own space."""
-        mesh = self._assembly.scene.bodies[body].mesh
-        faces = mesh.surface.faces
-        points = wp.array(mesh.positions[None], dtype=wp.vec3, device=self._assembly.device)
-        normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=points.device)).numpy()[0]
-        return find_sites(mesh.positions, normals, faces, cuts_of(len(faces)) if self._samples_receive[body] else 1)
+        """The sites of a body, in the frame of its fit."""
+        if body not in self._sites:
+            mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
+            faces = mesh.surface.faces
+            used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
+            positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
+            points = wp.array(positions[None], dtype=wp.vec3, device=device)
+            normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
+            cuts = cuts_of(len(faces)) if self._samples_receive[body] else 1
+            self._sites[body] = find_sites(positions, normals, faces, cuts)
+        return self._sites[body]
 
     def places(self, receivers: Receivers, span: Span) -> Places:
         """Where receivers of a body lie among its sites. Differentiable: barycentrics of samples."""
@@ -59,3 +134,70 @@ class OwnShadows:
                 sites.cuts,
             )
         return self._tables[body]
+
+    # ------------------------------------------------------------------------------------------ what
+
+    def lookups(self, bodies: tuple[int, ...], rotations: wp.array, light: Any) -> dict[int, OwnLookup]:
+        """What receivers of bodies look up of them, for the cells of some light. Differentiable: rotations."""
+        found = {}
+        for body in bodies:
+            if not self.is_flat[body]:
+                rows = self.rows(body)
+                supports = find_supports(light.directions, light.spreads, rows.ray_count, rotations.device)
+                found[body] = OwnLookup(rows, find_lookups(rotations, body, supports), supports)
+        return found
+
+    def missing(self, bodies: tuple[int, ...]) -> int:
+        """Number of bodies, of some, of which nothing is in memory yet."""
+        return sum(not (self.is_flat[body] or body in self._rows) for body in bodies)
+
+    def _row_count(self, body: int) -> int:
+        return len(self.sites(body).positions) * (1 + bool(self._assembly.is_two_sided[body]))
+
+    def rows(self, body: int) -> OwnRows:
+        """What the sites of a body see past it: in memory, on disk, or traced."""
+        if body not in self._rows:
+            mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
+            sites, faces = self.sites(body), mesh.surface.faces
+            count = ray_count(self._row_count(body))
+            if count < RAYS:
+                warnings.warn(
+                    f"body {body} ({mesh.name!r}): {len(sites.positions):,} points have {count} rays each for the "
+                    f"body's shadow on itself, in place of {RAYS}, which would take too much memory",
+                    stacklevel=2,
+                )
+            numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
+            key = hashlib.sha256(json.dumps(numbers).encode())
+            key.update(sites.positions[: len(mesh.positions)].tobytes())
+            key.update(np.asarray(faces, np.int32).tobytes())
+
+            def read(stored: Mapping[str, np.ndarray]) -> OwnRows:
+                arrays = (wp.array(stored[name], device=device) for name in OwnRows._fields)
+                found = OwnRows(*arrays)
+                if found.bits.shape != (self._row_count(body), count // 32):
+                    raise ValueError(f"got bits of shape {found.bits.shape}")
+                return found
+
+            def trace() -> OwnRows:
+                points = wp.array(sites.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
+                whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
+                sides = (1, -1) if self._assembly.is_two_sided[body] else (1,)
+                normals = np.concatenate([side * sites.normals for side in sides])
+                places = np.tile(sites.positions, (len(sides), 1))
+                with unrecorded():
+                    return trace_rows(whole, places, normals, count, progress=self._progress)
+
+            self._rows[body] = remembered(
+                cache_path("own_shadows", key.hexdigest()),
+                read,
+                trace,
+                lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
+                what="own shadow",
+            )
+        return self._rows[body]
+
+
+def _is_flat(mesh: Mesh) -> bool:
+    points = mesh.positions[np.unique(mesh.faces)].astype(np.float64)
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[-1] <= _FLAT * spread[0])

@@ -22,9 +22,10 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.lighting import Light, LitPoints
+from warpshadow.pipeline.lighting import Light, LitPoints, joined
 from warpshadow.pipeline.log_sh import LogSH
 from warpshadow.pipeline.node import Call, Clock, Node, Source
+from warpshadow.pipeline.own_shadows import NOT_TRACED, Traced
 from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
@@ -107,6 +108,7 @@ class Renderer:
         self._vertices = Source("vertices", lambda: self.geometry().positions)
         self._spheres = Source("spheres", lambda: (self.geometry().centers, self.geometry().radii))
         clip_matrices = [camera.clip_matrix() for camera in self.cameras]
+        self._rotations = Source("rotations", lambda: self.geometry().rotations)
         self._cameras = Source("cameras", lambda: wp.array(clip_matrices, dtype=wp.mat44, device=where))
         self._scene_view: View | None = None
         self._last_view: View | None = None
@@ -258,7 +260,7 @@ class Renderer:
             static = self._statics.get(geometry.moving)
             if static is None or not static.are_those_of(geometry):
                 static = Static(self.assembly, geometry)
-        given = vertices, spheres, cameras, static
+        given = vertices, spheres, cameras, static, self._traced(geometry, last)
         for view in (self._scene_view, last):
             if view is not None and view.given == given:
                 return view
@@ -270,6 +272,16 @@ class Renderer:
             camera=self.cameras[0],
             counts=(len(poses), image_count),
         )
+
+    def _traced(self, geometry: Geometry | None, last: LitPoints | None = None) -> Traced:
+        """The bodies of a geometry, by default the scene's, whose own spheres do not block their light."""
+        if not self._method.traces_own:
+            return NOT_TRACED
+        rotations = self._rotations
+        if geometry is not None and geometry.rotations is not None:
+            check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
+            rotations = Source.renewed("rotations", geometry.rotations, last.traced.rotations if last else None)
+        return self._method.own.traced(geometry, rotations)
 
     def _call(self, view: LitPoints | None = None) -> Call:
         """A call, which knows what was computed of a view."""
@@ -343,7 +355,12 @@ class Renderer:
         Cameras share the receivers at vertices, for which there is one view. Not to be written to.
         """
         view = self._own_view
-        return view.transfers.value(self._call(view))[-1]
+        parts = view.transfers.value(self._call(view))
+        if len(parts) == 1:
+            return parts[0]
+        count = parts[0].shape[2]
+        rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
+        return rows.reshape((rows.shape[0], -1, count))
 
     @one_at_a_time
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:

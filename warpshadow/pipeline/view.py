@@ -11,6 +11,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
+from warpshadow.pipeline.own_shadows import Traced
 from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
 from warpshadow.stages import film
@@ -35,12 +36,13 @@ class View(LitPoints):
         spheres: Centers and radii of the spheres.
         cameras: Clip matrices.
         static: The static bodies among moving ones; None where any may move.
+        traced: The bodies whose own spheres do not block their light.
         call: Has what may not be kept of it.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
 
     Attributes:
-        given: Vertices, spheres, cameras and static bodies.
+        given: Vertices, spheres, cameras, static bodies and traced ones.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of what is seen.
     """
 
@@ -52,18 +54,20 @@ class View(LitPoints):
         spheres: Source,
         cameras: Source,
         static: Static | None,
+        traced: Traced,
         *,
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
     ):
-        self.given = vertices, spheres, cameras, static
+        self.given = vertices, spheres, cameras, static, traced
+        self._apart = method.apart(traced)
         self.cameras = cameras
         self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, cameras, static)
-        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals)
+        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, traced)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
@@ -103,19 +107,19 @@ class View(LitPoints):
         has_backs = fragments.sides is not None
         keeps_vertex = method.can_receive[: 1 + has_backs]
         is_static = None if self.static is None else self.static.has_vertex
-        of_vertices = of_faces = None
-        if assembly.scene.bounces:
-            of_vertices, of_faces = assembly.body_of_vertex, assembly.body_of_face
+        apart = self._apart
+        bodies = None if apart is None else apart[assembly.body_of_vertex]
         if is_readable(assembly.device):
             keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
-            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order, of_vertices)
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order, bodies)
         elif is_static is None:
-            numbering = method.numberings[has_backs]
+            numbering = method.numbering(self.traced, has_backs)
         else:
-            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, bodies=of_vertices)
+            numbering = number_receivers(assembly.faces, keeps_vertex, is_static, bodies=bodies)
         wants_samples = method.samples_receive[assembly.body_of_face]
+        bodies = None if apart is None else apart[assembly.body_of_face]
         given = positions, normals, assembly.faces, fragments, numbering, wants_samples
-        return find_receivers(*given, bodies=of_faces, across=self._across)
+        return find_receivers(*given, bodies=bodies, across=self._across)
 
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""

@@ -228,6 +228,8 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         table["spheres"] = arrays.name
         written.append(arrays)
     place = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
+    if body.self_shadows is not None:
+        place["self_shadows"] = body.self_shadows
     return table | place | {"receivers": body.receivers}, written
 
 

@@ -30,6 +30,7 @@ READ_BY = {
     "directions": ("directional",),
     "softness": ("directional", AUTO),
     "merging": (*SPHERE_METHODS, AUTO),
+    "self_shadows": ("directional", AUTO),
     "order": ("log-sh", "none", "ray-traced", AUTO),
     "log": ("log-sh",),
     "base": ("log-sh",),
@@ -44,6 +45,8 @@ BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)
 MOST_BOUNCES = 16
 
 RECEIVERS = ("vertex", "pixel")
+
+SELF_SHADOWS = ("traced", "spheres")
 
 SCENE = "a Scene; load_scene(path) reads one"
 """What functions that take a scene say they expect."""
@@ -74,6 +77,8 @@ class Visibility:
         softness: κ of "directional": half-width of a shadow's soft edge in cell radii.
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
             ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
+        self_shadows: What shadows a body casts on itself: those of its mesh, "traced" once by rays wherever its shape
+            is not free, or those of its "spheres". Bodies may say otherwise.
         order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by
             "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
@@ -87,6 +92,7 @@ class Visibility:
     directions: int = 128
     softness: float = SOFTNESS
     merging: float = MERGING
+    self_shadows: str = "spheres"
     order: int = 8
     log: str = "eigen"
     base: str = "quadratic"
@@ -110,6 +116,7 @@ class Visibility:
         sh.check_order(self.order)
         check.choice("log", self.log, LOGS)
         check.choice("base", self.base, THRESHOLDS)
+        check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         check.whole("samples", self.samples, what="directions")
         if not (check.is_number(self.error) and self.error > 0):
             raise ValueError(f"error: got {self.error!r}, expected a positive number such as 0.05, which is 5%")
@@ -149,6 +156,8 @@ class Body:
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow.
+        self_shadows: What shadows it casts on itself, "traced" or of its "spheres", as for :class:`Visibility`; None
+            for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
     """
 
@@ -161,6 +170,7 @@ class Body:
     scale: float
     receivers: str
     name: str | None
+    self_shadows: str | None
 
     def __init__(
         self,
@@ -173,9 +183,11 @@ class Body:
         scale: float = 1.0,
         receivers: str = "vertex",
         name: str | None = None,
+        self_shadows: str | None = None,
     ):
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
+        vars(self).update(self_shadows=self_shadows)
         self._read_files()
         expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
@@ -198,6 +210,8 @@ class Body:
                 "axes; mesh.transformed(scale=(x, y, z)) stretches a mesh"
             )
         check.choice("receivers", self.receivers, RECEIVERS)
+        if self.self_shadows is not None:
+            check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         if self.name is not None and not (isinstance(self.name, str) and self.name):
             raise ValueError(f"name: got {check.described(self.name)}, expected a name, or None for the mesh's")
 

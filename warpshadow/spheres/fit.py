@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,14 +16,14 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets import files
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import compact_order
+from warpshadow.spheres.cache import cache_path, remembered
 from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.measure import FitReport, measure
-from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
@@ -114,14 +112,10 @@ def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_Job, np
     faces = np.asarray(mesh.faces, np.int32)
     used, renumbered = np.unique(faces, return_inverse=True)
     positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
     corners = positions[faces]
     if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
-
-    # the grid makes the normalized mesh, and so the fit and its cache key, independent of float32 rounding
-    normalized = (np.round((positions - middle) / diagonal * 2**18) / 2**18).astype(np.float32)
+    normalized, middle, diagonal = normalize(positions)
     return _Job(normalized, faces, seed, steps, device), middle, diagonal
 
 
@@ -197,35 +191,18 @@ def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
 
 
 def _cache_path(job: _Job, count: int) -> Path:
-    """Where a fit is kept: under WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
-    from platformdirs import user_cache_path
-
-    override = os.environ.get("WARPSHADOW_CACHE_DIR")
-    folder = Path(override) if override else user_cache_path("warpshadow", appauthor=False, opinion=False)
-    return folder / "spheres" / f"{job.key(count)}.npz"
+    return cache_path("spheres", job.key(count))
 
 
 def _cached_fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
-    """Read a fit from the cache, or make it and write it there; a second process that wants the same waits for it."""
-    path = _cache_path(job, count)
-    with contextlib.ExitStack() as held:
-        if not path.exists():
-            with contextlib.suppress(OSError):  # of a folder that cannot be written to
-                path.parent.mkdir(parents=True, exist_ok=True)
-                held.enter_context(files.locked(path))
-        if path.exists():
-            try:
-                with np.load(path, allow_pickle=False) as stored:
-                    spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
-                check.shape("spheres", spheres.shape, (report.sphere_count, 4))
-                return spheres, replace(report, cached=True)
-            except Exception as problem:  # whatever a damaged file raises: a fit can always be made again
-                warnings.warn(f"cached fit {path} cannot be read ({problem}); fitting again", stacklevel=4)
-        spheres, report = _fit(job, progress, count)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with files.whole(path) as unfinished:
-                np.savez(unfinished, spheres=spheres, report=json.dumps(asdict(report)))
-        except OSError as problem:
-            warnings.warn(f"the fit could not be cached in {path.parent} ({problem})", stacklevel=4)
-    return spheres, report
+    """Read a fit from the cache, or make it and write it there."""
+
+    def read(stored: Mapping[str, np.ndarray]) -> tuple[np.ndarray, FitReport]:
+        spheres, report = stored["spheres"], FitReport(**json.loads(str(stored["report"])))
+        check.shape("spheres", spheres.shape, (report.sphere_count, 4))
+        return spheres, replace(report, cached=True)
+
+    def arrays(fit: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
+        return {"spheres": fit[0], "report": np.array(json.dumps(asdict(fit[1])))}
+
+    return remembered(_cache_path(job, count), read, partial(_fit, job, progress, count), arrays, what="fit")

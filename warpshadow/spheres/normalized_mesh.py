@@ -33,6 +33,19 @@ def _signed_distances(
     slopes[i] = slope
 
 
+def normalize(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Take vertices [vertex, 3] to the frame of the fit, onto a grid so fine that no shadow changes.
+
+    So what is found there, and the key that it is kept by, are the same wherever the mesh is and however large.
+
+    Returns:
+        Vertices of float32, the middle of the bounds, and their diagonal.
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    return (np.round((positions - middle) / diagonal * 2**18) / 2**18).astype(np.float32), middle, diagonal
+
+
 class NormalizedMesh:
     """A mesh in the frame of the fit, ready to be sampled and queried; open meshes, too.
 

@@ -45,6 +45,20 @@ def _pose_radii(
     posed[batch, sphere] = scale * rest[instance_in(batch, rest.shape[0]), sphere]
 
 
+@wp.kernel
+def _turn(
+    # in
+    rest: wp.array2d(dtype=wp.mat33),
+    rotations: wp.array2d(dtype=wp.mat33),
+    # out
+    turned: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a body of an instance."""
+    batch, body = wp.tid()
+    at_rest = rest[instance_in(batch, rest.shape[0]), body]
+    turned[batch, body] = rotations[instance_in(batch, rotations.shape[0]), body] * at_rest
+
+
 @dataclass(frozen=True)
 class Poses:
     """Similarities x → s R x + t of every body of every instance.
@@ -94,6 +108,13 @@ class Poses:
         posed = wp.empty(self._shape(rest, bodies), dtype=wp.float32, device=rest.device)
         launch(_pose_radii, posed.shape, inputs=[rest, bodies, self.scales], outputs=[posed])
         return posed
+
+    def turned(self, rest: wp.array) -> wp.array:
+        """Turn bodies that are turned already, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
+        count = common_batch({"rest": rest, "rotations": self.rotations})
+        turned = wp.empty((count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
+        launch(_turn, turned.shape, inputs=[rest, self.rotations], outputs=[turned])
+        return turned
 
     def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
         """Shape of what moves."""

@@ -1,0 +1,63 @@
+"""What takes long to find is kept on disk, by a hash of all that it depends on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from warpshadow.assets import files
+
+Item = TypeVar("Item")
+
+
+def cache_path(kind: str, key: str) -> Path:
+    """Where something is kept: under WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
+    from platformdirs import user_cache_path
+
+    override = os.environ.get("WARPSHADOW_CACHE_DIR")
+    folder = Path(override) if override else user_cache_path("warpshadow", appauthor=False, opinion=False)
+    return folder / kind / f"{key}.npz"
+
+
+def remembered(
+    path: Path,
+    read: Callable[[Mapping[str, np.ndarray]], Item],
+    make: Callable[[], Item],
+    arrays: Callable[[Item], Mapping[str, np.ndarray]],
+    *,
+    what: str,
+) -> Item:
+    """Read something from the cache, or make it and write it there; a second process that wants it, too, waits for it.
+
+    Args:
+        path: From :func:`cache_path`.
+        read: Makes it of the arrays in the file.
+        make: Makes it anew.
+        arrays: The arrays that are kept of it.
+        what: What it is, for warnings, such as "fit".
+    """
+    with contextlib.ExitStack() as held:
+        if not path.exists():
+            with contextlib.suppress(OSError):  # of a folder that cannot be written to
+                path.parent.mkdir(parents=True, exist_ok=True)
+                held.enter_context(files.locked(path))
+        if path.exists():
+            try:
+                with np.load(path, allow_pickle=False) as stored:
+                    return read(stored)
+            except Exception as problem:  # whatever a damaged file raises: it can always be made again
+                warnings.warn(f"cached {what} {path} cannot be read ({problem}); it is made again", stacklevel=5)
+        made = make()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with files.whole(path) as unfinished:
+                np.savez(unfinished, allow_pickle=False, **arrays(made))
+        except OSError as problem:
+            warnings.warn(f"the {what} could not be cached in {path.parent} ({problem})", stacklevel=5)
+    return made
