@@ -21,6 +21,15 @@ def check_count(name: str, count: int) -> None:
         raise ValueError(f"{name}: got {count!r}, expected a positive multiple of {CHUNK}")
 
 
+def check_directions(directions: np.ndarray) -> None:
+    """Raise ValueError unless ``directions`` are unit vectors [direction, 3] for which there are cells."""
+    check.shape("directions", directions.shape, ("direction", 3))
+    check_count("directions", len(directions))
+    check.finite("directions", directions)
+    if not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
+        raise ValueError("directions: got vectors of other lengths, expected unit vectors")
+
+
 @functools.cache
 def fibonacci(count: int) -> np.ndarray:
     """Fibonacci directions z = 1 − (2i+1)/Q, φ = π(1+√5)(i+½), ordered so that each run of 4, 8, 16, … is compact.

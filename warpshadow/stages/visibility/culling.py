@@ -15,6 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.stages.visibility.cones import BLEND
+from warpshadow.stages.visibility.walk import ALL, receivers_type
 
 REACH = 1.001 + BLEND
 """Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
@@ -101,3 +102,53 @@ def make_rises(has_horizon: bool, lanes: int) -> wp.Function:
         return is_up
 
     return rises
+
+
+@functools.cache
+def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
+    """Make the kernel function that lists the bundles of directions that spheres can reach, for the walk.
+
+    Args:
+        has_horizon: Whether receivers have normals.
+        Task: Struct that has
+
+            - ``cells`` and ``first_bundle``: the thread's bundles begin there;
+            - ``ends`` [bundle], int32: the place in the walk from which on nothing matters to a bundle;
+            - ``found`` [2, bundle], int32: bundles that a run, and then a quad, may reach, where they are listed.
+        lanes: Receivers of a group.
+    """
+    Lane, Receivers = lane_type(lanes), receivers_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+
+    @wp.func
+    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
+        """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
+        count = int(0)
+        cells = task.cells
+        if bound[3] > 0.0:
+            reach = REACH * bound[3]
+            away = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
+            distance = sqrt(dot(away, away))
+            is_within = is_any_above(-distance, -reach)
+            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
+            sine = reach * inverse
+            cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
+            cap = widen(scale(inverse, away), cosine, sine, cells.cos_width, cells.sin_width)
+            if is_within or rises(cap, receivers.normals):
+                candidate_count = among
+                if among == ALL:
+                    candidate_count = task.ends.shape[0]
+                for k in range(candidate_count):
+                    bundle = k
+                    if among != ALL:
+                        bundle = task.found[0, k]
+                    at = task.first_bundle + bundle
+                    is_met = task.ends[bundle] > place
+                    if is_met and (is_within or reaches(cap, cells.axes[at], cells.half_angles[at])):
+                        task.found[wp.where(among == ALL, 0, 1), count] = bundle
+                        count += 1
+        return count
+
+    return cull

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpshadow import check
 from warpshadow.device.lanes import (
     group_count,
     lane_count,
@@ -27,13 +26,13 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_count, falloff_width
+from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.culling import (
-    REACH,
     Cells,
     cap_type,
     make_cells,
+    make_cull,
     make_reaches,
     make_rises,
     make_widen,
@@ -41,7 +40,6 @@ from warpshadow.stages.visibility.culling import (
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_adjoint
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres
 from warpshadow.stages.visibility.walk import (
-    ALL,
     make_load_receivers,
     make_spheres,
     make_walk,
@@ -103,46 +101,6 @@ def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_cull(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that lists the bundles of directions that spheres can reach."""
-    Lane, Receivers, Task = lane_type(lanes), receivers_type(lanes), _task_type(lanes)
-    fn = make_lane_functions(lanes)
-    sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
-
-    @wp.func
-    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
-        """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
-        count = int(0)
-        cells = task.cells
-        if bound[3] > 0.0:
-            reach = REACH * bound[3]
-            away = offset(wp.vec3(bound[0], bound[1], bound[2]), receivers.points)
-            distance = sqrt(dot(away, away))
-            is_within = is_any_above(-distance, -reach)
-            inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
-            sine = reach * inverse
-            cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
-            cap = widen(scale(inverse, away), cosine, sine, cells.cos_width, cells.sin_width)
-            if is_within or rises(cap, receivers.normals):
-                candidate_count = among
-                if among == ALL:
-                    candidate_count = task.ends.shape[0]
-                for k in range(candidate_count):
-                    bundle = k
-                    if among != ALL:
-                        bundle = task.found[0, k]
-                    at = task.first_bundle + bundle
-                    is_met = task.ends[bundle] > place
-                    if is_met and (is_within or reaches(cap, cells.axes[at], cells.half_angles[at])):
-                        task.found[wp.where(among == ALL, 0, 1), count] = bundle
-                        count += 1
-        return count
-
-    return cull
-
-
-@functools.cache
 def _make_block(lanes: int) -> wp.Function:
     """Make the kernel function that lets a sphere block its share of what passes towards a bundle of directions."""
     Lane, Task, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
@@ -190,7 +148,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
                 if is_met and not block(cap, slope, opacity, bundle, task):
                     task.ends[bundle] = seen.place + 1
 
-    walk = make_walk(_make_cull(has_horizon, lanes), visit, Task, False, lanes)
+    walk = make_walk(make_cull(has_horizon, Task, lanes), visit, Task, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit(
@@ -300,7 +258,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                 pull.weight = adj_weight
         return pull
 
-    walk = make_walk(_make_cull(has_horizon, lanes), visit, Task, True, lanes)
+    walk = make_walk(make_cull(has_horizon, Task, lanes), visit, Task, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit_adjoint(
@@ -379,11 +337,7 @@ def transmittance(
 
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging.
     """
-    check.shape("directions", directions.shape, ("direction", 3))
-    check_count("directions", len(directions))
-    check.finite("directions", directions)
-    if not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
-        raise ValueError("directions: got vectors of other lengths, expected unit vectors")
+    check_directions(directions)
     width = falloff_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     device = points.device

@@ -114,6 +114,16 @@ def check_merging(merging: float) -> None:
         raise ValueError(f"merging: got {merging!r}, expected 0 (never) to 1 cell radius")
 
 
+def merged_count(sphere_count: int, merging: float) -> int:
+    """Quads that so many spheres merge into, 0 where they do not.
+
+    Raises:
+        ValueError: for ``merging`` out of range.
+    """
+    check_merging(merging)
+    return sphere_count // QUAD if merging > 0 and sphere_count >= MERGED_FROM else 0
+
+
 def merge(centers: wp.array, radii: wp.array) -> Nodes:
     """Merge every four spheres that follow each other; what is left over stays as it is.
 
@@ -140,8 +150,7 @@ def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Nodes
 
     Differentiable: centers, radii.
     """
-    check_merging(merging)
-    if merging > 0 and radii.shape[1] >= MERGED_FROM:
+    if merged_count(radii.shape[1], merging):
         return merge(centers, radii)
     return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
 

@@ -143,6 +143,7 @@ def seen_type(lanes: int) -> Any:
     @wp.struct
     class Seen:
         place: int  # in the walk
+        node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
         cone: Cone  # its weight has the share as a factor
@@ -214,6 +215,7 @@ def make_walk(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: boo
                         if radius > TINY_RADIUS:
                             seen = Seen()
                             seen.place = quad * ITEMS + item
+                            seen.node = node
                             seen.offset = offset(spheres.centers[batch, node], receivers.points)
                             seen.curvature = 1.0 / radius
                             seen.cone = cone(seen.offset, seen.curvature)
