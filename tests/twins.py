@@ -217,6 +217,38 @@ def transmittance(points, centers, radii, directions, softness=0.35):
     return result
 
 
+def blocked_shares(points, centers, radii, directions, softness=0.35):
+    """The share of each cell that each sphere blocks, [vertex, sphere, direction]."""
+    alone = [transmittance(points, centers[s : s + 1], radii[s : s + 1], directions, softness) for s in range(len(radii))]
+    return 1 - np.stack(alone, axis=1)
+
+
+def sphere_exitance(radiosity, normals, areas, patches, directions):
+    """Light and area that the patches of spheres show, [sphere, direction, 4]; ``patches`` lists those of a sphere."""
+    table = np.zeros((len(patches), len(directions), 4))
+    for row, own in zip(table, patches, strict=True):
+        shown = np.maximum(-normals[own] @ directions.T, 0) + 0.01
+        share = areas[own] / areas[own].sum()
+        row[:, 3] = share @ shown if len(own) else 0.25
+        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown, radiosity[own])
+    return table
+
+
+def sphere_light(points, normals, centers, radii, exitance, passing, unblocked, directions, shares=None):
+    """Light of spheres, [vertex, 3]: a weighted mean of what they show in each cell, times what the cell lacks.
+
+    ``shares`` are those of nodes whose centers and radii are given, where spheres merge.
+    """
+    shares = blocked_shares(points, centers, radii, directions) if shares is None else shares
+    distance2 = ((centers - points[:, None]) ** 2).sum(axis=-1)
+    weights = shares / (distance2 + radii**2 / 16)[:, :, None]
+    sums = np.einsum("vsq,sqc->vqc", weights, exitance)
+    is_met = sums[..., 3:] > 0
+    mean = np.where(is_met, sums[..., :3] / np.where(is_met, sums[..., 3:], 1), 0)
+    cosine = np.maximum(normals @ directions.T, 0)
+    return np.einsum("vq,vqc->vc", 4 / len(directions) * cosine * (unblocked - passing), mean)
+
+
 def merged_quads(centers, radii):
     """Centers [quad, 3], radii [quad] and extents [quad] of the spheres of quads: moments by eigenvalues."""
     quads = len(radii) // 4

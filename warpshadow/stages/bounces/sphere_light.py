@@ -1,0 +1,562 @@
+"""Light from spheres: what the bodies that block a receiver's cells send to it in place of what they block.
+
+The spheres that block cell q in part are blended without sorting [McGuire and Bavoil 2013, weighted blended
+order-independent transparency], each by what it blocks, a_jq, and by nearness:
+
+    I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
+    R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq,   w_j = 1 / (d_j² + (r_j/4)²)
+
+T_q is the transmittance past the spheres, F_q that without them, so the light is all that a cell lacks; a_jq are the
+very shares of the transmittance, T_q = F_q Π_j (1 − a_jq); L and S are the light and the area that patches of a sphere
+show (:mod:`warpshadow.stages.bounces.exitance`); d is the distance to a sphere's center, r its radius. R is smooth in
+everything, stays within the radiosities of the patches, and does not depend on the scene's units.
+
+The walk is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
+something is blocked; they are kept from the forward launch: 16 bytes a receiver and cell, touched only in bundles of
+cells that are blocked in part (a seventh of them on a ground around a body). N bounces keep N times that.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.lanes import (
+    group_count,
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    vectors_type,
+)
+from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
+from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone_adjoint
+from warpshadow.stages.visibility.culling import Cells, make_cells, make_cull, make_reaches, make_rises, make_widen
+from warpshadow.stages.visibility.directional import SOFTNESS
+from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_adjoint
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres, merged_count
+from warpshadow.stages.visibility.walk import (
+    make_load_receivers,
+    make_spheres,
+    make_walk,
+    pull_type,
+    receivers_type,
+    seen_type,
+)
+
+_PAIR_COST = 0.15
+"""Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
+
+_CORE = 0.25
+"""Radii within which a sphere's weight hardly grows any more."""
+
+_NEAREST2 = 1.0e-12
+"""The least d² + (r/4)², in squares of the radius of the largest run of spheres: so weights are at most 1e12."""
+
+_LEAST = 1.0e-20
+"""The least denominator of R; spheres that block so little of a cell that they have less leave T at F."""
+
+_SUMS = 4
+"""Σ w a L, of three colors, and Σ w a S."""
+
+
+@functools.cache
+def _task_type(lanes: int) -> Any:
+    """Struct of what a thread works on: a span of bundles of directions."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+
+    @wp.struct
+    class Task:
+        cells: Cells
+        first_bundle: int
+        ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the walk's end
+        found: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
+        sums: wp.array(dtype=Lane)  # [direction · sum] of R
+        pulls: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
+        adj_light: Vectors
+        exitance: wp.array2d(dtype=wp.vec4)  # [node, direction]
+        adj_exitance: wp.array2d(dtype=wp.vec4)
+        inverse_size: float  # of 1/radius of the largest run of spheres
+
+    return Task
+
+
+@functools.cache
+def _make_begin(lanes: int) -> wp.Function:
+    """Make the kernel function that finds out which receivers and directions a thread works on."""
+    Lane, Task = lane_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    find_group, is_any_above, along = fn.find_group, fn.is_any_above, fn.along
+    load_receivers = make_load_receivers(True, lanes)
+
+    @wp.func(inline=False)
+    def begin(
+        row: int,
+        span: int,
+        span_count: int,
+        worker: int,
+        points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
+        spheres: Spheres,
+        cells: Cells,
+        exitance: wp.array3d(dtype=wp.vec4),
+        transmittance: wp.array3d(dtype=wp.float32),
+        unblocked: wp.array3d(dtype=wp.float32),
+        is_kept: bool,
+        scratch: wp.array3d(dtype=Lane),
+        found: wp.array3d(dtype=wp.int32),
+        sums: wp.array2d(dtype=Lane),
+    ):
+        batch, group = find_group(row, points.shape[1])
+        receivers = load_receivers(points, normals, batch, group)
+        item = row * span_count + span
+        place = scratch_place(worker, item)
+        task = Task()
+        task.cells = cells
+        task.first_bundle = span * (scratch.shape[2] // BUNDLE)
+        task.found = found[place]
+        task.ends = found[place, 2]
+        task.blocked = scratch[place, 0]
+        task.pulls = scratch[place, 1]
+        task.sums = sums[wp.where(is_kept, item, place)]
+        task.exitance = exitance[instance_in(batch, exitance.shape[0])]
+        size = float(TINY_RADIUS)
+        for run in range(spheres.bounds_of_runs.shape[1]):
+            size = wp.max(size, spheres.bounds_of_runs[batch, run][3])
+        task.inverse_size = 1.0 / size
+        for bundle in range(task.ends.shape[0]):
+            task.ends[bundle] = 0
+            at = task.first_bundle + bundle
+            if is_any_above(along(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+                for i in range(BUNDLE):
+                    blocked = Lane()
+                    for lane in range(wp.min(lanes, points.shape[1] - group * lanes)):
+                        vertex = group * lanes + lane
+                        most = float(1.0)
+                        if unblocked:
+                            most = unblocked[instance_in(batch, unblocked.shape[0]), vertex, at * BUNDLE + i]
+                        blocked[lane] = most - transmittance[batch, vertex, at * BUNDLE + i]
+                    task.blocked[bundle * BUNDLE + i] = blocked
+                    if is_any_above(wp.max(blocked, -blocked), 0.0):
+                        task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
+        return batch, group, receivers, task
+
+    return begin
+
+
+@functools.cache
+def _make_weight(lanes: int) -> wp.Function:
+    """Make the kernel function of the weight w, in units of the largest run of spheres: offsets, 1/r → w."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    fn = make_lane_functions(lanes)
+    dot, scale = fn.dot, fn.scale
+    CORE = wp.constant(_CORE)
+    NEAREST2 = wp.constant(_NEAREST2)
+
+    @wp.func(inline=True)
+    def weight(offset: Vectors, curvature: float, inverse_size: float):
+        relative = scale(Lane(inverse_size), offset)
+        core = CORE * inverse_size / curvature
+        return wp.cw_div(Lane(1.0), wp.max(dot(relative, relative) + Lane(core * core), Lane(NEAREST2)))
+
+    return weight
+
+
+@functools.cache
+def _make_light(lanes: int) -> wp.Kernel:
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Receivers, Seen, Task = receivers_type(lanes), seen_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, is_any_above, along, add_vectors = fn.sqrt, fn.is_any_above, fn.along, fn.add_vectors
+    begin, weigh, falloff = _make_begin(lanes), _make_weight(lanes), make_falloff(lanes)
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
+    SUMS = wp.constant(_SUMS)
+    LEAST = wp.constant(_LEAST)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        cone = seen.cone
+        cells = task.cells
+        sine = sqrt(cone.sine2)
+        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        if rises(cap, receivers.normals):
+            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            opacity = wp.cw_mul(opacity, weigh(seen.offset, seen.curvature, task.inverse_size))
+            for k in range(count):
+                bundle = task.found[1, k]
+                at = task.first_bundle + bundle
+                if reaches(cap, cells.axes[at], cells.half_angles[at]):
+                    for i in range(BUNDLE):
+                        t = wp.cw_mul(along(cells.directions[at * BUNDLE + i], cap.axis) - cap.cosine, slope)
+                        if is_any_above(t, 0.0):
+                            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+                            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                            share = wp.cw_mul(opacity, step)
+                            sent = task.exitance[seen.node, at * BUNDLE + i]
+                            place = (bundle * BUNDLE + i) * SUMS
+                            for c in range(SUMS):
+                                task.sums[place + c] = task.sums[place + c] + sent[c] * share
+
+    walk = make_walk(make_cull(True, Task, lanes), visit, Task, False, lanes)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def add_light(
+        first_row: int,
+        worker: int,
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
+        spheres: Spheres,
+        cells: Cells,
+        exitance: wp.array3d(dtype=wp.vec4),
+        transmittance: wp.array3d(dtype=wp.float32),
+        unblocked: wp.array3d(dtype=wp.float32),
+        factor: float,
+        span_count: int,
+        is_kept: bool,
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        found: wp.array3d(dtype=wp.int32),
+        # scratch, or out where they are kept
+        sums: wp.array2d(dtype=Lane),
+        # out
+        light: wp.array2d(dtype=wp.vec3),
+    ):
+        """A thread owns a group of receivers and a span of bundles, and adds to the light."""
+        item, span = wp.tid()
+        batch, group, receivers, task = begin(
+            first_row + item,
+            span,
+            span_count,
+            worker,
+            points,
+            normals,
+            spheres,
+            cells,
+            exitance,
+            transmittance,
+            unblocked,
+            is_kept,
+            scratch,
+            found,
+            sums,
+        )
+        for bundle in range(task.ends.shape[0]):
+            if task.ends[bundle] > 0:
+                for k in range(BUNDLE * SUMS):
+                    task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
+        walk(receivers, batch, spheres, Gradients(), task)
+        total = Vectors()
+        for bundle in range(task.ends.shape[0]):
+            if task.ends[bundle] > 0:
+                for i in range(BUNDLE):
+                    place = bundle * BUNDLE + i
+                    omega = cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
+                    cosine = factor * wp.max(along(omega, receivers.normals), Lane(0.0))
+                    part = wp.cw_mul(cosine, task.blocked[place])
+                    part = wp.cw_div(part, wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
+                    total.x += wp.cw_mul(part, task.sums[place * SUMS])
+                    total.y += wp.cw_mul(part, task.sums[place * SUMS + 1])
+                    total.z += wp.cw_mul(part, task.sums[place * SUMS + 2])
+        add_vectors(total, group, light[batch])
+
+    return add_light
+
+
+@functools.cache
+def _make_light_adjoint(lanes: int) -> wp.Kernel:
+    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, is_any_above, along, dot, scale = fn.sqrt, fn.is_any_above, fn.along, fn.dot, fn.scale
+    add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
+    begin, weigh = _make_begin(lanes), _make_weight(lanes)
+    falloff, falloff_adjoint, cone_adjoint = make_falloff(lanes), make_falloff_adjoint(lanes), make_cone_adjoint(lanes)
+    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
+    SUMS = wp.constant(_SUMS)
+    LEAST = wp.constant(_LEAST)
+    CORE2 = wp.constant(_CORE**2)
+
+    @wp.func(inline=True)
+    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+        """The adjoint of the sphere's cone and weight.
+
+        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and the pull of a unit of w a, v = f (Ī·L − S Ī·R):
+        ā = w v,  w̄ = Σ a v,  L̄ = f w a Ī,  S̄ = −f w a Ī·R
+        and with y = d / size:  w̄ → d̄ = −2 w̄ w² y / size,  r̄ = −2 w̄ w² r / (4 size)²;  ā as for the transmittance.
+        """
+        pull = Pull()
+        cone = seen.cone
+        cells = task.cells
+        sine = sqrt(cone.sine2)
+        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        if rises(cap, receivers.normals):
+            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            weight = weigh(seen.offset, seen.curvature, task.inverse_size)
+            is_any_met = bool(False)
+            sum_ = Lane(0.0)
+            sum_t = Lane(0.0)
+            sum_x = Lane(0.0)
+            sum_y = Lane(0.0)
+            sum_z = Lane(0.0)
+            adj_opacity = Lane(0.0)
+            for k in range(count):
+                bundle = task.found[1, k]
+                at = task.first_bundle + bundle
+                if reaches(cap, cells.axes[at], cells.half_angles[at]):
+                    for i in range(BUNDLE):
+                        omega = cells.directions[at * BUNDLE + i]
+                        t = wp.cw_mul(along(omega, cap.axis) - cap.cosine, slope)
+                        if is_any_above(t, 0.0):
+                            is_any_met = True
+                            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+                            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                            weighted = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
+                            pulled = task.pulls[bundle * BUNDLE + i]
+                            sent = task.exitance[seen.node, at * BUNDLE + i]
+                            light = along(wp.vec3(sent[0], sent[1], sent[2]), task.adj_light)
+                            adj_blocked = wp.cw_mul(weighted, light - sent[3] * pulled)
+                            adj_opacity += wp.cw_mul(adj_blocked, step)
+                            rise = wp.cw_mul(t, Lane(1.0) - t)
+                            adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked, opacity), rise)
+                            sum_ += adj_t
+                            sum_t += wp.cw_mul(adj_t, t)
+                            sum_x += omega[0] * adj_t
+                            sum_y += omega[1] * adj_t
+                            sum_z += omega[2] * adj_t
+                            if task.adj_exitance:
+                                share = wp.cw_mul(weighted, wp.cw_mul(opacity, step))
+                                adj_sent = wp.vec4(
+                                    total(wp.cw_mul(share, task.adj_light.x)),
+                                    total(wp.cw_mul(share, task.adj_light.y)),
+                                    total(wp.cw_mul(share, task.adj_light.z)),
+                                    -total(wp.cw_mul(share, pulled)),
+                                )
+                                wp.atomic_add(task.adj_exitance, seen.node, at * BUNDLE + i, adj_sent)
+            if is_any_met:
+                adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
+                    cone,
+                    sine,
+                    cap.cosine,
+                    cells.cos_width,
+                    cells.sin_width,
+                    wp.cw_mul(slope, sum_t - sum_),
+                    -wp.cw_mul(slope, sum_t),
+                    adj_opacity,
+                )
+                adj_axis = scale(slope, Vectors(sum_x, sum_y, sum_z))
+                adj_cone = Cone(adj_axis, adj_cosine, adj_sine2, wp.cw_mul(adj_weight, seen.share))
+                adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
+                # w̄ w = Σ a v w = Ā A
+                nearer = (-2.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), weight)
+                pull.is_any = True
+                pull.offset = add(adj_offset, scale(nearer, scale(Lane(task.inverse_size), seen.offset)))
+                pull.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
+                pull.weight = adj_weight
+        return pull
+
+    walk = make_walk(make_cull(True, Task, lanes), visit, Task, True, lanes)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def add_light_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        points: wp.array2d(dtype=wp.vec3),
+        normals: wp.array2d(dtype=wp.vec3),
+        spheres: Spheres,
+        cells: Cells,
+        exitance: wp.array3d(dtype=wp.vec4),
+        transmittance: wp.array3d(dtype=wp.float32),
+        unblocked: wp.array3d(dtype=wp.float32),
+        factor: float,
+        span_count: int,
+        is_kept: bool,
+        sums: wp.array2d(dtype=Lane),
+        adj_light: wp.array2d(dtype=wp.vec3),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        found: wp.array3d(dtype=wp.int32),
+        # out
+        adj_points: wp.array2d(dtype=wp.vec3),
+        adj_normals: wp.array2d(dtype=wp.vec3),
+        adj_transmittance: wp.array3d(dtype=wp.float32),
+        # out, or a sum where one instance serves all
+        adj_unblocked: wp.array3d(dtype=wp.float32),
+        # sums
+        adj_exitance: wp.array3d(dtype=wp.vec4),
+        adj_centers: wp.array2d(dtype=wp.vec3),
+        adj_radii: wp.array2d(dtype=wp.float32),
+        adj_extents: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers and a span of bundles.
+
+        T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
+        """
+        item, span = wp.tid()
+        batch, group, receivers, task = begin(
+            first_row + item,
+            span,
+            span_count,
+            worker,
+            points,
+            normals,
+            spheres,
+            cells,
+            exitance,
+            transmittance,
+            unblocked,
+            is_kept,
+            scratch,
+            found,
+            sums,
+        )
+        task.adj_light = load(adj_light[batch], group)
+        if adj_exitance:
+            task.adj_exitance = adj_exitance[instance_in(batch, exitance.shape[0])]
+        turned = Vectors()
+        for bundle in range(task.ends.shape[0]):
+            if task.ends[bundle] > 0:
+                for i in range(BUNDLE):
+                    place = bundle * BUNDLE + i
+                    direction = (task.first_bundle + bundle) * BUNDLE + i
+                    omega = cells.directions[direction]
+                    inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
+                    mean = Vectors(task.sums[place * SUMS], task.sums[place * SUMS + 1], task.sums[place * SUMS + 2])
+                    pulled = wp.cw_mul(inverse, dot(task.adj_light, mean))
+                    cosine = along(omega, receivers.normals)
+                    is_up = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
+                    adj_cosine = factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], pulled))
+                    turned.x += omega[0] * adj_cosine
+                    turned.y += omega[1] * adj_cosine
+                    turned.z += omega[2] * adj_cosine
+                    facing = factor * wp.max(cosine, Lane(0.0))
+                    adj_blocked = wp.cw_mul(facing, pulled)
+                    for lane in range(wp.min(lanes, points.shape[1] - group * lanes)):
+                        vertex = group * lanes + lane
+                        if adj_transmittance:
+                            adj_transmittance[batch, vertex, direction] = (
+                                adj_transmittance[batch, vertex, direction] - adj_blocked[lane]
+                            )
+                        if adj_unblocked:
+                            serving = instance_in(batch, adj_unblocked.shape[0])
+                            adj_unblocked[serving, vertex, direction] = (
+                                adj_unblocked[serving, vertex, direction] + adj_blocked[lane]
+                            )
+                    task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
+                    task.pulls[place] = pulled
+        gradients = Gradients()
+        gradients.centers = adj_centers
+        gradients.radii = adj_radii
+        gradients.extents = adj_extents
+        adj = walk(receivers, batch, spheres, gradients, task)
+        if adj_points:
+            add_vectors(adj.points, group, adj_points[batch])
+        if adj_normals:
+            add_vectors(turned, group, adj_normals[batch])
+
+    return add_light_adjoint
+
+
+def sphere_light(
+    points: wp.array,
+    normals: wp.array,
+    centers: wp.array,
+    radii: wp.array,
+    exitance: wp.array,
+    transmittance: wp.array,
+    unblocked: wp.array | None,
+    directions: np.ndarray,
+    *,
+    softness: float = SOFTNESS,
+    merging: float = MERGING,
+) -> wp.array:
+    """Light that spheres send to receivers, through the cells that they block.
+
+    Args:
+        points: Receiver positions [scene units], vec3 of shape [batch, receiver].
+        normals: Unit normals, vec3 of shape [batch, receiver].
+        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
+        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+        exitance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of shape
+            [batch, node, direction], from :func:`.exitance.sphere_exitance`. A batch of 1 serves every instance.
+        transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same
+            directions, softness and merging.
+        unblocked: F, what T would be without these spheres, a factor of T, of the same shape; a batch of 1 serves every
+            instance. None for 1.
+        directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
+        softness: κ, half-width of the falloff in cell radii.
+        merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
+
+    Returns:
+        What a white receiver reflects of that light, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
+
+    Raises:
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii, as far as they can be checked.
+
+    Differentiable: points, normals, centers, radii, exitance, transmittance, unblocked. (The derivative in T is that at
+    a fixed blend of spheres.) Not: directions, softness, merging.
+    """
+    check_directions(directions)
+    width = falloff_width(softness, len(directions))
+    check_spheres(points, normals, centers, radii)
+    common_batch({"points": points, "exitance": exitance, "unblocked": unblocked})
+    batch_count, vertex_count = points.shape
+    node_count = radii.shape[1] + merged_count(radii.shape[1], merging)
+    check.shape("exitance", exitance.shape, (exitance.shape[0], node_count, len(directions)))
+    check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
+    if unblocked is not None:
+        check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
+    check.finite_arrays({"exitance": exitance, "transmittance": transmittance, "unblocked": unblocked})
+    device = points.device
+    lanes = lane_count(device)
+    cells = make_cells(directions, width, device)
+    # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
+    span_count = 1 if device.is_cpu else len(directions) // CHUNK
+    own_count = len(directions) // span_count
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)))
+    dim = batch_count * group_count(vertex_count, lanes), span_count
+    variables = [points, normals, *nodes, exitance, transmittance, unblocked]
+    is_kept = varies(variables)
+    scratch = [
+        Scratch((2, own_count), lane_type(lanes)),
+        Scratch((3, own_count // BUNDLE), wp.int32),
+    ]
+    sums = (own_count * _SUMS,), lane_type(lanes)
+    kept = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if is_kept else []
+    inputs = [points, normals, spheres, cells, exitance, transmittance, unblocked]
+    inputs += [4 / len(directions), span_count, is_kept]
+    cost = _PAIR_COST * lanes * radii.shape[1] * own_count
+    is_shared = unblocked is not None and len(unblocked) < batch_count
+
+    def adjoint(adj_light: wp.array) -> None:
+        adj_unblocked = [None if unblocked is None else unblocked.grad]
+        launch(
+            _make_light_adjoint(lanes),
+            dim,
+            cost=2 * cost,
+            inputs=[*inputs, *kept, adj_light],
+            scratch=scratch,
+            outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_unblocked)],
+            sums=[*(adj_unblocked if is_shared else []), exitance.grad, *(array.grad for array in nodes)],
+        )
+
+    return differentiable(
+        lambda light: launch(
+            _make_light(lanes),
+            dim,
+            cost=cost,
+            inputs=inputs,
+            scratch=scratch if is_kept else [*scratch, Scratch(*sums)],
+            outputs=[*kept, light],
+        ),
+        adjoint,
+        result=wp.zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),
+        variables=variables,
+    )
