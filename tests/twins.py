@@ -219,7 +219,9 @@ def transmittance(points, centers, radii, directions, softness=0.35):
 
 def blocked_shares(points, centers, radii, directions, softness=0.35):
     """The share of each cell that each sphere blocks, [vertex, sphere, direction]."""
-    alone = [transmittance(points, centers[s : s + 1], radii[s : s + 1], directions, softness) for s in range(len(radii))]
+    alone = [
+        transmittance(points, centers[s : s + 1], radii[s : s + 1], directions, softness) for s in range(len(radii))
+    ]
     return 1 - np.stack(alone, axis=1)
 
 
