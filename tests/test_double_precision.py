@@ -201,6 +201,33 @@ def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
     check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *quad)
 
 
+def test_exitance_of_spheres(double, device, check):
+    directions = double("maths.directions").fibonacci(16)
+    nodes = np.int32([0, 2, 3, 3]), np.int32([0, 1, 2])
+    check(
+        lambda b, n: double("stages.bounces.exitance").sphere_exitance(b, n, np.ones(3), *nodes, directions),
+        (wp.vec3d, random(0, 2, 3, 3)),
+        (wp.vec3d, unit(random(1, 2, 3, 3))),
+    )
+
+
+@pytest.mark.slow
+def test_light_from_spheres(double, device, check, spheres):
+    directions = double("maths.directions").fibonacci(16)
+    sphere_light = double("stages.bounces.sphere_light").sphere_light
+    exitance, unblocked = 1 + random(0, 1, 4, 16, 4) ** 2, 1 + random(1, 1, 5, 16) ** 2
+    rest = (wp.vec4d, exitance), (wp.float64, 0.5 * unblocked), (wp.float64, unblocked)
+    check(lambda *scene: sphere_light(*scene, directions, softness=1.2), *spheres, *rest)
+
+
+@pytest.mark.slow
+def test_light_from_spheres_that_merge(double, device, check, quad):
+    directions = double("maths.directions").fibonacci(16)
+    sphere_light = double("stages.bounces.sphere_light").sphere_light
+    rest = (wp.vec4d, 1 + random(0, 1, 6, 16, 4) ** 2), (wp.float64, 0.5 * random(1, 1, 6, 16) ** 2)
+    check(lambda *scene: sphere_light(*scene, None, directions, merging=1.0), *quad, *rest)
+
+
 def logs(*sizes):
     """Log-visibility of one instance, of these norms."""
     rows = random(0, 1, len(sizes), 9)

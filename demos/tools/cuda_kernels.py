@@ -12,6 +12,7 @@ import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.stages import transfer
+from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.interpolate import _make_interpolate, _make_interpolate_adjoint
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
@@ -60,6 +61,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4)
     },
     **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},
+    **{make.__name__: partial(make, LANES) for make in (sphere_light._make_light, sphere_light._make_light_adjoint)},
     "_make_empty": partial(lanes._make_empty, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""
