@@ -317,9 +317,18 @@ class Assembly:
             None where no such body casts a shadow.
         """
         casting = [number for number in self.casting if bodies is None or number in bodies]
-        if not casting:
-            return None
-        faces = self.faces.numpy()[np.isin(self.body_of_face, casting)]
+        return self._mesh(positions, np.isin(self.body_of_face, casting)) if casting else None
+
+    def mesh(self, positions: wp.array) -> wp.Mesh:
+        """Make the mesh of all bodies.
+
+        Args:
+            positions: Their vertices [scene units], vec3 of shape [vertex]; they are copied.
+        """
+        return self._mesh(positions, np.ones(len(self.body_of_face), bool))
+
+    def _mesh(self, positions: wp.array, keeps_face: np.ndarray) -> wp.Mesh:
+        faces = self.faces.numpy()[keeps_face]
         return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
 
     def faces_of(self, first: int, end: int) -> wp.array:

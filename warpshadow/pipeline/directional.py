@@ -8,10 +8,9 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
+from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, map_of
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
@@ -102,9 +101,7 @@ class Directional(SphereMethod):
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:
-        light = self.light.value()
-        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
-        samples = sample_map(radiance, self.visibility.samples)
+        samples = sample_map(map_of(self.light.value()), self.visibility.samples)
         return cell_samples(samples, self._directions, device=self.assembly.device)
 
     @functools.cached_property

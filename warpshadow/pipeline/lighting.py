@@ -13,6 +13,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import common_batch, concatenate, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
+from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import NOT_TRACED, OwnLookup, OwnShadows, Traced
@@ -207,6 +208,11 @@ def check_light(light: object) -> None:
     if isinstance(light, np.ndarray):
         check.shape("light", light.shape, ("order²", 3))
         check.finite("light", light)
+
+
+def map_of(light: KnownLight) -> np.ndarray:
+    """Radiance of known light as a map, shape [height, 2 height, 3]."""
+    return light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
 
 
 def receiver_words(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:

@@ -3,10 +3,8 @@
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.assets.light import EnvironmentMap
-from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, receiver_words
+from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_words
 from warpshadow.pipeline.node import Fixed, Node, Source
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.light_samples import sample_map
@@ -21,21 +19,29 @@ class Rays(Method):
     """Visibility of the meshes."""
 
     lights_samples = True
+    can_bounce = True
 
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
 
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
-        """Shading of points in known light, towards which rays are drawn."""
-        return Node(
+        """Shading of points in known light, towards which rays are drawn; what bounces comes along paths."""
+        meshes = self._meshes(points)
+        direct = Node(
             "shading",
             self._shade,
-            self._meshes(points),
+            meshes,
             points.receivers_node,
             light,
             items=lambda: receiver_words(points),
             beside=(Node("transfer", None, idle="rays shade known light at once"),),
         )
+        if not self.assembly.scene.bounces:
+            return direct
+        from warpshadow.pipeline.paths import path_traced
+
+        given = direct, meshes, points, light, materials
+        return path_traced(*given, samples=self._sample_count, progress=self.progress)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -64,6 +70,11 @@ class Rays(Method):
             beside=(Node("static shadows", None, idle=alike),),
         )
 
+    @property
+    def _sample_count(self) -> int:
+        """Rays of direct light for each receiver."""
+        return max(1, self.visibility.samples // self.assembly.scene.supersampling**2)
+
     def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
         points = receivers.points
         count = min(len(points) if points.size else 0, len(positions))
@@ -76,9 +87,7 @@ class Rays(Method):
             raise ValueError(
                 "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
             )
-        radiance = light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
-        count = max(1, self.visibility.samples // self.assembly.scene.supersampling**2)
-        samples = sample_map(radiance, count)
+        samples = sample_map(map_of(light), self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
             lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)

@@ -108,6 +108,13 @@ class Materials:
             materials._take_textures(Source("textures", images, news="textures are given"))
         return materials
 
+    @property
+    def texture_of_face(self) -> wp.array:
+        """Number of each face's texture among those that there are, -1 for none, int32 of shape [face]."""
+        has_texture = np.array([size is not None for size in self.sizes])
+        texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
+        return constant(texture_of_body[self.assembly.body_of_face], wp.int32, self.assembly.device)
+
     def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
         """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
 
@@ -172,8 +179,6 @@ class SeenSurfaces:
         if materials.textures is not self._materials.textures and not materials.assembly.scene.bounces:
             pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
         if self._footprints[0] != materials.sizes:
-            has_texture = np.array([size is not None for size in materials.sizes])
-            texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
             assembly = materials.assembly
             footprints = Node(
                 "footprints",
@@ -183,7 +188,7 @@ class SeenSurfaces:
                 self._clip_positions,
                 assembly.uvs,
                 assembly.uv_faces,
-                constant(texture_of_body[assembly.body_of_face], wp.int32, assembly.device),
+                materials.texture_of_face,
                 Fixed(pyramids, is_constant=True),  # of which it takes the sizes alone
                 items=items,
             )

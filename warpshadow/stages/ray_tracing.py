@@ -190,12 +190,13 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
     visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
-    inputs = [_id(mesh), points, normals, directions]
+    inputs = [mesh_id(mesh), points, normals, directions]
     launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=RAY_COST)
     return visibility
 
 
-def _id(mesh: wp.Mesh | None) -> wp.uint64:
+def mesh_id(mesh: wp.Mesh | None) -> wp.uint64:
+    """Number of a mesh in kernels; 0 is the mesh that has no face."""
     return wp.uint64(0) if mesh is None else mesh.id
 
 
@@ -251,7 +252,7 @@ def trace_shading(
         launch(
             _trace_shading,
             part.stop - part.start,
-            inputs=[_id(mesh), points[part], normals[part], directions, radiance],
+            inputs=[mesh_id(mesh), points[part], normals[part], directions, radiance],
             outputs=[shading[part]],
             cost=RAY_COST * directions.shape[1],
         )
@@ -355,7 +356,7 @@ def trace_cells(
         launch(
             _trace_cells,
             part.stop - part.start,
-            inputs=[_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
+            inputs=[mesh_id(mesh), points[part], normals[part], numbers[part], *samples[:3]],
             outputs=[light[part]],
             cost=RAY_COST * samples.directions.shape[1],
         )

@@ -141,6 +141,12 @@ def _filtered(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, lin
 
 
 @wp.func
+def at_uv(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2):
+    """A level at a point, bilinear between four texels."""
+    return _filtered(texels, level, uv, wp.vec4(0.0, 0.0, 0.0, 1.0))
+
+
+@wp.func
 def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4, adj_color: wp.vec3):
     """Add to the gradients of a level's texels: the adjoint of `_filtered`, by what is filtered."""
     place = _place(level, uv)

@@ -1,0 +1,97 @@
+"""Paths: light that bounces between the meshes, for the ray-traced method. Imported where light bounces."""
+
+from dataclasses import replace
+
+import warp as wp
+
+from warpshadow.device.batch import accumulate, common_batch
+from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_words
+from warpshadow.pipeline.node import Node, Source
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.light_samples import sample_map
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.path_tracing import Surfaces, trace_bounces
+from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.textures.pyramid import Textures
+
+_LIGHT_SAMPLES = 1024
+"""Directions of each set from which hits draw light."""
+
+_RAYS_OF_PATH = 2
+"""Rays of direct light for each path, which varies about as much and takes 2.4 times as long with two bounces."""
+
+
+def path_traced(
+    direct: Node, meshes: Node, points: LitPoints, light: Source, materials: Materials, *, samples: int, progress: bool
+) -> Node:
+    """Shading with bounces: what direct light makes, and what paths bring.
+
+    Args:
+        direct: Node of the shading by direct light.
+        meshes: Node of the meshes that block direct light, one for each instance.
+        points: What is lit.
+        light: Known light.
+        materials: What the bodies reflect.
+        samples: Rays of direct light for each receiver.
+        progress: Show progress where it takes longer than a second.
+    """
+    assembly = points.assembly
+    bounces, paths = assembly.scene.bounces, -(-samples // _RAYS_OF_PATH)
+
+    def trace(
+        shading: wp.array,
+        receivers: Receivers,
+        casting: list[wp.Mesh | None],
+        positions: wp.array,
+        normals: wp.array,
+        radiance: KnownLight,
+        vertex_albedo: wp.array,
+        textures: Textures | None,
+    ) -> wp.array:
+        texels = None if textures is None else textures.texels
+        count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels})
+        drawn = sample_map(map_of(radiance), _LIGHT_SAMPLES, seed=1)
+        lit = wp.empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
+
+        def own(array: wp.array) -> wp.array:
+            return array[min(instance, len(array) - 1)]
+
+        for instance in range(count):
+            surfaces = Surfaces(
+                _whole_mesh(assembly, own(casting), own(positions)),
+                own(casting),
+                assembly.faces,
+                own(normals),
+                own(vertex_albedo),
+                None if textures is None else replace(textures, texels=own(texels).reshape((1, -1))),
+                materials.texture_of_face,
+                assembly.uvs[0],
+                assembly.uv_faces,
+            )
+            places = own(receivers.points), own(receivers.normals)
+            bounced = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
+            wp.copy(lit[instance], own(shading))
+            accumulate(bounced, lit[instance])
+        return lit
+
+    return Node(
+        "bounces",
+        trace,
+        direct,
+        points.receivers_node,
+        meshes,
+        points.vertices,
+        Node("", vertex_normals, points.vertices, assembly.faces),
+        light,
+        materials.vertex_albedo,
+        materials.pyramids if materials.images else None,
+        items=lambda: f"{receiver_words(points)} × {paths:,} paths of {bounces} bounces",
+        has_adjoint=False,
+    )
+
+
+def _whole_mesh(assembly: Assembly, casting: wp.Mesh | None, positions: wp.array) -> wp.Mesh:
+    """The mesh of all bodies: that of those that cast shadows, where all do."""
+    is_whole = casting is not None and len(assembly.casting) == len(assembly.scene.bodies)
+    return casting if is_whole else assembly.mesh(positions)

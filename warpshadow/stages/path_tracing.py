@@ -1,0 +1,205 @@
+"""Path tracing: light that bounces between the meshes before it reaches receivers. It judges the approximations.
+
+A path starts at a receiver. At each of its hits x_k light is drawn from the sky (next-event estimation), so that with
+n bounces the receiver gets
+
+    I = Σ_{k=1..n} a(x_1) ⋯ a(x_k) S(x_k)                [Kajiya 1986; Veach 1997, section 10.2]
+
+on average over paths whose directions are drawn in proportion to the cosine: a albedo and S the direct shading of a
+white surface. A hit is a receiver of its own: on the side of its face that the ray meets, with the normal of the
+vertices, interpolated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.light_samples import LightSamples
+from warpshadow.stages.ray_tracing import RAY_COST, escapes, mesh_id, nearest, parts
+from warpshadow.stages.textures.pyramid import Textures
+from warpshadow.stages.textures.sample import at_uv
+
+_SEED = 29
+
+_STEP_U, _STEP_V = wp.uint32(3242174889), wp.uint32(2447445414)
+"""Roberts' R2 sequence, which spreads the first directions of a receiver's paths, in parts of 2³²."""
+
+
+class Surfaces(NamedTuple):
+    """What light bounces from, one instance.
+
+    Args:
+        mesh: All bodies.
+        casting: Those that block direct light, None for none.
+        faces: Vertex indices of the mesh, vec3i of shape [face].
+        normals: Unit normals of the vertices, vec3 of shape [vertex].
+        vertex_albedo: Reflectance of the vertices, vec3 of shape [vertex].
+        textures: Textures, of one instance; None where no body has one.
+        texture_of_face: Texture of each face, -1 for none, int32 of shape [face].
+        uvs: Texture coordinates, vec2 of shape [uv].
+        uv_faces: Indices of uvs, vec3i of shape [face].
+    """
+
+    mesh: wp.Mesh
+    casting: wp.Mesh | None
+    faces: wp.array
+    normals: wp.array
+    vertex_albedo: wp.array
+    textures: Textures | None
+    texture_of_face: wp.array
+    uvs: wp.array
+    uv_faces: wp.array
+
+
+@wp.struct
+class _Surfaces:
+    """The same in kernels."""
+
+    mesh: wp.uint64
+    casting: wp.uint64
+    positions: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)
+    normals: wp.array(dtype=wp.vec3)
+    vertex_albedo: wp.array(dtype=wp.vec3)
+    texels: wp.array(dtype=wp.vec3)
+    levels: wp.array2d(dtype=wp.vec3i)
+    texture_of_face: wp.array(dtype=wp.int32)
+    uvs: wp.array(dtype=wp.vec2)
+    uv_faces: wp.array(dtype=wp.vec3i)
+
+
+@wp.func
+def _albedo(surfaces: _Surfaces, face: int, weights: wp.vec3):
+    """What a point of a face reflects: bilinear in the finest level of its texture, or between vertices."""
+    texture = surfaces.texture_of_face[face]
+    if texture < 0:
+        return at_point(surfaces.vertex_albedo, surfaces.faces[face], weights)
+    return at_uv(surfaces.texels, surfaces.levels[texture, 0], at_point(surfaces.uvs, surfaces.uv_faces[face], weights))
+
+
+@wp.func
+def _toward(normal: wp.vec3, u: float, v: float):
+    """A direction of the hemisphere, with a probability in proportion to the cosine for even u and v in [0, 1).
+
+    The normal and a point of the unit sphere add up to it [Shirley et al. 2019, "Sampling Transformations Zoo",
+    section 16.6.1].
+    """
+    z = 1.0 - 2.0 * u
+    across = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    angle = 2.0 * wp.pi * v
+    return wp.normalize(normal + wp.vec3(across * wp.cos(angle), across * wp.sin(angle), z))
+
+
+@wp.func
+def _spread(shift: wp.uint32, step: wp.uint32, number: int):
+    """A number of a low-discrepancy sequence, from 0 to 1."""
+    return float((shift + step * wp.uint32(number)) >> wp.uint32(8)) / 16777216.0
+
+
+@wp.kernel(enable_backward=False)
+def _trace_bounces(
+    first_row: int,
+    worker: int,
+    # in
+    surfaces: _Surfaces,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    first_receiver: int,
+    directions: wp.array(dtype=wp.vec3),
+    radiance: wp.array(dtype=wp.vec3),
+    bounce_count: int,
+    path_count: int,
+    # out
+    light: wp.array(dtype=wp.vec3),
+):
+    """A thread owns a receiver. Only the first directions of its paths are spread: all else is drawn apart."""
+    receiver = first_row + wp.tid()
+    state = wp.rand_init(_SEED, first_receiver + receiver)
+    shift_u = wp.randu(state)
+    shift_v = wp.randu(state)
+    total = wp.vec3()
+    for path in range(path_count):
+        point = points[receiver]
+        normal = normals[receiver]
+        u = _spread(shift_u, _STEP_U, path)
+        v = _spread(shift_v, _STEP_V, path)
+        reflected = wp.vec3(1.0)
+        for _bounce in range(bounce_count):
+            toward = _toward(normal, u, v)
+            hit = nearest(surfaces.mesh, point, normal, toward)
+            if hit.face < 0:
+                break
+            corners = surfaces.faces[hit.face]
+            point = at_point(surfaces.positions, corners, hit.weights)
+            normal = wp.normalize(at_point(surfaces.normals, corners, hit.weights))
+            normal = wp.where(hit.is_back, -normal, normal)
+            reflected = wp.cw_mul(reflected, _albedo(surfaces, hit.face, hit.weights))
+            drawn = int(wp.randu(state) % wp.uint32(directions.shape[0]))
+            cosine = wp.dot(normal, directions[drawn])
+            if cosine > 0.0 and escapes(surfaces.casting, point, normal, directions[drawn]):
+                total += cosine * wp.cw_mul(reflected, radiance[drawn])
+            u = wp.randf(state)
+            v = wp.randf(state)
+    light[receiver] = total / float(path_count)
+
+
+def trace_bounces(
+    surfaces: Surfaces,
+    points: wp.array,
+    normals: wp.array,
+    samples: LightSamples,
+    *,
+    bounces: int,
+    paths: int,
+    progress: bool = False,
+) -> wp.array:
+    """Trace the light that reaches receivers after it bounced; add direct light (:func:`.trace_shading`) to it.
+
+    Rays that meet a face see it from either side. Direct light at what they meet is blocked by the casting bodies
+    alone, as at receivers.
+
+    Args:
+        surfaces: What it bounces from.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        samples: Directions drawn from the light; each hit takes one of all the sets.
+        bounces: Most bounces of a path, 1 or more.
+        paths: Number of paths from each receiver.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        The bounced light that white surfaces send back, vec3 of shape [receiver].
+
+    Differentiable: no.
+    """
+    device = points.device
+    count = samples.directions.shape[1]
+    directions = wp.array(samples.directions.reshape(-1, 3), dtype=wp.vec3, device=device)
+    radiance = wp.array(count / np.pi * samples.radiance.reshape(-1, 3), dtype=wp.vec3, device=device)
+    light = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    traced, cost = _struct(surfaces), 2 * bounces * paths
+    for part in parts(points.shape[0], 2**20 // cost, progress):
+        launch(
+            _trace_bounces,
+            part.stop - part.start,
+            inputs=[traced, points[part], normals[part], part.start, directions, radiance, bounces, paths],
+            outputs=[light[part]],
+            cost=RAY_COST * cost,
+        )
+    return light
+
+
+def _struct(surfaces: Surfaces) -> _Surfaces:
+    struct = _Surfaces()
+    struct.mesh, struct.casting = mesh_id(surfaces.mesh), mesh_id(surfaces.casting)
+    struct.positions, struct.faces, struct.normals = surfaces.mesh.points, surfaces.faces, surfaces.normals
+    struct.vertex_albedo, struct.texture_of_face = surfaces.vertex_albedo, surfaces.texture_of_face
+    struct.uvs, struct.uv_faces = surfaces.uvs, surfaces.uv_faces
+    if surfaces.textures is not None:
+        struct.texels, struct.levels = surfaces.textures.texels[0], surfaces.textures.levels
+    return struct
