@@ -10,7 +10,6 @@ from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver
 from warpshadow.pipeline.node import Node, Source
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.path_tracing import Surfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.textures.pyramid import Textures
@@ -82,7 +81,7 @@ def path_traced(
         points.receivers_node,
         meshes,
         points.vertices,
-        Node("", vertex_normals, points.vertices, assembly.faces),
+        points.normals,
         light,
         materials.vertex_albedo,
         materials.pyramids if materials.images else None,
