@@ -1,0 +1,316 @@
+"""Light of flat bodies, and what passes them, against NumPy, against rays, and against differences."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.device.tape import recorded
+from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.stages.bounces.flat_light import FlatBody, Flats, flat_light, passing_flats
+from warpshadow.stages.bounces.patches import find_flat_patches
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+FLOAT32 = 2e-5
+DIRECTIONS = fibonacci(64)
+
+
+# ---------------------------------------------------------------------------------------------------- the twin
+
+
+def ramp(z):
+    u = np.clip((z + 1) / 2, 0, 1)
+    return u**2 * (3 - 2 * u)
+
+
+def halved(image, height, width):
+    """Means over equal parts of an image, which may share texels: each texel is first cut into those of both."""
+    rows, columns = len(image), image.shape[1]
+    fine = np.repeat(np.repeat(image, height, axis=0), width, axis=1)
+    return fine.reshape(height, rows, width, columns, -1).mean(axis=(1, 3))
+
+
+def bilinear(image, x, y):
+    height, width = image.shape[:2]
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+    left, top = int(min(x, max(width - 2, 0))), int(min(y, max(height - 2, 0)))
+    right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+    s, t = x - left, y - top
+    upper = (1 - s) * image[top, left] + s * image[top, right]
+    return (1 - t) * upper + t * ((1 - s) * image[below, left] + s * image[below, right])
+
+
+def fetched(image, grid, y, cosine, t, radius):
+    """Mean of an image [row, column, channel] over a footprint at a place in the plane."""
+    height, width = image.shape[:2]
+    z = y / grid.spread
+    count = np.array([width, height])
+    texel = (z / np.sqrt(1 + np.abs(z)) - grid.low) / (grid.high - grid.low) * count
+    slopes = (1 + np.abs(z) / 2) / (1 + np.abs(z)) ** 1.5 * count / (grid.high - grid.low) / grid.spread
+    footprint = max(2 * t * radius * np.sqrt(slopes.prod() / cosine), 1.0)
+    sizes = [(height, width)]
+    while max(sizes[-1]) > 1:
+        sizes.append(tuple(max(size // 2, 1) for size in sizes[-1]))
+    level = min(int(np.log2(footprint)), len(sizes) - 1)
+    part = footprint / 2**level - 1 if level < len(sizes) - 1 else 0.0
+    values = []
+    for rows, columns in sizes[level : level + 2]:
+        x, y = texel / count * (columns, rows) - 0.5
+        values.append(bilinear(halved(image, rows, columns), x, y))
+    return values[0] if part == 0 else (1 - part) * values[0] + part * values[1]
+
+
+def met_sides(point, omega, radius, frames, grids, radiosity, skip):
+    """Coverage, distance, its width, light and flat of each side that a cell meets."""
+    sides = []
+    for f, grid in enumerate(grids):
+        origin, u, v = frames[3 * f : 3 * f + 3]
+        scales = np.linalg.norm(u), np.linalg.norm(v)
+        axes = np.stack([u / scales[0], v / scales[1]])
+        normal = np.cross(*axes)
+        place = axes @ (point - origin) / scales
+        height = normal @ (point - origin) / scales[0]
+        edges = [np.sign(e) * (e**2 + np.abs(e) * np.sqrt(e**2 + 4)) / 2 * grid.spread for e in (grid.low, grid.high)]
+        margin = 0.1 * grid.texel_sizes().min()
+        front = ramp(1 + 2 * height / margin)
+        for side, presence in ((1, front), (-1, 1 - front)):
+            cosine = -side * (normal @ omega)
+            if f == skip or presence <= 0 or cosine <= -radius:
+                continue
+            ratio = cosine / radius
+            mean = cosine if ratio >= 1 else radius * (1 / 3 + 2 / 3 * ((ratio + 1) / 2) ** 3)
+            t = max(side * height, 0) / mean
+            y = place + t * (axes @ omega)
+            extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2) + margin
+            inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
+            share = presence * ramp(ratio) * inside.prod()
+            covered = fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius)[0]
+            light = np.zeros(3)
+            if side == 1 or grid.sides == 2:
+                image = radiosity[f][0 if side == 1 else 1] * grid.covered[..., None]
+                light = share * fetched(image, grid, y, mean, t, radius)
+            sides.append((share * covered, t, t * radius / mean, light, f))
+    return sides
+
+
+def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None):
+    """Of one instance, [receiver, 3]; radiosity is [side, row, column, 3] for each flat."""
+    radius, result = cell_radius(len(directions)), np.zeros((len(points), 3))
+    for receiver, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        for q, omega in enumerate(directions):
+            weight = 4 / len(directions) * max(normal @ omega, 0) * transmittance[receiver, q]
+            if weight == 0:
+                continue
+            sides = met_sides(point, omega, radius, frames, grids, radiosity, skip)
+            for k, (_, t, width, light, _) in enumerate(sides):
+                unhidden = 1.0
+                for j, (h, other_t, other_width, _, _) in enumerate(sides):
+                    if j != k:
+                        unhidden *= 1 - h * ramp((t - other_t) / (width + other_width + 1e-20))
+                result[receiver] += weight * unhidden * light
+    return result
+
+
+def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=None):
+    radius, result = cell_radius(len(directions)), np.array(transmittance, float)
+    black = [np.zeros((2, *grid.covered.shape, 3)) for grid in grids]
+    for receiver, point in enumerate(points):
+        for q, omega in enumerate(directions):
+            for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip):
+                result[receiver, q] *= 1 - h * blocks[f]
+    return result
+
+
+# ---------------------------------------------------------------------------------------------------- scenes
+
+
+def l_shape():
+    """An L of three unit squares, whose corner is at the origin."""
+    corners = np.array([[x, 0, z] for x in range(3) for z in range(3)], float) - [1, 0, 1]
+    squares = [(0, 1), (0, 0), (1, 0)]
+    faces = [[3 * i + j, 3 * i + j + 1, 3 * i + j + 4] for i, j in squares]
+    faces += [[3 * i + j, 3 * i + j + 4, 3 * i + j + 3] for i, j in squares]
+    return ws.Mesh(corners, faces)
+
+
+WALL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # turns a ground into a wall that looks to −z … or +z
+
+
+class Setting:
+    """Flats with random radiosity, and receivers above, below and beside them."""
+
+    def __init__(self, device, *, two_sided=False, blocks=(True, True, True), names=("ground", "wall", "l"), batch=1):
+        rng = np.random.default_rng(1)
+        meshes = {
+            "ground": (ws.plane(4.0, 4), np.eye(3), [0.0, 0, 0], 1.0),
+            "wall": (ws.plane(3.0, 1), WALL.T, [0.1, 1.2, -1.3], 0.8),
+            "l": (l_shape(), np.diag([1.0, -1, -1]), [0.4, 1.9, 0.1], 0.7),
+        }
+        near = np.array([[-0.5, 0, -0.4], [0.6, 1, 0.5]])
+        self.parts, self.radiosity, posed, bodies = [], [], [], []
+        vertex_count = patch_count = 0
+        for name, is_blocking in zip(names, blocks, strict=False):
+            mesh, rotation, translation, scale = meshes[name]
+            faces = mesh.surface.faces
+            patches = find_flat_patches(mesh.positions, faces, is_two_sided=two_sided, others=near)
+            bodies.append(FlatBody(patches.grid, mesh.positions, faces, vertex_count, patch_count, is_blocking))
+            self.radiosity.append(rng.uniform(size=(2, *patches.grid.covered.shape, 3)))
+            posed.append(scale * mesh.positions.astype(float) @ rotation.T + translation)
+            vertex_count, patch_count = vertex_count + mesh.vertex_count, patch_count + patches.count
+        self.grids, self.blocks = [body.grid for body in bodies], blocks
+        self.flats = Flats.of(bodies, patch_count, vertex_count, device=device)
+        self.vertices = np.repeat(np.concatenate(posed)[None], batch, axis=0)
+        points = rng.uniform([-1.2, 0.05, -1], [1.2, 1.6, 1.2], size=(7, 3))
+        points[5] = [0.4, -0.2, 0.3]  # below the ground
+        points[6] = [-0.5, -0.3 * 0.1 * self.grids[0].texel_sizes().min(), 0.2]  # in its margin
+        normals = rng.normal(size=(7, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        self.points, self.normals = (np.repeat(values[None], batch, axis=0) for values in (points, normals))
+        self.transmittance = rng.uniform(size=(batch, 7, len(DIRECTIONS))) * (rng.uniform(size=len(DIRECTIONS)) > 0.2)
+        if batch > 1:
+            self.points[1:] += 0.05
+            self.vertices[1:] += 0.02
+        self.device = device
+
+    def values(self):
+        """Points, normals, transmittance, vertices, and radiosity of patches."""
+        sides = [each[: grid.sides].reshape(-1, 3) for each, grid in zip(self.radiosity, self.grids, strict=True)]
+        return self.points, self.normals, self.transmittance, self.vertices, np.concatenate(sides)[None]
+
+    def move(self, steps):
+        """Add to all of these."""
+        for name, step in zip(("points", "normals", "transmittance", "vertices"), steps[:4], strict=True):
+            setattr(self, name, getattr(self, name) + step)
+        first = 0
+        for each, grid in zip(self.radiosity, self.grids, strict=True):
+            own = each[: grid.sides]
+            own += steps[4][0, first : first + own[..., 0].size].reshape(own.shape)
+            first += own[..., 0].size
+
+    def arrays(self):
+        """The same on the device, wanting gradients."""
+        values = self.values()
+        dtypes = wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3
+        return [
+            wp.array(value, dtype=dtype, device=self.device, requires_grad=True)
+            for value, dtype in zip(values, dtypes, strict=True)
+        ]
+
+    def frames(self, vertices):
+        rows = self.flats.frames_of_vertices
+        starts, columns, weights = (array.numpy() for array in rows.rows)
+        return np.array(
+            [weights[a:b].astype(float) @ vertices[columns[a:b]] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        )
+
+    def light(self, skip=None, batch=0):
+        at = self.points[batch], self.normals[batch], self.transmittance[batch]
+        return twin_light(*at, self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip)
+
+    def passing(self, skip=None, batch=0):
+        at = self.points[batch], self.transmittance[batch]
+        return twin_passing(*at, self.frames(self.vertices[batch]), self.grids, self.blocks, DIRECTIONS, skip)
+
+
+# ---------------------------------------------------------------------------------------------------- values
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("skip", [None, 0])
+@pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
+def test_light_is_that_of_the_formula(names, skip, two_sided, device):
+    setting = Setting(device, names=names, two_sided=two_sided, batch=2)
+    points, normals, transmittance, vertices, radiosity = setting.arrays()
+    frames = setting.flats.frames(vertices)
+    light = flat_light(points, normals, transmittance, frames, radiosity, setting.flats, DIRECTIONS, skip=skip).numpy()
+    for batch in range(2):
+        np.testing.assert_allclose(light[batch], setting.light(skip, batch), atol=FLOAT32)
+
+
+@pytest.mark.parametrize("skip", [None, 1])
+def test_what_passes_is_that_of_the_formula(skip, device):
+    setting = Setting(device, blocks=(True, False, True))
+    points, _, transmittance, vertices, _ = setting.arrays()
+    frames = setting.flats.frames(vertices)
+    passing = passing_flats(points, transmittance, frames, setting.flats, DIRECTIONS, skip=skip).numpy()
+    np.testing.assert_allclose(passing[0], setting.passing(skip), atol=FLOAT32)
+    assert passing.min() >= 0 and np.abs(passing - setting.transmittance).max() > 0.5
+
+
+# ---------------------------------------------------------------------------------------------------- gradients
+
+
+def slopes_of(setting, steps, twin, weights):
+    """Derivative of the sum of weights times what the twin gives, by central differences along steps."""
+    ends = []
+    for sign in (1, -2):
+        setting.move([sign * step for step in steps])
+        ends.append((weights * twin(setting)).sum())
+    setting.move(steps)
+    return (ends[0] - ends[1]) / 2
+
+
+def random_steps(setting, number, size=1e-6):
+    """A step of one of the variables alone."""
+    rng = np.random.default_rng(number)
+    values = setting.values()
+    steps = [np.zeros(value.shape) for value in values]
+    steps[number] = size * rng.normal(size=values[number].shape)
+    if number == 3:  # of frames three vertices decide, and they are to stay those of a body that is moved and scaled
+        turn, shift = rng.normal(size=3), rng.normal(size=3)
+        steps[3] = size * (np.cross(turn, values[3]) + shift + 0.3 * values[3])
+    return steps
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
+def test_gradients_of_light_are_those_of_the_twin(names, two_sided, device, verified_tape):
+    setting = Setting(device, names=names, two_sided=two_sided)
+    variables = setting.arrays()
+    points, normals, transmittance, vertices, radiosity = variables
+    with recorded() as tape:
+        frames = setting.flats.frames(vertices)
+        light = flat_light(points, normals, transmittance, frames, radiosity, setting.flats, DIRECTIONS)
+    weights = np.random.default_rng(5).uniform(size=(7, 3))
+    tape.backward(grads={light: wp.array(weights[None], dtype=wp.vec3, device=device)})
+    for number, variable in enumerate(variables):
+        steps = random_steps(setting, number)
+        expected = slopes_of(setting, steps, Setting.light, weights)
+        assert (variable.grad.numpy() * steps[number]).sum() == pytest.approx(expected, rel=2e-3), number
+
+
+@pytest.mark.parametrize("names", [("ground",), ("ground", "wall", "l")])
+def test_gradients_of_what_passes_are_those_of_the_twin(names, device, verified_tape):
+    setting = Setting(device, names=names, blocks=(True, False, True))
+    variables = setting.arrays()
+    points, _, transmittance, vertices, _ = variables
+    with recorded() as tape:
+        frames = setting.flats.frames(vertices)
+        passing = passing_flats(points, transmittance, frames, setting.flats, DIRECTIONS)
+    weights = np.random.default_rng(5).uniform(size=passing.shape[1:])
+    tape.backward(grads={passing: wp.array(weights[None], dtype=wp.float32, device=device)})
+    for number in (0, 2, 3):
+        steps = random_steps(setting, number)
+        expected = slopes_of(setting, steps, Setting.passing, weights)
+        assert (variables[number].grad.numpy() * steps[number]).sum() == pytest.approx(expected, rel=2e-3), number
+
+
+def test_instances_that_share_an_array_add_to_its_gradient(device):
+    setting = Setting(device, names=("ground",))
+    points, normals, transmittance, vertices, radiosity = setting.arrays()
+    twice = wp.array(np.repeat(setting.vertices, 2, axis=0), dtype=wp.vec3, device=device, requires_grad=True)
+    gradients = []
+    for placed in (vertices, twice):
+        with recorded() as tape:
+            passing = passing_flats(points, transmittance, setting.flats.frames(placed), setting.flats, DIRECTIONS)
+            light = flat_light(
+                points, normals, transmittance, setting.flats.frames(placed), radiosity, setting.flats, DIRECTIONS
+            )
+        seeds = {passing: wp.full(passing.shape, 1.0, device=device)}
+        seeds[light] = wp.full(light.shape, wp.vec3(1.0), dtype=wp.vec3, device=device)
+        tape.backward(grads=seeds)
+        gradients.append([each.grad.numpy() for each in (points, normals, transmittance, radiosity)])
+        tape.zero()
+    for once, both in zip(*gradients, strict=True):
+        np.testing.assert_allclose(both, 2 * once, rtol=1e-4, atol=1e-5)
