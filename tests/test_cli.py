@@ -237,7 +237,7 @@ def test_tune_prints_what_it_tried_and_lines_that_the_scene_file_takes(scene, tm
     assert result.stdout.startswith(f"{scene}: error of the shading at points of the image, against rays; time of a")
     assert "warm image of 16 × 12" in result.stdout
     for method in ("none", "directional 16", "directional 32", "log-sh eigen 4"):
-        assert re.search(rf"^[> ][* ]{method} .* vertex .*\d\.\d\d% +\d+\.\d\d ms$", result.stdout, re.M)
+        assert re.search(rf"^[> ][* ]{method} .* auto .*\d\.\d\d% +\d+\.\d\d ms$", result.stdout, re.M)
     assert len(re.findall(r"^>", result.stdout, re.M)) == 1
     lines = lines_to_put_in(result.stdout).split("\n\n")[0]
     before, after = SCENE.split("[visibility]\ndirections = 32\n")
@@ -291,7 +291,7 @@ def test_render_makes_the_choice_that_a_scene_leaves_to_it(scene, tmp_path, quic
     scene.write_text(SCENE.replace("[visibility]", '[visibility]\nmethod = "auto"\nerror = 0.9'))
     result = run("render", scene, "-o", tmp_path / "out.exr")
     assert result.exit_code == 0, result.output
-    assert "auto: none, receivers vertex\n" in result.stdout and "out.exr: none, 16 × 12" in result.stdout
+    assert "auto: none, receivers auto\n" in result.stdout and "out.exr: none, 16 × 12" in result.stdout
     np.testing.assert_array_equal(ws.read_image(tmp_path / "out.exr"), ws.render(ws.load_scene(scene)))
 
 

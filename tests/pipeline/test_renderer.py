@@ -1,6 +1,7 @@
 """The pipeline as a whole: images against rays, against formulas, and against each other."""
 
 import dataclasses
+import pickle
 import warnings
 
 import numpy as np
@@ -214,11 +215,11 @@ def test_a_scene_turned_with_its_light_and_camera_gives_the_same_image(device, m
 
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_two_triangles_receive_a_shadow_with_pixel_receivers(device, method):
-    coarse, fine = (ground(1, receivers="pixel"), ground(128))
+    coarse, fine, at_corners = ground(1, receivers="pixel"), ground(128), ground(1, receivers="vertex")
     camera = ws.Camera.look_at((0, 2.0, 5), (0, 0, 0), size=(32, 32))
     by_pixel, by_vertex, missed = (
         ws.render(scene_of(method, ball(), body, camera=camera, supersampling=1), device=device)
-        for body in (coarse, fine, ground(1))
+        for body in (coarse, fine, at_corners)
     )
     interpolation = 1e-3  # of vertices 0.05 apart in a penumbra; 0.04% measured
     assert relative_error(by_pixel, by_vertex) < interpolation
@@ -446,14 +447,85 @@ def test_no_light_is_lost_between_cells_of_different_size(device, count):
 
 
 def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
-    floor = ws.Body(ws.plane(4.0, 1), blockers=0)
+    floor = ws.Body(ws.plane(4.0, 1), blockers=0, receivers="vertex")
     camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(64, 64))
     scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
-    with pytest.warns(UserWarning, match=r"body 0 \('plane'\): a face covers \d+ pixels .* receivers = \"pixel\""):
+    with pytest.warns(
+        UserWarning, match=r"body 0 \('plane'\): a face covers \d+ pixels .* receivers = \"auto\" or \"pixel\""
+    ):
         ws.render(scene)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        ws.render(dataclasses.replace(scene, bodies=(dataclasses.replace(floor, receivers="pixel"),)))
+        for receivers in ("auto", "pixel"):
+            ws.render(dataclasses.replace(scene, bodies=(dataclasses.replace(floor, receivers=receivers),)))
+
+
+# ---------------------------------------------------------------------------------------------- receivers = "auto"
+
+
+def coarse_and_fine(size: int = 64, receivers: str = "auto") -> ws.Scene:
+    """A ground of two triangles, and a ball of faces of a pixel or so."""
+    camera = ws.Camera.look_at((0, 2.0, 5), (0, 0, 0), size=(size, size))
+    return scene_of("directional", ball(receivers=receivers), ground(1, receivers=receivers), camera=camera)
+
+
+def chosen_receivers(scene: ws.Scene, **options) -> list[str]:
+    return [body.receivers for body in Renderer(scene, **options).scene.bodies]
+
+
+def test_bodies_of_large_faces_are_shaded_by_pixel(device):
+    scene = coarse_and_fine()
+    assert chosen_receivers(scene, device=device) == ["vertex", "pixel"]
+    explicit = dataclasses.replace(scene, bodies=(ball(receivers="vertex"), ground(1, receivers="pixel")))
+    np.testing.assert_array_equal(ws.render(scene, device=device), ws.render(explicit, device=device))
+    assert chosen_receivers(explicit, device=device) == ["vertex", "pixel"]
+    assert chosen_receivers(coarse_and_fine(receivers="vertex"), device=device) == ["vertex", "vertex"]
+
+
+def test_what_is_large_is_the_mean_over_the_faces_that_the_cameras_see():
+    scene = coarse_and_fine()
+    renderer = Renderer(dataclasses.replace(scene, supersampling=1))
+    face_ids = renderer.view().fragments.face_ids.numpy()
+    on_ground = face_ids >= ball().mesh.face_count
+    size = on_ground.sum() / len(np.unique(face_ids[on_ground]))
+    assert f"Body 1 ('plane') has receivers at pixels: its faces have {size:.2g} pixels each." in str(
+        renderer.explain()
+    )
+    assert "Body 0 ('icosphere') has receivers at vertices" in str(renderer.explain())
+    assert "has receivers" not in str(Renderer(coarse_and_fine(receivers="vertex")).explain())
+    far = [ws.Camera.look_at((0, 60.0, 150), (0, 0, 0), size=(64, 64))]
+    assert chosen_receivers(scene, cameras=far) == ["vertex", "vertex"]
+
+
+@pytest.mark.parametrize(("size", "largest"), [(64, 16), (256, 16), (512, 64), (2048, 400)])
+def test_in_large_images_faces_may_be_larger(size, largest):
+    """Sheets that fill the image, cut into faces that are all of one size."""
+    camera = ws.Camera.look_at(
+        (0, 1e3, 0), (0, 0, 0), up=(0, 0, -1), fov_y=np.degrees(2 * np.arctan(1e-3)), size=(size, size)
+    )
+    for factor, expected in ((0.7, "vertex"), (1.4, "pixel")):
+        quads = round(size / np.sqrt(2 * largest * factor))
+        sheet = ws.Body(ws.plane(2.0, quads), blockers=0)
+        scene = ws.Scene((sheet,), ws.EnvironmentMap.constant(), camera)
+        assert chosen_receivers(scene) == [expected]
+
+
+def test_what_moves_does_not_change_the_choice_and_a_copy_makes_the_same():
+    renderer = Renderer(coarse_and_fine())
+    poses = renderer.scene_poses()
+    nearer = wp.array(poses.translations.numpy() + [0, 0, 4.5], dtype=wp.vec3, device=renderer.device)
+    geometry = renderer.placed(dataclasses.replace(poses, translations=nearer))
+    view = renderer.view(geometry, wp.array([renderer.cameras[0].clip_matrix()], dtype=wp.mat44))
+    assert view.receivers.points.shape[1] > 0
+    assert [body.receivers for body in renderer.scene.bodies] == ["vertex", "pixel"]
+    copy = pickle.loads(pickle.dumps(renderer))
+    assert [body.receivers for body in copy.scene.bodies] == ["vertex", "pixel"]
+
+
+def test_rays_need_no_choice():
+    renderer = Renderer(dataclasses.replace(coarse_and_fine(), visibility=ws.Visibility("ray-traced")))
+    assert [body.receivers for body in renderer.scene.bodies] == ["auto", "auto"]
+    assert "has receivers" not in str(renderer.explain())
 
 
 # ---------------------------------------------------------------------------------------------- several cameras

@@ -164,7 +164,7 @@ def test_the_ground_shadows_a_body_above_it_nearly_as_the_plane_does(device):
     of six radii. Measured: 4.2% with the ground's sphere, 62% without."""
     errors = {}
     for number, blocker_count in (("one sphere", 1), ("none", 0)):
-        scene = scene_of(ws.Body(ws.plane(6.0, 2), blockers=blocker_count), ball(), directions=256)
+        scene = scene_of(ws.Body(ws.plane(6.0, 2), blockers=blocker_count, receivers="vertex"), ball(), directions=256)
         renderer = Renderer(scene, device=device)
         shading = renderer.shade().numpy()[0, 9:]
         points, normals = (array.numpy()[0, 9:] for array in renderer.view().receivers[:2])

@@ -46,19 +46,30 @@ class Explanation:
         timings: How long stages took last, by name.
         is_host: Whether launches wait until they are done, as they do on a CPU.
         hidden: Nodes that are left out.
+        notes: Lines below the table.
 
     Attributes:
         stages: By name, in the order in which they run.
+        notes: What else there is to say, a line each.
     """
 
     def __init__(
-        self, image: Node, call: Call, timings: dict[str, Timing], *, is_host: bool, hidden: Collection[Node] = ()
+        self,
+        image: Node,
+        call: Call,
+        timings: dict[str, Timing],
+        *,
+        is_host: bool,
+        hidden: Collection[Node] = (),
+        notes: Iterable[str] = (),
     ):
         decisions = decide(image, call)
         nodes = [node for node in decisions if node.name and node not in hidden]
         self.stages = {node.name: _stage(node, decisions[node]) for node in nodes}
         self.timings = dict(timings)
-        self._is_host = is_host
+        self.notes = list(notes)
+        if not is_host:
+            self.notes.append("Times are the host's: a launch returns before the GPU is done.")
 
     def __getitem__(self, name: str) -> Stage:
         return self.stages[name]
@@ -81,9 +92,7 @@ class Explanation:
             "  ".join([*(cell.ljust(width) for cell, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip()
             for row in rows
         ]
-        if not self._is_host:
-            lines.append("Times are the host's: a launch returns before the GPU is done.")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.notes])
 
 
 def decide(image: Node, call: Call) -> dict[Node, Decision]:

@@ -20,6 +20,14 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
+from warpshadow.pipeline.choice_of_receivers import (
+    COARSE_FACE,
+    Choice,
+    choose_receivers,
+    pixels_per_face,
+    receiver_notes,
+    with_receivers,
+)
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.lighting import Light, LitPoints, joined
@@ -41,9 +49,6 @@ METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-trac
 
 Own = TypeVar("Own", bound="Renderer")
 
-COARSE_FACE = 400
-"""Pixels of an average face beyond which shading at its corners draws a warning."""
-
 
 class Renderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
@@ -61,7 +66,7 @@ class Renderer:
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        scene: The scene; a method "auto" has been replaced by what was chosen.
+        scene: The scene; a method "auto" has been replaced by what was chosen, and so have receivers "auto".
         cameras: Those that see the scene.
         has_camera_batch: Whether they were given as a batch.
         basis: What free light is expressed in.
@@ -95,12 +100,13 @@ class Renderer:
             "basis": basis,
             "progress": progress,
         }
-        self.scene = scene
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
         self.device = where
         self.progress = progress
         self.assembly = Assembly(scene, device=self.device, progress=progress)
+        self._given_scene, self._choices = scene, self._choose_receivers()
+        self.assembly.scene = self.scene = with_receivers(scene, self._choices)
         self.clock = Clock()
         self._method = make_method(self.assembly, basis, progress=progress)
         self._materials = Materials.of_scene(self.assembly)
@@ -115,6 +121,12 @@ class Renderer:
         self._last_cameras: Source | None = None
         self._statics: dict[tuple[int, ...], Static] = {}  # by what moves
         self._has_warned = False
+
+    def _choose_receivers(self) -> list[Choice]:
+        if METHODS[self.assembly.scene.visibility.method].lights_samples:  # whatever the bodies say
+            return [Choice(body.receivers, None) for body in self.assembly.scene.bodies]
+        with unrecorded():
+            return choose_receivers(self.assembly, self.cameras)
 
     def moved(self: Own, device: wp.DeviceLike) -> Own:
         """Make the same renderer on another device; it computes all anew there."""
@@ -329,20 +341,12 @@ class Renderer:
 
     def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
-        bodies = self.scene.bodies
-        body_of_face = self.assembly.body_of_face
-        sample_counts, face_counts = np.zeros((2, len(bodies)))
-        for face_ids in fragments.face_ids.numpy():
-            seen = face_ids[face_ids >= 0]
-            sample_counts += np.bincount(body_of_face[seen], minlength=len(bodies))
-            face_counts += np.bincount(body_of_face[np.unique(seen)], minlength=len(bodies))
-        pixels_per_face = sample_counts / self.scene.supersampling**2 / np.maximum(face_counts, 1)
-        for number, body in enumerate(bodies):
-            if body.receivers == "vertex" and not self._method.lights_samples and pixels_per_face[number] > COARSE_FACE:
+        sizes = pixels_per_face(fragments.face_ids.numpy(), self.assembly) / self.scene.supersampling**2
+        for number, (body, size) in enumerate(zip(self._given_scene.bodies, sizes, strict=True)):
+            if body.receivers == "vertex" and not self._method.lights_samples and size > COARSE_FACE:
                 warnings.warn(
-                    f"body {number} ({body.called!r}): a face covers {pixels_per_face[number]:.0f} "
-                    "pixels on average, and light is evaluated at its corners alone; "
-                    'receivers = "pixel" evaluates it at every pixel',
+                    f"body {number} ({body.called!r}): a face covers {size:.0f} pixels on average, and light is "
+                    'evaluated at its corners alone; receivers = "auto" or "pixel" evaluates it at every pixel',
                     stacklevel=2,
                 )
 
@@ -505,7 +509,8 @@ class Renderer:
             view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
         image = view.preview().image(light, *self._per_body(albedo, textures))
         is_host = self.device.is_cpu or self.clock.waits
-        return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden)
+        notes = receiver_notes(self._given_scene, self._choices)
+        return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes)
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

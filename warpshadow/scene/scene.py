@@ -44,7 +44,7 @@ BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)
 
 MOST_BOUNCES = 16
 
-RECEIVERS = ("vertex", "pixel")
+RECEIVERS = (AUTO, "vertex", "pixel")
 
 SELF_SHADOWS = ("traced", "spheres")
 
@@ -155,7 +155,9 @@ class Body:
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
-            of few faces needs to receive a shadow.
+            of few faces needs to receive a shadow. "auto" leaves it to each renderer: by pixel where its cameras see
+            faces of more than 16 pixels on average (in images larger than 256 × 256, 1/4096 of the pixels, at most
+            400).
         self_shadows: What shadows it casts on itself, "traced" or of its "spheres", as for :class:`Visibility`; None
             for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
@@ -181,7 +183,7 @@ class Body:
         rotation: npt.ArrayLike = (0.0, 0.0, 0.0),
         translation: npt.ArrayLike = (0.0, 0.0, 0.0),
         scale: float = 1.0,
-        receivers: str = "vertex",
+        receivers: str = AUTO,
         name: str | None = None,
         self_shadows: str | None = None,
     ):

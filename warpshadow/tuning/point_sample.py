@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import Renderer
-from warpshadow.scene.scene import Scene, Visibility
+from warpshadow.scene.scene import AUTO, Scene, Visibility
 from warpshadow.stages.normals import vertex_normals
 
 
@@ -81,6 +81,7 @@ class PointSample:
         self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
         self.bodies = stage.assembly.body_of_face[face_ids[chosen]]
         self._scene = scene
+        self._chosen = [body.receivers for body in stage.scene.bodies]
         if not self.truth.any():
             raise ValueError("light: none falls on what the camera sees, so nothing can be compared")
 
@@ -99,12 +100,21 @@ class PointSample:
         bodies = tuple(replace(body, receivers=receivers) for body in self._scene.bodies)
         return self.shading(replace(self._scene, bodies=bodies, visibility=visibility, supersampling=1))
 
+    def decided(self, scene: Scene) -> Scene:
+        """A variant of the scene with what a renderer of the whole image chooses for receivers "auto"."""
+        bodies = (
+            replace(body, receivers=chosen) if body.receivers == AUTO else body
+            for body, chosen in zip(scene.bodies, self._chosen, strict=True)
+        )
+        return replace(scene, bodies=tuple(bodies))
+
     def shading(self, scene: Scene) -> np.ndarray:
         """Shade the points, as white surfaces, with the visibility, spheres and receivers of a variant of the scene.
 
         Returns:
             Linear RGB, float32 of shape [point, 3].
         """
+        scene = self.decided(scene)
         # it draws no image, so that what else a renderer prepares may be as small as can be
         glimpse = replace(scene.camera, width=1, height=1)
         renderer = Renderer(scene, cameras=[glimpse], device=self._device, progress=self._progress)

@@ -191,7 +191,13 @@ def tune(
     check.positive("error" if milliseconds is None else "milliseconds", wanted)
     sample = PointSample(scene, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE
-    settings = list(_settings(scene, is_coarse, fits, device))
+    fine = [
+        body.receivers if receivers == own.receivers else receivers
+        for body, own, receivers in zip(
+            scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
+        )
+    ]
+    settings = list(_settings(scene, fine, fits, device))
     bar = tqdm(settings, desc="measuring errors", unit="setting", delay=1, leave=False, disable=not progress)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
@@ -283,7 +289,7 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
 
 def _interpolation_error(scene: Scene, sample: PointSample) -> float:
     """Error that is left however visibility is computed: of the bodies whose vertices are receivers."""
-    is_interpolated = [body.receivers == "vertex" for body in scene.bodies]
+    is_interpolated = [body.receivers == "vertex" for body in sample.decided(scene).bodies]
     return float(np.linalg.norm(sample.interpolation_errors()[is_interpolated]))
 
 
@@ -306,11 +312,9 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 # ---------------------------------------------------------------------------------------------- settings
 
 
-def _settings(scene: Scene, is_coarse: np.ndarray, fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
-    """What is tried, a variant of the scene each."""
-    own = tuple(body.receivers for body in scene.bodies)
-    fine = tuple("pixel" if coarse else "vertex" for coarse in is_coarse)
-    for receivers in dict.fromkeys((own, fine)):
+def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
+    """What is tried, a variant of the scene each: with its own receivers, and with fine ones."""
+    for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
         bodies = tuple(replace(body, receivers=each) for body, each in zip(scene.bodies, receivers, strict=True))
         placed = replace(scene, bodies=bodies)
         if not scene.bounces:
