@@ -225,8 +225,13 @@ def _shade(transfers: list[wp.array], light: wp.array, *, matrix: np.ndarray | N
     """Light the receivers of all groups, by light that a matrix converts. Differentiable: transfers, light."""
     most = check.LARGEST
     if matrix is not None:
-        light, most = shade(constant(matrix[None], wp.float32, light.device), light), LARGEST_COEFFICIENT
+        light, most = _converted(light, matrix), LARGEST_COEFFICIENT
     return joined([shade(transfer, light, most=most) for transfer in transfers])
+
+
+def _converted(light: wp.array, matrix: np.ndarray | None) -> wp.array:
+    """Coefficients of light in another basis, to which a matrix takes them, None for the same; differentiable in it."""
+    return light if matrix is None else shade(constant(matrix[None], wp.float32, light.device), light)
 
 
 def joined(parts: list[wp.array]) -> wp.array:
@@ -303,7 +308,7 @@ class SphereMethod(Method):
     in_free: Any
     why_no_shadows = ""
     joins_kept = False
-
+    can_bounce = True
     bounces: "Bouncing | None" = None
     flats: tuple[int, ...] = ()
 
@@ -341,6 +346,16 @@ class SphereMethod(Method):
         if self.bounces is not None:
             return self.bounces.shading(points, own, light, materials)
         return InParts(self, points, own, light, joined)
+
+    def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """Shading of points in free light; where it bounces, found with the light as if that were known."""
+        if self.bounces is None:
+            return super().free_shading(points, light, materials)
+        return self.bounces.shading(points, Node("", self._in_given, light), light, materials)
+
+    def _in_given(self, light: wp.array) -> Any:
+        """What the method takes of free light that is given. Differentiable: light."""
+        return self.in_free._replace(coefficients=_converted(light, self.own_from_basis))
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to what the method computes in."""

@@ -47,7 +47,10 @@ class LogSH(SphereMethod):
 
     def coefficient_count(self, light: Source | None) -> int:
         """Number of coefficients that take part."""
-        return (self.in_free.bands if light is None else self._band_count(light.value())) ** 2
+        known = None if light is None else light.value()
+        if known is None or isinstance(known, wp.array):
+            return self.in_free.bands**2
+        return self._band_count(known) ** 2
 
     def see(self, group: Group, light: Bands) -> Seen:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""

@@ -70,8 +70,13 @@ class ScenePatches:
         return tuple(number for number, each in enumerate(corners) if plane_normal(each) is not None)
 
     def senders(self, materials: Materials) -> Senders:
-        """The bodies that are not known to be black, with their patches."""
-        bodies = tuple(number for number in range(len(self._assembly.scene.bodies)) if not materials.is_black(number))
+        """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""
+        casting = [number for number in self.flats if self._assembly.scene.bodies[number].casts_shadow]
+        bodies = tuple(
+            number
+            for number in range(len(self._assembly.scene.bodies))
+            if number in casting or not materials.is_black(number)
+        )
         if bodies not in self._senders:
             self._senders[bodies] = Senders(self._assembly, bodies, [self.of_body(n) for n in bodies])
         return self._senders[bodies]

@@ -30,7 +30,7 @@ from warpshadow.pipeline.choice_of_receivers import (
 )
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.lighting import Light, LitPoints, joined
+from warpshadow.pipeline.lighting import Light, LitPoints, SphereMethod, joined
 from warpshadow.pipeline.log_sh import LogSH
 from warpshadow.pipeline.node import Call, Clock, Node, Source
 from warpshadow.pipeline.own_shadows import NOT_TRACED, Traced
@@ -109,6 +109,10 @@ class Renderer:
         self.assembly.scene = self.scene = with_receivers(scene, self._choices)
         self.clock = Clock()
         self._method = make_method(self.assembly, basis, progress=progress)
+        if scene.bounces and isinstance(self._method, SphereMethod):
+            from warpshadow.pipeline.bounces import SphereBounces
+
+            self._method.bounces = SphereBounces(self._method)
         self._materials = Materials.of_scene(self.assembly)
         self.basis = self._method.basis
         self._vertices = Source("vertices", lambda: self.geometry().positions)
@@ -268,7 +272,9 @@ class Renderer:
             matrices = clip_matrices
             cameras = Source.renewed("cameras", matrices, self._last_cameras)
         image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
-        if geometry is not None and geometry.moving is not None and not self._method.lights_samples:
+        # rays look at all that moves, and light bounces from what moves to what does not
+        keeps_rows = not (self._method.lights_samples or self.scene.bounces)
+        if geometry is not None and geometry.moving is not None and keeps_rows:
             static = self._statics.get(geometry.moving)
             if static is None or not static.are_those_of(geometry):
                 static = Static(self.assembly, geometry)

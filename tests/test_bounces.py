@@ -1,0 +1,235 @@
+"""Light that bounces, as a whole: energy, what runs, and gradients of images against central differences of them."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from test_end_to_end import (
+    ON_BOTH,
+    ON_GROUND,
+    SILHOUETTE,
+    SMOOTH,
+    Cameras,
+    Deformations,
+    Poses,
+    blob,
+    gradient_and_differences,
+    image_of_batch,
+    one_thread,  # noqa: F401  a fixture of all tests here
+    random_batch,
+    relative_error,
+    scene_of,
+)
+
+import warpshadow as ws
+from warpshadow.pipeline import lighting
+from warpshadow.torch import TorchRenderer
+
+METHODS = ("directional", "log-sh")
+
+# A white scene under even light is as bright everywhere, whatever its shape: each receiver by itself is off where the
+# body's spheres and its mesh block different light, and harmonics ring. The mean over receivers, and single ones:
+FURNACE = {"directional": (0.005, 0.1), "log-sh": (0.02, 0.12)}
+
+
+def bounced(method: str, camera: ws.Camera, bounces: int = 2, *, blockers: int = 0, **visibility) -> ws.Scene:
+    """The blob and its ground, which casts a shadow if it has a blocker."""
+    scene = scene_of(method, camera, **visibility)
+    ground = dataclasses.replace(scene.bodies[1], blockers=blockers)
+    return dataclasses.replace(scene, bounces=bounces, bodies=(scene.bodies[0], ground))
+
+
+# ---------------------------------------------------------------------------------------------- energy
+
+
+def furnace(method: str, bounces: int, albedo: float) -> np.ndarray:
+    """Shading of a body on a ground under light of radiance 1 from everywhere."""
+    bodies = [
+        dataclasses.replace(blob(), albedo=(albedo,) * 3),
+        ws.Body(ws.plane(6.0, 48), albedo=(albedo,) * 3, blockers=1),
+    ]
+    light = ws.EnvironmentMap.constant(1.0, height=16)
+    return ws.Renderer(ws.Scene(bodies, light, ON_BOTH, ws.Visibility(method), bounces=bounces)).shade().numpy()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_in_a_white_furnace_all_is_as_bright_as_the_light(method):
+    in_the_mean, at_most = FURNACE[method]
+    shading = furnace(method, 16, 1.0)
+    assert abs(shading.mean() - 1) < in_the_mean
+    assert abs(shading - 1).max() < at_most
+
+
+def test_bounces_add_ever_less_light():
+    """Of albedo a the n-th bounce brings less than a times what the one before brought."""
+    shadings = [furnace("directional", bounces, 0.5).mean() for bounces in range(5)]
+    gains = np.diff(shadings)
+    assert (gains > 0).all()
+    assert (gains[1:] < 0.5 * gains[:-1]).all()
+
+
+def test_a_colored_ground_colors_what_stands_on_it():
+    scene = bounced("directional", ON_BOTH, 1)
+    red = dataclasses.replace(scene.bodies[1], albedo=(0.8, 0.0, 0.0))
+    renderer = ws.Renderer(dataclasses.replace(scene, bodies=(scene.bodies[0], red)))
+    direct = ws.Renderer(dataclasses.replace(renderer.scene, bounces=0)).shade().numpy()
+    body = renderer.view().receivers.spans[0]
+    gained = renderer.shade().numpy()[0, body.first : body.end].mean(axis=0) / direct[0].mean(axis=0)
+    assert gained[0] > gained[1] + 0.05
+
+
+# ---------------------------------------------------------------------------------------------- what runs
+
+
+@pytest.mark.slow
+def test_without_bounces_nothing_of_them_is_imported():
+    script = (
+        "import json, sys, warpshadow as ws;"
+        "bodies = [ws.Body(ws.icosphere(1.0, 1), blockers=ws.Spheres([(0, 0, 0)], [1])), ws.Body(ws.plane(4.0, 2))];"
+        "scene = ws.Scene(bodies, ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 2, 4), (0, 0, 0)));"
+        "ws.render(scene);"
+        "print(json.dumps([name for name in sys.modules if 'bounces' in name]))"
+    )
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert json.loads(output.splitlines()[-1]) == []
+
+
+def test_black_bodies_send_nothing():
+    scene = bounced("directional", ON_BOTH)
+    black = [dataclasses.replace(body, albedo=(0, 0, 0)) for body in scene.bodies]
+    dark = dataclasses.replace(scene, bodies=black)
+    expected = ws.Renderer(dataclasses.replace(dark, bounces=0)).shade().numpy()
+    renderer = ws.Renderer(dark)
+    np.testing.assert_array_equal(np.sort(renderer.shade().numpy(), axis=1), np.sort(expected, axis=1))
+    assert renderer.explain()["bounces"].forward.why == "every body is black"
+
+
+def test_it_says_what_runs_for_bounces_and_what_does_not():
+    renderer = ws.Renderer(bounced("directional", ON_BOTH))
+    light = wp.zeros((1, renderer.basis.size), dtype=wp.vec3, requires_grad=True)
+    explained = renderer.explain(light)
+    for name in ("own light", "flat light", "sphere light", "radiosity", "own light of sources"):
+        assert explained[name].forward and explained[name].backward, name
+    only = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[:1])
+    explained = ws.Renderer(only).explain()
+    assert explained["flat light"].forward.why == "nothing flat reflects"
+    ground = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[1:])
+    assert ws.Renderer(ground).explain()["own light"].forward.why == "all that reflects is flat"
+
+
+def test_one_bounce_asks_for_no_light_between_sources():
+    explained = ws.Renderer(bounced("directional", ON_BOTH, 1)).explain()
+    assert explained["own light of sources"].forward.why == "light bounces once"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_receivers_lit_in_parts_are_lit_alike(method, monkeypatch):
+    scene = bounced(method, ON_BOTH)
+    whole = ws.Renderer(scene).shade().numpy()
+    monkeypatch.setattr(lighting, "PART", 200)
+    np.testing.assert_allclose(ws.Renderer(scene).shade().numpy(), whole, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_receivers_at_pixels_and_backs_of_open_bodies_are_lit(receivers):
+    """A bowl, seen from within and without."""
+    mesh = ws.icosphere(0.8, 3)
+    low = mesh.positions[mesh.faces].mean(axis=1)[:, 1] < 0.1
+    bowl = ws.Body(ws.Mesh(mesh.positions, mesh.faces[low]), blockers=0, translation=(0, 1, 0), receivers=receivers)
+    ground = ws.Body(ws.plane(4.0, 8), blockers=1)
+    scene = ws.Scene([bowl, ground], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=2)
+    direct, found = (ws.render(dataclasses.replace(scene, bounces=count)) for count in (0, 2))
+    assert np.isfinite(found).all()
+    assert (found - direct).min() > -1e-5
+    assert (found - direct)[..., :3].max() > 0.05
+
+
+# ---------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("blockers", [0, 1])
+@pytest.mark.parametrize("method", METHODS)
+def test_what_a_body_blocks_and_sends_moves_it(method, blockers):
+    renderer = TorchRenderer(bounced(method, ON_GROUND, blockers=blockers))
+    got, expected = gradient_and_differences(Poses(renderer), np.eye(7), 2e-3, slice(3))
+    assert relative_error(got, expected) < SMOOTH
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_a_deforming_body_blocks_and_sends_moves_its_nodes(method):
+    """And its vertices, by the patches that they carry."""
+    image_of = Deformations(TorchRenderer(bounced(method, ON_GROUND)))
+    directions = np.random.default_rng(4).normal(size=(6, len(image_of.start)))
+    got, expected = gradient_and_differences(image_of, directions, 2e-3, slice(3))
+    assert relative_error(got, expected) < SMOOTH
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("parameters", [Poses, Cameras])
+def test_what_moves_an_image_with_bounces_has_its_gradient(method, parameters):
+    renderer = TorchRenderer(bounced(method, ON_BOTH))
+    got, expected = gradient_and_differences(parameters(renderer), np.eye(7), 4e-3, slice(4))
+    assert relative_error(got, expected) < SILHOUETTE
+
+
+class Given:
+    """The image as a function of light, of both albedos, of colors of vertices or of a texture."""
+
+    def __init__(self, renderer: TorchRenderer, name: str):
+        generator = torch.Generator().manual_seed(0)
+        self.renderer, self.name = renderer, name
+        count = renderer.scene.bodies[0].mesh.vertex_count
+        sizes = {"light": (renderer.basis.size, 3), "albedo": (2, 3), "colors": (count, 3), "texture": (9, 7, 3)}
+        self.shape = sizes[name]
+        self.start = torch.rand(self.shape, generator=generator).flatten()
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        values = values.reshape(self.shape)
+        if self.name == "light":
+            return self.renderer(values)
+        if self.name == "albedo":
+            return self.renderer(albedo=list(values))
+        if self.name == "colors":
+            return self.renderer(albedo=[values, None])
+        return self.renderer(textures=[None, values])
+
+
+@pytest.mark.parametrize("name", ["light", "albedo", "colors", "texture"])
+@pytest.mark.parametrize("method", METHODS)
+def test_light_and_reflectance_have_the_gradient_of_an_image_with_bounces(method, name):
+    image_of = Given(TorchRenderer(bounced(method, ON_BOTH)), name)
+    directions = np.random.default_rng(5).normal(size=(4, len(image_of.start)))
+    got, expected = gradient_and_differences(image_of, directions, 1e-2, slice(4))
+    assert relative_error(got, expected) < 1e-4
+
+
+# ---------------------------------------------------------------------------------------------- batches
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_batch_with_bounces_is_its_instances_one_by_one(method):
+    renderer = TorchRenderer(bounced(method, ON_BOTH, directions=64, order=4))
+    values = random_batch(renderer, 2)
+    images = image_of_batch(renderer, values)
+    for instance in range(2):
+        alone = {name: value[instance : instance + 1] for name, value in values.items()}
+        torch.testing.assert_close(image_of_batch(renderer, alone)[0], images[instance], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["turns", "clip_matrices", "light", "albedo", "textures"])
+def test_one_instance_of_anything_serves_all_with_bounces(name):
+    renderer = TorchRenderer(bounced("directional", ON_BOTH, directions=32))
+    varied = ["turns", "shifts"] if name == "turns" else [name]
+    values = random_batch(renderer, 2)
+    given = {key: value if key in varied else value[:1] for key, value in values.items()}
+    images = image_of_batch(renderer, given)
+    for instance in range(2):
+        one = {key: value[instance : instance + 1] if key in varied else value for key, value in given.items()}
+        torch.testing.assert_close(image_of_batch(renderer, one)[0], images[instance], rtol=1e-5, atol=1e-6)

@@ -1,0 +1,407 @@
+"""Light that bounces between bodies, by the spheres that stand in for them.
+
+Patches of bodies have a radiosity B, what they send if direct light S and bounced light I meet them:
+
+    B = a (S + I),   I = G[B],
+
+and G is applied as often as light bounces: first at the sources, points where patches are lit, at last at the receivers
+of the image. G has three parts, each a stage of its own: what a body's own patches send to it, what flat bodies send,
+and what bodies send that spheres stand in for. Where the light of a cell is blocked one of them takes its place.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import common_batch, cut, expand
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.directional import Cells, Directional
+from warpshadow.pipeline.lighting import Group, InParts, LitPoints, Seen, SphereMethod, joined, receiver_words
+from warpshadow.pipeline.node import Call, Node, Source
+from warpshadow.pipeline.patches import ScenePatches, Senders
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
+from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.flat_light import FlatBody, Flats, flat_light, passing_flats
+from warpshadow.stages.bounces.own_light import own_light
+from warpshadow.stages.bounces.radiosity import patch_radiosity
+from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.visibility.directional import transmittance
+
+CELLS = fibonacci(64)
+"""Where receivers look for bounced light if direct light is found in harmonics."""
+
+
+class SeenCells(NamedTuple):
+    """What a part of receivers sees in cells of directions."""
+
+    own: wp.array | None  # [batch, receiver, cell], the share that its own body lets through; None where that is all
+    through: wp.array  # [batch, receiver, cell], and what all bodies do but flat ones
+    directions: np.ndarray  # [cell, 3]
+
+
+class Outgoing:
+    """What patches send, in the forms in which receivers take it; each is found when it is first asked for.
+
+    Args:
+        bounces: How light bounces.
+        senders: The bodies whose patches they are.
+        radiosity: Of the patches, vec3 of shape [batch, patch].
+        normals: Mean normals of the patches in the world, vec3 of shape [batch, patch].
+        spheres: Centers and radii of all spheres.
+        frames: Where flat bodies are, vec3 of shape [batch, 3 · flat].
+    """
+
+    def __init__(
+        self,
+        bounces: SphereBounces,
+        senders: Senders,
+        radiosity: wp.array,
+        normals: wp.array,
+        spheres: tuple[wp.array, wp.array],
+        frames: wp.array,
+    ):
+        self._bounces, self.senders, self.radiosity = bounces, senders, radiosity
+        self._normals, self._spheres, self.frames = normals, spheres, frames
+        self._of_spheres: dict[int | None, tuple[wp.array, wp.array, wp.array]] = {}
+
+    def of_body(self, body: int) -> wp.array:
+        """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
+        place = self.senders.bodies.index(body)
+        return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
+
+    def of_spheres(self, body: int | None, directions: np.ndarray) -> tuple[wp.array, wp.array, wp.array]:
+        """Centers and radii of the spheres of bodies other than one, and what they send towards cells."""
+        if body not in self._of_spheres:
+            bounces, senders = self._bounces, self.senders
+            others = bounces.blocking(body)
+            centers, radii = bounces.assembly.spheres_of(others, self._spheres)
+            given = self.radiosity, self._normals, senders.areas, *bounces.patches_of_spheres(senders, body)
+            self._of_spheres[body] = centers, radii, sphere_exitance(*given, directions)
+        return self._of_spheres[body]
+
+
+class Gathering:
+    """What receivers get of the light that patches send: G.
+
+    Args:
+        bounces: How light bounces.
+        senders: The bodies whose patches send light.
+        given: Nodes that radiosity, receivers and spheres depend on.
+        words: Number of receivers, in words.
+        where: Put after the names of its stages.
+        why_not: Why nobody asks for it, in words; empty if somebody does.
+
+    Attributes:
+        stages: Nodes of its three parts.
+    """
+
+    def __init__(
+        self,
+        bounces: SphereBounces,
+        senders: Senders,
+        given: tuple[Node | Source, ...],
+        words: str | Callable[[], str],
+        where: str = "",
+        why_not: str = "",
+    ):
+        self._bounces = bounces
+        flats = bounces.flats
+        solid = [body for body in senders.bodies if body not in flats]
+        idle = (
+            "" if solid else "all that reflects is flat",
+            "" if len(solid) < len(senders.bodies) else "nothing flat reflects",
+            "" if any(bounces.assembly.sphere_counts[body] for body in solid) else "nothing that reflects has spheres",
+        )
+        functions = self._from_itself, self._from_flats, self._from_spheres
+        names = "own light", "flat light", "sphere light"
+        self.stages = tuple(
+            Node(f"{name}{where}", function, *given, items=words, idle=why_not or why, keeps=False)
+            for name, function, why in zip(names, functions, idle, strict=True)
+        )
+
+    def run(self, call: Call, group: Group, cells: SeenCells, outgoing: Outgoing) -> list[wp.array]:
+        """What a group gets in each way in which it gets some, vec3 of shape [batch, receiver]."""
+        found = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
+        return [light for light in found if light is not None]
+
+    def _from_itself(self, group: Group, _: SeenCells, outgoing: Outgoing) -> wp.array | None:
+        if group.body not in outgoing.senders.bodies or group.body in self._bounces.flats:
+            return None
+        assert group.body is not None and group.places is not None
+        return own_light(self._bounces.factors(group.body), outgoing.of_body(group.body), *group.places)
+
+    def _from_flats(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array:
+        flats = self._bounces.flats_of(outgoing.senders)
+        assert flats is not None
+        given = group.points, group.normals, cells.through, outgoing.frames, outgoing.radiosity, flats.all
+        return flat_light(*given, cells.directions, skip=flats.number.get(group.body))
+
+    def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
+        centers, radii, exitance = outgoing.of_spheres(group.body, cells.directions)
+        if not radii.shape[1]:
+            return None
+        visibility = self._bounces.method.visibility
+        count = common_batch({"geometry": group.points, "light": exitance})
+        points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, centers, radii))
+        given = points, normals, centers, radii, exitance, _expanded(cells.through, count), cells.own, cells.directions
+        return sphere_light(*given, softness=visibility.softness, merging=visibility.merging)
+
+
+def _expanded(rows: wp.array, count: int) -> wp.array:
+    """Repeat an array [1, receiver, cell] for every instance. Differentiable: rows."""
+    return expand(rows.reshape((len(rows), -1)), count).reshape((count, *rows.shape[1:]))
+
+
+class LitPart(NamedTuple):
+    """Some sources, lit directly."""
+
+    shading: wp.array
+    group: Group
+    cells: SeenCells
+
+
+class LitSources(InParts):
+    """Direct light at the sources; what they see is kept with it, for light that bounces."""
+
+    def __init__(
+        self, bounces: SphereBounces, senders: Senders, points: LitPoints, own: Node, light: Source, frames: Node
+    ):
+        self._bounces, self._senders = bounces, senders
+        super().__init__(bounces.method, points, own, light, list, where=" of sources", extra=(frames,))
+
+    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> LitPart:
+        """Light a part, and keep what it sees."""
+        (frames,) = extra
+        seen = self.see(call, part, own)
+        shading = self.light(call, part, self._bounces.past_flats(part, seen, own, self._senders, frames), own)
+        return LitPart(shading, part, self._bounces.cells(part, seen, own, spheres))
+
+
+class Radiosity(Node):
+    """What patches send in the end: of direct light, and of all bounces but the last, which the receivers find."""
+
+    def __init__(
+        self,
+        bounces: SphereBounces,
+        senders: Senders,
+        sources: Node,
+        lit: Node,
+        albedo: Node,
+        spheres: Source,
+        frames: Node,
+    ):
+        self._bounces, self._senders = bounces, senders
+        count = f"{len(senders.areas):,} patches"
+        self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=count, keeps=False)
+        given = lit, albedo, frames
+        words = f"{len(senders.sides):,} sources"
+        why_not = "light bounces once" if bounces.count == 1 else ""
+        self._gathering = Gathering(bounces, senders, given, words, " of sources", why_not)
+        beside = self._reflect, *self._gathering.stages
+        super().__init__("", None, sources, lit, albedo, spheres, frames, beside=beside)
+
+    def compute(self, call: Call) -> Outgoing:
+        """Reflect direct light, then light that has bounced once, and so on."""
+        sources, lit, albedo, spheres, frames = self.values(call)
+        mean = self._senders.mean
+        normals = multiply(mean, sources.normals)
+        direct = joined([part.shading for part in lit])
+        bounced: list[wp.array] = []
+        for bounce in range(self._bounces.count):
+            light = total_light([direct, *bounced])
+            radiosity = self._reflect.run(call, albedo, light, mean)
+            outgoing = Outgoing(self._bounces, self._senders, radiosity, normals, spheres, frames)
+            if bounce + 1 < self._bounces.count:
+                bounced = [joined([self._gather(call, part, outgoing) for part in lit])]
+        return outgoing
+
+    def _gather(self, call: Call, part: LitPart, outgoing: Outgoing) -> wp.array:
+        parts = self._gathering.run(call, part.group, part.cells, outgoing)
+        if parts:
+            return total_light(parts)
+        return wp.zeros((1, part.group.points.shape[1]), dtype=wp.vec3, device=outgoing.radiosity.device)
+
+
+class BouncedShading(InParts):
+    """Shading of receivers, direct and bounced."""
+
+    def __init__(
+        self,
+        bounces: SphereBounces,
+        points: LitPoints,
+        own: Node,
+        light: Source,
+        frames: Node,
+        radiosity: Radiosity,
+        senders: Senders,
+    ):
+        self._bounces, self._senders = bounces, senders
+        given = points.receivers_node, radiosity
+        self._gathering = Gathering(bounces, senders, given, functools.partial(receiver_words, points))
+        stages = self._gathering.stages
+        super().__init__(bounces.method, points, own, light, joined, extra=(frames, radiosity), beside=stages)
+
+    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
+        """Light a part, directly and by what patches send."""
+        frames, outgoing = extra
+        seen = self.see(call, part, own)
+        direct = self.light(call, part, self._bounces.past_flats(part, seen, own, self._senders, frames), own)
+        cells = self._bounces.cells(part, seen, own, spheres)
+        return total_light([direct, *self._gathering.run(call, part, cells, outgoing)])
+
+
+class PlacedFlats(NamedTuple):
+    """Flat bodies."""
+
+    all: Flats
+    number: dict[int | None, int]  # of each among them, by the number of the body
+
+
+class SphereBounces:
+    """How light bounces in a scene in which spheres stand in for bodies.
+
+    Args:
+        method: How light is blocked.
+
+    Attributes:
+        count: How often light bounces.
+        patches: What sends light.
+        flats: Bodies that lie in a plane.
+    """
+
+    def __init__(self, method: SphereMethod):
+        self.method, self.assembly = method, method.assembly
+        self.count = method.assembly.scene.bounces
+        self.patches = ScenePatches(method.assembly)
+        self.flats = self.patches.flats
+        self._factors: dict[int, SparseMatrix] = {}
+        self._flats: dict[Senders, PlacedFlats] = {}
+        self._nodes: dict[tuple[Senders, int | None], tuple[np.ndarray, np.ndarray]] = {}
+        if isinstance(method, Directional):
+            method.flats = self.flats
+
+    def shading(self, points: LitPoints, own: Node, light: Source, materials: Materials) -> Node:
+        """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
+
+        Args:
+            points: The receivers.
+            own: What the method takes of the light.
+            light: The light.
+            materials: What the bodies reflect.
+        """
+        senders = self.patches.senders(materials)
+        if not senders.bodies:
+            idle = Node("bounces", None, idle="every body is black")
+            return InParts(self.method, points, own, light, joined, beside=(idle,))
+        spheres, flats = points.spheres, self.flats_of(senders)
+        frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
+        words = f"{len(senders.sides):,} sources"
+        sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
+        given = self.method, materials, points.vertices, spheres, sources, points.call
+        at_sources = LitPoints(*given, normals=points.normals, traced=points.traced)
+        lit = LitSources(self, senders, at_sources, own, light, frames)
+        albedo = self.patches.albedo(materials, senders.bodies)
+        radiosity = Radiosity(self, senders, sources, lit, albedo, spheres, frames)
+        return BouncedShading(self, points, own, light, frames, radiosity, senders)
+
+    def flats_of(self, senders: Senders) -> PlacedFlats | None:
+        """The flat bodies among the senders; None without any."""
+        numbers = [number for number in senders.bodies if number in self.flats]
+        if senders not in self._flats and numbers:
+            bodies = []
+            for number in numbers:
+                place, mesh = senders.bodies.index(number), self.assembly.scene.bodies[number].mesh
+                grid, blocks = senders.patches[place].grid, self.assembly.scene.bodies[number].casts_shadow
+                assert grid is not None
+                starts = int(self.assembly.first_vertex[number]), int(senders.first[place])
+                bodies.append(FlatBody(grid, mesh.positions, mesh.surface.faces, *starts, blocks))
+            counts = len(senders.areas), int(self.assembly.first_vertex[-1])
+            found = Flats.of(bodies, *counts, device=self.assembly.device)
+            self._flats[senders] = PlacedFlats(found, {number: k for k, number in enumerate(numbers)})
+        return self._flats.get(senders)
+
+    def patches_of_spheres(self, senders: Senders, body: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """The patches that each sphere that blocks a body's receivers stands in for: where they begin, and numbers."""
+        key = senders, body
+        if key not in self._nodes:
+            self._nodes[key] = patches_of_nodes(*self._nearest(senders, body), merging=self.method.visibility.merging)
+        return self._nodes[key]
+
+    def _nearest(self, senders: Senders, body: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """For each patch the nearest sphere of its body, and for each sphere the nearest patch; −1 for none."""
+        rest, first_sphere = self.assembly.rest, self.assembly.first_sphere
+        centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
+        spheres, start = np.full(len(senders.areas), -1, np.int32), 0
+        nearest = [np.empty(0, int)]
+        for other in self.blocking(body):
+            own = slice(*first_sphere[other : other + 2])
+            count = len(radii[own])
+            of_spheres = np.full(count, -1)
+            if count and other in senders.bodies:
+                place = senders.bodies.index(other)
+                patches, first = senders.patches[place], senders.first[place]
+                spheres[first : senders.first[place + 1]] = start + patches.nearest_spheres(centers[own], radii[own])
+                gaps = np.linalg.norm(centers[own][:, None] - patches.centers, axis=2)
+                of_spheres = first + gaps.argmin(axis=1)
+            nearest.append(of_spheres)
+            start += count
+        return spheres, np.concatenate(nearest)
+
+    def blocking(self, body: int | None) -> list[int]:
+        """Bodies whose spheres block the light of a body's receivers: neither flat ones nor itself."""
+        return [other for other in range(len(self.assembly.scene.bodies)) if other != body and other not in self.flats]
+
+    def past_flats(self, group: Group, seen: Seen, light: Any, senders: Senders, frames: wp.array | None) -> Seen:
+        """What a group sees past flat bodies, too, where no spheres stand in for these."""
+        flats = self.flats_of(senders)
+        if flats is None or not isinstance(light, Cells):
+            return seen
+        given = group.points, seen.through, frames, flats.all, light.directions
+        return seen._replace(through=passing_flats(*given, skip=flats.number.get(group.body)))
+
+    def cells(self, group: Group, seen: Seen, light: Any, spheres: tuple[wp.array, wp.array]) -> SeenCells:
+        """What a group sees in cells, of what it sees, what the method takes of the light, and all spheres."""
+        through, own, directions = seen.through, seen.own, CELLS
+        if isinstance(light, Cells):
+            directions = light.directions
+        else:
+            own, through = None, self._transmittance(group, self.blocking(None), spheres, directions)
+        if own is None and group.body is not None and group.body not in self.flats:
+            own = self._transmittance(group, [group.body], spheres, directions)
+        if through is None:
+            through = wp.full((*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device)
+        return SeenCells(own, through, directions)
+
+    def _transmittance(
+        self, group: Group, bodies: list[int], spheres: tuple[wp.array, wp.array], directions: np.ndarray
+    ) -> wp.array | None:
+        """Transmittance of the spheres of some bodies, [batch, receiver, cell]; None without any."""
+        blocking = self.assembly.spheres_of(bodies, spheres)
+        if not (blocking[1].shape[1] and group.points.size):
+            return None
+        softness, merging = self.method.visibility.softness, self.method.visibility.merging
+        return transmittance(group.points, group.normals, *blocking, directions, softness=softness, merging=merging)
+
+    def factors(self, body: int) -> SparseMatrix:
+        """What share of the hemisphere of each of a body's sites its own patches take, found once, by rays."""
+        if body not in self._factors:
+            sites, patches = self.method.own.sites(body), self.patches.of_body(body)
+            faces = self.assembly.scene.bodies[body].mesh.surface.faces
+            vertices = sites.positions[: self.assembly.first_vertex[body + 1] - self.assembly.first_vertex[body]]
+            pieces = patch_mesh(patches, vertices, faces, device=self.assembly.device)
+            points, normals = sites.positions, sites.normals
+            if self.assembly.is_two_sided[body]:
+                points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
+            found = trace_factors(
+                pieces, patches.of_pieces, patches.count, points, normals, progress=self.method.progress
+            )
+            self._factors[body] = SparseMatrix.of(found, device=self.assembly.device)
+        return self._factors[body]
