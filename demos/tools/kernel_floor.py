@@ -84,6 +84,10 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
     cull = 25 + 2 * SPECIAL  # height above the horizon
     pair = cull + rising * (cone + edge) + reached * 17 * q
     pair_back = pair - 17 * reached * q + rising * (200 + 6 * SPECIAL) + reached * (33 + SPECIAL) * q
+    lit = 23 * reached * q  # a sphere's share of a cell, in four sums
+    pair_light = cull + rising * (cone + edge + 12 + 2 * SPECIAL) + lit
+    pair_light_back = pair_light - lit + rising * (220 + 6 * SPECIAL) + 2 * lit
+    sums = 16 * q * min(1.0, s * reached)  # of cells that a sphere reaches
     harmonic_pair = cone + 20 + 6 * 8 + 4 * 64
     return [
         Stage("pose", "vertex", Work(18, 24, 12), Work(40, 48, 10)),
@@ -107,6 +111,12 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
         Stage("smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 5), Work(60, 64 + 2 * 16 + 64, 5)),
         Stage("slopes", "sample", Work(0, 0, 0), Work(160 + 6 * SPECIAL, 28 + 84, 2)),
         Stage("loss", "sample", Work(8, 32, 2), Work(8, 48, 4)),
+        Stage(
+            "bounces, from spheres",
+            "receiver",
+            Work(s * pair_light + (14 + SPECIAL) * q, 36 + 4 * q + sums, 5),
+            Work(s * pair_light_back + (30 + SPECIAL) * q, 84 + 12 * q + sums, 3),
+        ),
         Stage("visibility, log-SH sum", "pair", Work(harmonic_pair, 0, 1), Work(2.5 * harmonic_pair, 0, 1)),
         Stage(
             "visibility, log-SH exponential",
@@ -140,8 +150,8 @@ def floor(work: Work, items: int) -> float:
 
 
 def is_of_pose_iteration(stage: Stage) -> bool:
-    """Whether a stage is one of a pose iteration with directional visibility and without textures."""
-    return "log-SH" not in stage.name and "texture" not in stage.name
+    """Whether a stage is one of a pose iteration with directional visibility, without textures and bounces."""
+    return not any(word in stage.name for word in ("log-SH", "texture", "bounces"))
 
 
 def iteration_floor(each: list[Stage], size: Size, instances: int) -> float:
