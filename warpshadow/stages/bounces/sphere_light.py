@@ -13,7 +13,7 @@ everything, stays within the radiosities of the patches, and does not depend on 
 
 The walk is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
 something is blocked; they are kept from the forward launch: 16 bytes a receiver and cell, touched only in bundles of
-cells that are blocked in part (a seventh of them on a ground around a body). N bounces keep N times that.
+cells that are blocked in part (a fifth of them on a ground around a body). N bounces keep N times that.
 """
 
 import functools
@@ -498,7 +498,7 @@ def sphere_light(
         What a white receiver reflects of that light, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
 
     Raises:
-        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii, as far as they can be checked.
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
 
     Differentiable: points, normals, centers, radii, exitance, transmittance, unblocked. (The derivative in T is that at
     a fixed blend of spheres.) Not: directions, softness, merging.
@@ -513,7 +513,6 @@ def sphere_light(
     check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
     if unblocked is not None:
         check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
-    check.finite_arrays({"exitance": exitance, "transmittance": transmittance, "unblocked": unblocked})
     device = points.device
     lanes = lane_count(device)
     cells = make_cells(directions, width, device)
