@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import concatenate
-from warpshadow.device.constants import constant
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Node
@@ -18,8 +17,7 @@ from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertice
 from warpshadow.stages.bounces.patches import Patches, find_flat_patches, find_patches
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
-from warpshadow.stages.rasterize import Fragments
-from warpshadow.stages.receivers import Receivers, Span, points_on_faces
+from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.textures.pyramid import Textures
 
 
@@ -160,27 +158,12 @@ class Senders:
         self.barycentrics = _joined([each.sources.barycentrics for each in patches], np.float32).reshape(-1, 3)
         self.areas = _joined([each.areas for each in patches], np.float32)
         weights = _joined([each.sources.weights for each in patches], np.float32)
-        counts = np.cumsum([0, *map(len, sides)]).tolist()
-        self._spans = tuple(
-            Span(*each) for each in zip(bodies, counts[:-1], counts[1:], strict=True) if each[2] > each[1]
-        )
+        self._bodies = np.repeat(bodies, [len(each) for each in sides])
         self.mean = mean_over_sources(_joined(owners, np.int32), weights, int(self.first[-1]), device=assembly.device)
 
     def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
         """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""
-        device, faces = positions.device, self._assembly.faces
-        sides = constant(self.sides[None], wp.int32, device)
-        barycentrics = constant(self.barycentrics[None], wp.vec3, device)
-        none = constant(np.empty(0, np.int32), wp.int32, device)
-        return Receivers(
-            *points_on_faces(positions, normals, faces, sides, barycentrics),
-            faces,
-            none,
-            Fragments(sides, barycentrics),
-            spans=self._spans,
-            vertices=none,
-            seen=Fragments(sides, barycentrics),
-        )
+        return receivers_on_faces(positions, normals, self._assembly.faces, self.sides, self.barycentrics, self._bodies)
 
 
 def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:

@@ -40,9 +40,10 @@ from warpshadow.pipeline.static import Static
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.rasterize import Fragments
-from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.receivers import Receivers, receivers_on_faces
 
 METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
 """How light is blocked."""
@@ -322,6 +323,23 @@ class Renderer:
             spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
         return LitPoints(self._method, self._materials, vertices, spheres, node, self._call())
+
+    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray) -> LitPoints:
+        """Points on faces of the scene's bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
+
+        Args:
+            sides: Face of each, after the last of which their backs are numbered, int of shape [receiver]; those of a
+                body after one another.
+            barycentrics: Where on it, shape [receiver, 3].
+        """
+        traced, assembly, vertices = self._traced(None), self.assembly, self._vertices
+        apart = self._method.apart(traced)
+        bodies = None if apart is None else apart[assembly.body_of_face[sides % len(assembly.body_of_face)]]
+        normals = Node("", vertex_normals, vertices, assembly.faces)
+        given = assembly.faces, sides, barycentrics, bodies
+        node = Node("", receivers_on_faces, vertices, normals, *given)
+        points = self._method, self._materials, vertices, self._spheres, node, self._call()
+        return LitPoints(*points, normals=normals, traced=traced)
 
     @functools.cached_property
     def _own_view(self) -> View:

@@ -337,33 +337,39 @@ def find_receivers(
     return found._replace(spans=spans, vertices=vertices, seen=_seen(sides, own) if own_count else None)
 
 
-def points_on_faces(
-    positions: wp.array, normals: wp.array, faces: wp.array, sides: wp.array, barycentrics: wp.array
-) -> tuple[wp.array, wp.array]:
-    """Gather points on faces, and their normals.
+def receivers_on_faces(
+    positions: wp.array,
+    normals: wp.array,
+    faces: wp.array,
+    sides: np.ndarray,
+    barycentrics: np.ndarray,
+    bodies: np.ndarray | None = None,
+) -> Receivers:
+    """Make receivers of given points on faces, for light alone: no image gets it from them.
 
     Args:
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
-        sides: Faces, from the front or from behind, int32 of shape [1, point].
-        barycentrics: Where on them, vec3 of shape [1, point].
+        sides: Faces, from the front or from behind, int of shape [receiver].
+        barycentrics: Where on them, shape [receiver, 3].
+        bodies: Body of each, −1 for those that need not be told apart, shape [receiver], runs of the same one after
+            another. None where all share what blocks them.
 
-    Returns:
-        Points and unit normals, vec3 of shape [batch, point]; normals of backs are turned over.
-
-    Differentiable: positions, normals, barycentrics.
+    Differentiable: positions, normals.
     """
-    device, count = positions.device, sides.shape[1]
+    device, count = positions.device, len(sides)
     points, point_normals = (wp.empty((len(positions), count), dtype=wp.vec3, device=device) for _ in range(2))
-    none, all_of_them = (constant(np.arange(number), wp.int32, device) for number in (0, count))
+    none, every = (constant(np.arange(number), wp.int32, device) for number in (0, count))
+    seen = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
     launch(
         _gather,
         points.shape,
-        inputs=[positions, normals, faces, sides, barycentrics, none, all_of_them.reshape((1, count))],
+        inputs=[positions, normals, faces, seen.face_ids, seen.barycentrics, none, every.reshape((1, count))],
         outputs=[points, point_normals],
     )
-    return points, point_normals
+    spans = () if bodies is None else _spans(bodies)
+    return Receivers(points, point_normals, faces, none, seen, spans=spans, vertices=none, seen=seen)
 
 
 def _seen(sides: wp.array, own: "_Own") -> Fragments:

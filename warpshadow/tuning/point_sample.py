@@ -21,6 +21,10 @@ class PointReceivers(NamedTuple):
     """Positions [scene units], float32 of shape [receiver, 3]."""
     normals: np.ndarray
     """Unit normals, float32 of shape [receiver, 3]."""
+    sides: np.ndarray
+    """Faces that they lie on, after the last of which backs are numbered, of shape [receiver]."""
+    barycentrics: np.ndarray
+    """And where on them, of shape [receiver, 3]."""
     corners: np.ndarray
     """Receivers of each point, of shape [point, 3]."""
     weights: np.ndarray
@@ -72,10 +76,10 @@ class PointSample:
         faces = stage.assembly.faces
         self._positions = stage.geometry().positions.numpy()[0]
         self._normals = vertex_normals(stage.geometry().positions, faces).numpy()[0]
-        self._vertices = faces.numpy()[face_ids[chosen]]
+        self._vertices, self._sides = faces.numpy()[face_ids[chosen]], face_ids[chosen]
         if self._view.fragments.sides is not None:  # the backs of vertices are numbered after them
-            sides = self._view.fragments.sides.numpy().ravel()
-            self._vertices = self._vertices + len(self._positions) * (sides != face_ids)[chosen, None]
+            self._sides = self._view.fragments.sides.numpy().ravel()[chosen]
+            self._vertices = self._vertices + len(self._positions) * (self._sides != face_ids[chosen])[:, None]
             self._positions = np.tile(self._positions, (2, 1))
             self._normals = np.concatenate([self._normals, -self._normals])
         self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
@@ -119,12 +123,11 @@ class PointSample:
         glimpse = replace(scene.camera, width=1, height=1)
         renderer = Renderer(scene, cameras=[glimpse], device=self._device, progress=self._progress)
         receivers = self.receivers([body.receivers for body in scene.bodies])
-        points, normals = (
-            wp.array(array[None], dtype=wp.vec3, device=renderer.device)
-            for array in (receivers.points, receivers.normals)
-        )
-        view = renderer.at_points(points, normals)
-        shading = renderer.shade(view=view).numpy()[0]
+        sides = receivers.sides
+        order = np.argsort(renderer.assembly.body_of_face[sides % renderer.assembly.first_face[-1]], kind="stable")
+        shading = np.empty((len(sides), 3), np.float32)
+        view = renderer.on_faces(sides[order], receivers.barycentrics[order])
+        shading[order] = renderer.shade(view=view).numpy()[0]
         return np.einsum("pk,pkc->pc", receivers.weights, shading[receivers.corners])
 
     def receivers(self, of_bodies: Sequence[str]) -> PointReceivers:
@@ -134,21 +137,20 @@ class PointSample:
             of_bodies: "vertex" or "pixel" for each body: whether its points are interpolated or receivers themselves.
         """
         is_own = np.array([receivers == "pixel" for receivers in of_bodies])[self.bodies]
-        vertices, corners = np.unique(self._vertices[~is_own], return_inverse=True)
+        vertices, places, corners = np.unique(self._vertices[~is_own], return_index=True, return_inverse=True)
+        # a vertex lies on the face of a point of which it is a corner
+        at_vertices = np.flatnonzero(~is_own)[places // 3]
+        of_receivers = np.concatenate([at_vertices, np.flatnonzero(is_own)])
+        weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], self._weights[is_own]])
         points, normals = (
-            np.einsum("pk,pkc->pc", self._weights[is_own], values[self._vertices[is_own]])
+            np.einsum("pk,pkc->pc", weights, values[self._vertices[of_receivers]])
             for values in (self._positions, self._normals)
         )
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         receivers = np.repeat(len(vertices) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
         receivers[~is_own] = corners.reshape(-1, 3)
-        weights = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
-        return PointReceivers(
-            np.concatenate([self._positions[vertices], points]),
-            np.concatenate([self._normals[vertices], normals]),
-            receivers,
-            weights,
-        )
+        shares = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
+        return PointReceivers(points, normals, self._sides[of_receivers], weights, receivers, shares)
 
     def error(self, shading: np.ndarray) -> float:
         """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""
