@@ -7,7 +7,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.bounces.flat_light import FlatBody, Flats, flat_light, passing_flats
+from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
+from warpshadow.stages.bounces.flats import FlatBody, Flats
 from warpshadow.stages.bounces.patches import find_flat_patches
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

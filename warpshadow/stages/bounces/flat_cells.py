@@ -1,0 +1,286 @@
+"""A cell of directions meets a flat: what is covered, and the radiosity there, with gradients; see flat_light.py."""
+
+import warp as wp
+
+from warpshadow.stages.bounces.flats import FlatGrid
+
+
+@wp.struct
+class FlatScene:
+    """The flats as kernels read them."""
+
+    grids: wp.array(dtype=FlatGrid)
+    levels: wp.array(dtype=wp.vec3i)
+    level_scales: wp.array(dtype=wp.vec2)
+    covered: wp.array(dtype=wp.vec3)
+    skip: int  # the flat that the receivers are part of, -1 for none
+    radius: float  # ρ
+    per_radius: float
+
+
+@wp.func
+def step(z: float):
+    """The smoothstep from 0 at −1 to 1 at 1."""
+    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+@wp.func
+def step_slope(z: float):
+    """Its derivative."""
+    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
+    return 3.0 * u * (1.0 - u)
+
+
+# ---------------------------------------------------------------------------------------------------- coverage
+
+
+@wp.struct
+class Met:
+    """How a cell meets a side of a flat."""
+
+    share: float  # part of the cell that the rectangle takes
+    distance: float  # [units of the body]
+    per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
+    place: wp.vec2  # in the plane
+
+
+@wp.func
+def _is_amid(grid: FlatGrid, met: Met, radius: float):
+    """Whether a footprint is so far from the border that it does not matter."""
+    reach = met.distance * radius * met.per_cosine + grid.margin
+    nearest = wp.min(met.place - grid.least)
+    return wp.min(nearest, wp.min(grid.most - met.place)) > reach
+
+
+@wp.func
+def meet(grid: FlatGrid, scene: FlatScene, at: wp.vec3, toward: wp.vec3, presence: float):
+    """Meet a side.
+
+    Args:
+        grid: The flat.
+        scene: Has the radius of cells.
+        at: Where the receiver is: along both axes, and its height above the side.
+        toward: Direction of the cell along both axes, and its cosine, above −ρ.
+        presence: Part of the side that is there.
+    """
+    met = Met()
+    met.share = presence
+    cosine = toward[2]
+    if cosine < scene.radius:
+        ratio = cosine * scene.per_radius
+        u = 0.5 * ratio + 0.5
+        cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
+        met.share *= step(ratio)
+    met.per_cosine = 1.0 / cosine
+    met.distance = at[2] * met.per_cosine
+    met.place = wp.vec2(at[0] + met.distance * toward[0], at[1] + met.distance * toward[1])
+    if not _is_amid(grid, met, scene.radius):
+        for axis in range(2):
+            slope = toward[axis] * met.per_cosine
+            extent = met.distance * scene.radius * wp.sqrt(1.0 + slope * slope) + grid.margin
+            beyond = (grid.most[axis] - met.place[axis]) / extent
+            before = (grid.least[axis] - met.place[axis]) / extent
+            met.share = met.share * (step(beyond) - step(before))
+    return met
+
+
+@wp.func
+def meet_adjoint(
+    grid: FlatGrid,
+    scene: FlatScene,
+    toward: wp.vec3,
+    presence: float,
+    met: Met,
+    adj_share: float,
+    adj_distance: float,
+    adj_cosine: float,
+    adj_place: wp.vec2,
+):
+    """Gradients of ``at``, ``toward`` and ``presence``, from those of what is met and of the mean cosine c′."""
+    radius = scene.radius
+    horizon = step(toward[2] * scene.per_radius)
+    inside_x = float(1.0)
+    inside_y = float(1.0)
+    adj_t = adj_distance
+    adj_c = adj_cosine
+    adj_x = adj_place[0]
+    adj_y = adj_place[1]
+    adj_toward = wp.vec3()
+    if not _is_amid(grid, met, radius):
+        slope = wp.vec2(toward[0], toward[1]) * met.per_cosine
+        stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
+        extent = met.distance * radius * stretch + wp.vec2(grid.margin, grid.margin)
+        beyond = wp.cw_div(grid.most - met.place, extent)
+        before = wp.cw_div(grid.least - met.place, extent)
+        inside_x = step(beyond[0]) - step(before[0])
+        inside_y = step(beyond[1]) - step(before[1])
+        adj_inside = adj_share * presence * horizon * wp.vec2(inside_y, inside_x)
+        at_most = wp.cw_div(wp.cw_mul(adj_inside, wp.vec2(step_slope(beyond[0]), step_slope(beyond[1]))), extent)
+        at_least = wp.cw_div(wp.cw_mul(adj_inside, wp.vec2(step_slope(before[0]), step_slope(before[1]))), extent)
+        adj_x += at_least[0] - at_most[0]
+        adj_y += at_least[1] - at_most[1]
+        adj_extent = wp.cw_mul(at_least, before) - wp.cw_mul(at_most, beyond)
+        adj_t += radius * wp.dot(adj_extent, stretch)
+        adj_slope = (met.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
+        adj_toward = wp.vec3(adj_slope[0] * met.per_cosine, adj_slope[1] * met.per_cosine, 0.0)
+        adj_c -= wp.dot(adj_slope, slope) * met.per_cosine
+    adj_inside_share = adj_share * inside_x * inside_y
+    adj_t += adj_x * toward[0] + adj_y * toward[1]
+    adj_c -= adj_t * met.distance * met.per_cosine
+    if toward[2] < radius:
+        u = 0.5 * toward[2] * scene.per_radius + 0.5
+        adj_c = adj_c * u * u + adj_inside_share * presence * step_slope(2.0 * u - 1.0) * scene.per_radius
+    adj_toward += wp.vec3(adj_x * met.distance, adj_y * met.distance, adj_c)
+    return wp.vec3(adj_x, adj_y, adj_t * met.per_cosine), adj_toward, adj_inside_share * horizon
+
+
+# ---------------------------------------------------------------------------------------------------- radiosity
+
+
+@wp.struct
+class Spot:
+    """Where a footprint lies on a grid, and how large it is."""
+
+    texel: wp.vec2  # in texels of the finest level, from its corner
+    slopes: wp.vec2  # of that by the place in the plane
+    level: int  # finer of the two levels
+    part: float  # of the coarser one
+    part_slope: float  # of that by the logarithm of the footprint's width
+
+
+@wp.func
+def find_spot(grid: FlatGrid, scene: FlatScene, met: Met):
+    """Find the spot of a footprint."""
+    spot = Spot()
+    x = met.place[0] * grid.per_spread
+    y = met.place[1] * grid.per_spread
+    root_x = 1.0 / wp.sqrt(1.0 + wp.abs(x))
+    root_y = 1.0 / wp.sqrt(1.0 + wp.abs(y))
+    spot.texel = wp.vec2(x * root_x * grid.texels[0] + grid.first[0], y * root_y * grid.texels[1] + grid.first[1])
+    spot.slopes = grid.per_spread * wp.vec2(
+        (1.0 + 0.5 * wp.abs(x)) * root_x * root_x * root_x * grid.texels[0],
+        (1.0 + 0.5 * wp.abs(y)) * root_y * root_y * root_y * grid.texels[1],
+    )
+    width = 2.0 * met.distance * scene.radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * met.per_cosine)
+    while spot.level < grid.level_count - 1 and width >= 2.0:
+        spot.level = spot.level + 1
+        width *= 0.5
+    if width > 1.0 and spot.level < grid.level_count - 1:
+        spot.part = width - 1.0
+        spot.part_slope = width
+    return spot
+
+
+@wp.func
+def _log_slope(z: float):
+    """Derivative of log √g′(z), g the squeeze of a grid's coordinates."""
+    size = wp.abs(z)
+    return wp.sign(z) * (0.25 / (1.0 + 0.5 * size) - 0.75 / (1.0 + size))
+
+
+@wp.struct
+class _Corners:
+    """Four texels of a level around a spot, and where it lies between them."""
+
+    above: int  # the left one above
+    below: int
+    right: int  # what the right one is further on: 1, or 0 in a level of one column
+    s: float
+    t: float
+    slopes: wp.vec2  # of s and t by the texel of the finest level
+
+
+@wp.func
+def _find_corners(scene: FlatScene, number: int, texel: wp.vec2):
+    corners = _Corners()
+    level = scene.levels[number]
+    scale = scene.level_scales[number]
+    last_x = float(level[1] - 1)
+    last_y = float(level[2] - 1)
+    x = texel[0] * scale[0] - 0.5
+    y = texel[1] * scale[1] - 0.5
+    corners.slopes = wp.vec2(
+        wp.where(x > 0.0 and x < last_x, scale[0], 0.0), wp.where(y > 0.0 and y < last_y, scale[1], 0.0)
+    )
+    x = wp.clamp(x, 0.0, last_x)
+    y = wp.clamp(y, 0.0, last_y)
+    column = wp.min(int(x), wp.max(level[1] - 2, 0))
+    row = wp.min(int(y), wp.max(level[2] - 2, 0))
+    corners.s = x - float(column)
+    corners.t = y - float(row)
+    corners.right = wp.min(level[1] - 1, 1)
+    corners.above = level[0] + row * level[1] + column
+    corners.below = corners.above + wp.where(level[2] > 1, level[1], 0)
+    return corners
+
+
+@wp.func
+def _between(texels: wp.array(dtype=wp.vec3), corners: _Corners):
+    above = (1.0 - corners.s) * texels[corners.above] + corners.s * texels[corners.above + corners.right]
+    below = (1.0 - corners.s) * texels[corners.below] + corners.s * texels[corners.below + corners.right]
+    return (1.0 - corners.t) * above + corners.t * below
+
+
+@wp.func
+def _slopes_between(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj: wp.vec3):
+    """Slopes of the dot product with a color, by the texel of the finest level."""
+    a = wp.dot(adj, texels[corners.above])
+    b = wp.dot(adj, texels[corners.above + corners.right])
+    c = wp.dot(adj, texels[corners.below])
+    d = wp.dot(adj, texels[corners.below + corners.right])
+    along = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
+    down = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
+    return wp.vec2(corners.slopes[0] * along, corners.slopes[1] * down)
+
+
+@wp.func
+def fetch(texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: Spot):
+    """Mean over a footprint, in the mip levels from ``first_level`` on."""
+    value = _between(texels, _find_corners(scene, first_level + spot.level, spot.texel))
+    if spot.part > 0.0:
+        coarse = _between(texels, _find_corners(scene, first_level + spot.level + 1, spot.texel))
+        value = (1.0 - spot.part) * value + spot.part * coarse
+    return value
+
+
+@wp.func
+def fetch_adjoint(
+    texels: wp.array(dtype=wp.vec3),
+    grid: FlatGrid,
+    scene: FlatScene,
+    first_level: int,
+    met: Met,
+    spot: Spot,
+    adj: wp.vec3,
+):
+    """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
+    fine = _find_corners(scene, first_level + spot.level, spot.texel)
+    slopes = _slopes_between(texels, fine, adj)
+    adj_log = float(0.0)
+    if spot.part > 0.0:
+        coarse = _find_corners(scene, first_level + spot.level + 1, spot.texel)
+        slopes = (1.0 - spot.part) * slopes + spot.part * _slopes_between(texels, coarse, adj)
+        adj_log = spot.part_slope * wp.dot(adj, _between(texels, coarse) - _between(texels, fine))
+    adj_x = slopes[0] * spot.slopes[0]
+    adj_y = slopes[1] * spot.slopes[1]
+    if adj_log != 0.0:
+        adj_x += adj_log * grid.per_spread * _log_slope(met.place[0] * grid.per_spread)
+        adj_y += adj_log * grid.per_spread * _log_slope(met.place[1] * grid.per_spread)
+    return wp.vec3(adj_x, adj_y, adj_log)
+
+
+@wp.func
+def scatter(adj_texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: Spot, adj: wp.vec3):
+    """Add to the gradients of texels: the adjoint of :func:`fetch` by what is fetched."""
+    part = 1.0 - spot.part
+    for coarser in range(2):
+        if part > 0.0:
+            c = _find_corners(scene, first_level + spot.level + coarser, spot.texel)
+            above = (part * (1.0 - c.t)) * adj
+            below = (part * c.t) * adj
+            wp.atomic_add(adj_texels, c.above, (1.0 - c.s) * above)
+            wp.atomic_add(adj_texels, c.above + c.right, c.s * above)
+            wp.atomic_add(adj_texels, c.below, (1.0 - c.s) * below)
+            wp.atomic_add(adj_texels, c.below + c.right, c.s * below)
+        part = spot.part
