@@ -27,7 +27,8 @@ from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
-from warpshadow.stages.bounces.flat_light import FlatBody, Flats, flat_light, passing_flats
+from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
+from warpshadow.stages.bounces.flats import FlatBody, Flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply

@@ -155,13 +155,12 @@ def find_spot(grid: FlatGrid, scene: FlatScene, met: Met):
     spot = Spot()
     x = met.place[0] * grid.per_spread
     y = met.place[1] * grid.per_spread
-    root_x = 1.0 / wp.sqrt(1.0 + wp.abs(x))
-    root_y = 1.0 / wp.sqrt(1.0 + wp.abs(y))
-    spot.texel = wp.vec2(x * root_x * grid.texels[0] + grid.first[0], y * root_y * grid.texels[1] + grid.first[1])
-    spot.slopes = grid.per_spread * wp.vec2(
-        (1.0 + 0.5 * wp.abs(x)) * root_x * root_x * root_x * grid.texels[0],
-        (1.0 + 0.5 * wp.abs(y)) * root_y * root_y * root_y * grid.texels[1],
+    size_x = 1.0 + wp.abs(x)
+    size_y = 1.0 + wp.abs(y)
+    spot.texel = grid.first + wp.vec2(
+        wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
+    spot.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
     width = 2.0 * met.distance * scene.radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * met.per_cosine)
     while spot.level < grid.level_count - 1 and width >= 2.0:
         spot.level = spot.level + 1
@@ -175,8 +174,7 @@ def find_spot(grid: FlatGrid, scene: FlatScene, met: Met):
 @wp.func
 def _log_slope(z: float):
     """Derivative of log √g′(z), g the squeeze of a grid's coordinates."""
-    size = wp.abs(z)
-    return wp.sign(z) * (0.25 / (1.0 + 0.5 * size) - 0.75 / (1.0 + size))
+    return -0.5 * wp.sign(z) / (1.0 + wp.abs(z))
 
 
 @wp.struct

@@ -21,8 +21,8 @@ nearest takes the cell; where they are at about the same distance, the cell is d
 
     I = 4/Q Σ_q max(n·ω_q, 0) T_q Σ_k h_k B_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
 
-Measured above a ground with the shadow of a disc, 400 receivers on a body over it, 128 cells, 24² nodes: the error of
-I is 1.9% (relative L2), most of it that of 128 cells; 2.7% without mip levels, 2.1% with 16² nodes.
+Measured for 150 receivers on a ball over a ground with the shadow of a disc, 24² nodes: I is off by 2.0% (relative L2)
+with 128 cells and 1.3% with 1024; in a prototype by 2.7 instead of 1.9% without mip levels.
 """
 
 from __future__ import annotations

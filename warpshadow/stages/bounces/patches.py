@@ -39,7 +39,7 @@ _LEARNED = 20_000
 _GRID = 24
 """Nodes along a grid's longer side."""
 
-_EVEN = 1e3
+_EVEN = 100.0
 """Spread of a grid that is even, in sizes of its body."""
 
 _ROUNDING = 1e-6
@@ -82,7 +82,7 @@ class Grid(NamedTuple):
 
     A point has the coordinates (a, b, d) = frame (x − origin). A node is the middle of a texel of
 
-        ξ = g(a / spread),  η = g(b / spread),  g(z) = z / √(1 + |z|)
+        ξ = g(a / spread),  η = g(b / spread),  g(z) = sign(z) log(1 + |z|)
 
     and the texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
     """
@@ -165,14 +165,13 @@ class Patches:
 
 
 def squeezed(z: np.ndarray) -> np.ndarray:
-    """g(z) = z / √(1 + |z|): about z near 0, and √z far from it."""
-    return z / np.sqrt(1 + np.abs(z))
+    """g(z) = sign(z) log(1 + |z|): steps are as long as the distance from the middle, but no shorter than there."""
+    return np.sign(z) * np.log1p(np.abs(z))
 
 
 def stretched(y: np.ndarray) -> np.ndarray:
     """The inverse of :func:`squeezed`."""
-    size = np.abs(y)
-    return np.sign(y) * (size**2 + size * np.sqrt(size**2 + 4)) / 2
+    return np.sign(y) * np.expm1(np.abs(y))
 
 
 def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, count: int = 256) -> Patches:
