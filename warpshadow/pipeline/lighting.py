@@ -1,7 +1,7 @@
 """Lighting: where light is evaluated, and what each method of visibility makes of it there."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -71,6 +71,13 @@ class LitPoints:
         self._scene_shading: Node | None = None
         self._known: tuple[Source, Node] | None = None
         self._transfers: Node | None = None
+        self._kept: dict[str, tuple[Hashable, Node]] = {}
+
+    def kept(self, name: str, given: Hashable, make: Callable[[], Node]) -> Node:
+        """A node that a method makes for the points: that which the name has, as long as it is asked for the same."""
+        if name not in self._kept or self._kept[name][0] != given:
+            self._kept[name] = given, make()
+        return self._kept[name][1]
 
     @property
     def receivers(self) -> Receivers:

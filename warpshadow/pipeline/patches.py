@@ -29,7 +29,7 @@ class ScenePatches:
     """
 
     def __init__(self, assembly: Assembly):
-        self._assembly = assembly
+        self.assembly = self._assembly = assembly
         self._of_body: dict[int, Patches] = {}
         self._means: dict[tuple, SparseMatrix] = {}
         self._senders: dict[tuple[int, ...], Senders] = {}

@@ -1,5 +1,8 @@
 """The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
 
+import functools
+from typing import TYPE_CHECKING
+
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
@@ -10,6 +13,10 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.shading import shade
+
+if TYPE_CHECKING:  # it is imported where light bounces
+    from warpshadow.pipeline.kept_bounces import KeptBounces
 
 Meshes = list[wp.Mesh | None]
 """What blocks the light of each instance of receivers; None for nothing."""
@@ -25,23 +32,59 @@ class Rays(Method):
         super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
 
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
-        """Shading of points in known light, towards which rays are drawn; what bounces comes along paths."""
+        """Shading of points in known light, towards which rays are drawn.
+
+        It bounces along paths from what the scene's bodies reflect; from what a call gives, past what rays found once.
+        """
         meshes = self._meshes(points)
-        direct = Node(
-            "shading",
-            self._shade,
-            meshes,
-            points.receivers_node,
-            light,
-            items=lambda: receiver_words(points),
-            beside=(Node("transfer", None, idle="rays shade known light at once"),),
-        )
+
+        def shaded() -> Node:
+            return Node(
+                "shading",
+                self._shade,
+                meshes,
+                points.receivers_node,
+                light,
+                items=lambda: receiver_words(points),
+                beside=(Node("transfer", None, idle="rays shade known light at once"),),
+            )
+
+        if not self.assembly.scene.bounces:
+            return shaded()
+        direct = points.kept("direct", light, shaded)
+        if materials is points.materials:
+            from warpshadow.pipeline.paths import path_traced
+
+            given = direct, meshes, points, light, materials
+            return path_traced(*given, samples=self._sample_count, progress=self.progress)
+        sources = self._bounces.sources(points, materials)
+
+        def shaded_sources() -> Node:
+            return Node("", self._shade, self._meshes_for(points, sources), sources, light)
+
+        at_sources = points.kept("direct at sources", (light, sources), shaded_sources)
+        return self._bounces.shading(direct, at_sources, points, materials)
+
+    def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """Shading of points in free light."""
+        direct = super().free_shading(points, light, materials)
         if not self.assembly.scene.bounces:
             return direct
-        from warpshadow.pipeline.paths import path_traced
+        sources = self._bounces.sources(points, materials)
 
-        given = direct, meshes, points, light, materials
-        return path_traced(*given, samples=self._sample_count, progress=self.progress)
+        def transfers() -> Node:
+            return Node("", self._transfer, self._meshes_for(points, sources), sources)
+
+        at_sources = points.kept("transfer of sources", sources, transfers)
+        shaded = Node("", lambda transfers, light: shade(transfers[0], light), at_sources, light)
+        return self._bounces.shading(direct, shaded, points, materials)
+
+    @functools.cached_property
+    def _bounces(self) -> "KeptBounces":
+        from warpshadow.pipeline.kept_bounces import KeptBounces
+        from warpshadow.pipeline.patches import ScenePatches
+
+        return KeptBounces(ScenePatches(self.assembly), self.assembly.scene.bounces, progress=self.progress)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -69,6 +112,10 @@ class Rays(Method):
             keeps=False,
             beside=(Node("static shadows", None, idle=alike),),
         )
+
+    def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:
+        """Node of the meshes that rays of other receivers among the same bodies meet."""
+        return Node("", self._casting_meshes, points.vertices, Fixed(receivers), keeps=False)
 
     @property
     def _sample_count(self) -> int:

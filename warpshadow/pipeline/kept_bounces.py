@@ -1,0 +1,161 @@
+"""Bounces where geometry stands still: rays once, then small matrices in each iteration. For the ray-traced method.
+
+Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
+With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces,
+
+    B = a M (S + F B),  M the mean over sources,        starting from B = a M S,
+
+and what receivers get of it, F B. Receivers of an image are many: F is found at some of them, and interpolated.
+It is linear in light, and differentiable in light and albedo.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.lighting import LitPoints, receiver_words
+from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.patches import ScenePatches, Senders
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.factors import trace_factors
+from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
+from warpshadow.stages.bounces.radiosity import patch_radiosity
+from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.receivers import Receivers
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+_RAYS = 1024
+"""Rays of a node or source, which find its form factors."""
+
+
+class _Factors(NamedTuple):
+    """What is kept of a geometry."""
+
+    between: SparseMatrix  # [source, patch]
+    of_nodes: SparseMatrix  # [node, patch], nodes of each view after one another
+    of_receivers: SparseMatrix  # [receiver, node]
+    shape: tuple[int, int]  # views, receivers of each
+
+
+class KeptBounces:
+    """Light that bounces between the bodies of a scene that stand still.
+
+    Args:
+        patches: Of the scene.
+        bounces: How often, 1 or more.
+        progress: Show progress where it takes longer than a second.
+    """
+
+    def __init__(self, patches: ScenePatches, bounces: int, *, progress: bool = False):
+        self._patches, self._bounces, self._progress = patches, bounces, progress
+
+    def sources(self, points: LitPoints, materials: Materials) -> Node:
+        """Node of the points of patches that are lit, of one instance."""
+        senders = self._patches.senders(materials)
+        return points.kept("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
+
+    def shading(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+        """Shading with bounces.
+
+        Args:
+            direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
+            at_sources: Node of that of :meth:`sources`, vec3 of shape [batch, source].
+            points: The receivers.
+            materials: What the bodies reflect.
+        """
+        senders = self._patches.senders(materials)
+        if not senders.bodies:
+            return direct
+
+        def bounce(direct: wp.array, at_sources: wp.array, albedo: wp.array, factors: _Factors) -> wp.array:
+            radiosity = patch_radiosity(albedo, at_sources, senders.mean)
+            for _ in range(self._bounces - 1):
+                lit = total_light([at_sources, multiply(factors.between, radiosity)])
+                radiosity = patch_radiosity(albedo, lit, senders.mean)
+            bounced = multiply(factors.of_receivers, multiply(factors.of_nodes, radiosity))
+            if factors.shape[0] > 1:
+                if len(bounced) > 1:
+                    raise ValueError(
+                        f"light, albedo, textures: got a batch of {len(bounced)} for {factors.shape[0]} views, "
+                        "expected one, which bounces past rays for them all"
+                    )
+                bounced = bounced.reshape(factors.shape)
+            return total_light([direct, bounced])
+
+        return Node(
+            "bounces",
+            bounce,
+            direct,
+            at_sources,
+            self._patches.albedo(materials, senders.bodies),
+            self._factors(points, materials, senders),
+            items=lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces",
+        )
+
+    def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
+        def find(positions: wp.array, sources: Receivers, receivers: Receivers) -> _Factors:
+            from scipy.sparse import block_diag
+
+            if len(positions) > 1:
+                raise ValueError(
+                    f"geometry: got a batch of {len(positions)} for free light or reflectance that bounces past rays, "
+                    "expected one"
+                )
+            mesh, of_faces = self._mesh(positions.numpy()[0], senders)
+
+            def trace(points: np.ndarray, normals: np.ndarray) -> csr_matrix:
+                count = len(senders.areas)
+                return trace_factors(mesh, of_faces, count, points, normals, rays=_RAYS, progress=self._progress)
+
+            at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
+            chosen = [choose_nodes(each) for each in at]
+            at_nodes, of_nodes = (
+                np.concatenate([each[nodes] for each, nodes in zip(places, chosen, strict=True)])
+                for places in (at, facing)
+            )
+            return _Factors(
+                SparseMatrix.of(trace(sources.points.numpy()[0], sources.normals.numpy()[0]), device=device),
+                SparseMatrix.of(trace(at_nodes, of_nodes), device=device),
+                SparseMatrix.of(block_diag(list(map(interpolation, at, facing, chosen))), device=device),
+                at.shape[:2],
+            )
+
+        return points.kept(
+            "form factors",
+            senders,
+            lambda: Node(
+                "form factors",
+                find,
+                points.vertices,
+                self.sources(points, materials),
+                points.receivers_node,
+                items=lambda: f"{len(senders.sides):,} sources × {len(senders.areas):,} patches",
+                has_adjoint=False,
+            ),
+        )
+
+    def _mesh(self, positions: np.ndarray, senders: Senders) -> tuple[wp.Mesh, np.ndarray]:
+        """The mesh that rays meet, of the pieces of all bodies, and the patches of the sides of its faces."""
+        assembly = self._patches.assembly
+        corners, owners = [], []
+        for number, body in enumerate(assembly.scene.bodies):
+            own = positions[assembly.first_vertex[number] : assembly.first_vertex[number + 1]]
+            faces = body.mesh.surface.faces
+            if number in senders.bodies:
+                place = senders.bodies.index(number)
+                patches = senders.patches[place]
+                corners.append(patches.pieces.positions(own, faces))
+                owners.append(np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place]))
+            else:
+                corners.append(own[faces])
+                owners.append(np.full((2, len(faces)), -1))
+        joined = np.concatenate(corners).reshape(-1, 3)
+        points = wp.array(joined, dtype=wp.vec3, device=assembly.device)
+        indices = wp.array(np.arange(len(joined)), dtype=wp.int32, device=assembly.device)
+        return wp.Mesh(points, indices), np.concatenate(owners, axis=1)
