@@ -382,6 +382,32 @@ PLACES, SCALES = [(0, 0, 0), (1.8, 0.7, 0.3)], [1, 0.4]  # of a ground and a bod
 LIGHT = random(0, 4, 3) + 5 * np.eye(4, 1)
 
 
+@pytest.mark.parametrize("sharp", [False, True])
+def test_own_shadows_under_a_rotation(sharp, double, device):
+    """From rotations and places in faces to transmittance, of rows of which nothing is known."""
+    rng = np.random.default_rng(5)
+    lookup, gather = double("stages.own_shadows.lookup"), double("stages.own_shadows.gather")
+    directions = double("maths.directions").fibonacci(16)
+    spreads = np.full(16, 0.1) if sharp else None
+    supports = lookup.find_supports(directions, spreads, 4096, wp.get_device(device))
+    bits = wp.array(rng.integers(0, 2**32, (6, 128), dtype=np.uint32), device=device)
+    cells = wp.array(rng.integers(0, 256, (6, 512), dtype=np.uint8), device=device)
+    rows = double("stages.own_shadows.trace").OwnRows(bits, cells)
+    normals = wp.array(rng.normal(size=(1, 5, 3)), dtype=wp.vec3d, device=device)
+    corners = wp.array(rng.integers(0, 6, (1, 5, 3)), dtype=wp.vec3i, device=device)
+
+    def see(rotations, weights):
+        places = double("stages.own_shadows.sites").Places(corners, weights)
+        return gather.gather_own(normals, places, lookup.find_lookups(rotations, 0, supports), supports, rows)
+
+    matrices = torch.linalg.qr(torch.tensor(rng.normal(size=(2, 1, 3, 3))))[0]
+    given = matrices.requires_grad_(), torch.tensor(rng.uniform(size=(1, 5, 3))).requires_grad_()
+    apply = double("torch").apply
+    assert torch.autograd.gradcheck(
+        lambda *tensors: apply(see, *tensors, dtypes=(wp.mat33d, wp.vec3d)), given, nondet_tol=CUDA_SUMS, **EXACT
+    )
+
+
 @pytest.fixture
 def make_renderer(double, device):
     """Make what torch sees of a scene: a ground that fills the picture, and beside that a body that shadows it."""
@@ -395,7 +421,8 @@ def make_renderer(double, device):
             double("scene.scene").Body(ground, blockers=0, receivers=receivers),
             double("scene.scene").Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
         ]
-        visibility = double("scene.scene").Visibility.of({"method": method, "directions": 16, "order": 3})
+        settings = {"method": method, "directions": 16, "order": 3, "self_shadows": "spheres"}  # rays are float32
+        visibility = double("scene.scene").Visibility.of(settings)
         whole = double("scene.scene").Scene(
             bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1
         )

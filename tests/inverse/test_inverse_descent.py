@@ -218,7 +218,8 @@ def test_candidates_go_on_from_the_best_of_the_stage_before():
     result = fit(problem, stages)
     assert [len(losses) for losses in result.losses] == [1] * 9
     first, second, third = (sum(part, []) for part in (result.losses[:5], result.losses[5:8], result.losses[8:]))
-    assert len(set(first)) == 5 and second == sorted(first)[:3] and third == second[:1]
+    assert len(set(first)) == 5
+    assert second == pytest.approx(sorted(first)[:3], rel=1e-6) and third == pytest.approx(second[:1], rel=1e-6)
     assert first[0] == fit(problem, [Stage(1)]).losses[0][0]  # the scene's own pose takes part
 
 

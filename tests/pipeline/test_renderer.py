@@ -404,8 +404,8 @@ def test_two_bodies_are_the_same_as_one_mesh_of_both(device):
     )
     spheres = ws.Spheres([first.translation, second.translation], [0.8, 0.5])
     one = ws.Body(joined, albedo=(1, 1, 1), blockers=spheres)
-    expected = ws.render(scene_of("directional", first, second, ground()), device=device)
-    image = ws.render(scene_of("directional", one, ground()), device=device)
+    expected = ws.render(scene_of("directional", first, second, ground(), self_shadows="spheres"), device=device)
+    image = ws.render(scene_of("directional", one, ground(), self_shadows="spheres"), device=device)
     assert np.abs(image - expected).max() < FLOAT32
 
 
@@ -638,8 +638,9 @@ def test_a_view_of_another_renderer_is_refused(device):
     np.testing.assert_array_equal(first.draw(view=view).numpy(), image)
 
 
-def test_a_plain_tuple_is_a_geometry(device):
-    renderer = Renderer(scene_of("directional", ball(), light=dome()), device=device)
+def test_a_plain_tuple_is_a_geometry_whose_rotations_are_not_known(device):
+    scene = scene_of("directional", ball(), light=dome(), self_shadows="spheres")
+    renderer = Renderer(scene, device=device)
     plain = tuple(renderer.placed().arrays().values())
     image = renderer.draw().numpy()
     np.testing.assert_array_equal(renderer.draw(view=renderer.view(plain)).numpy(), image)

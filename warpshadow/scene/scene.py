@@ -92,7 +92,7 @@ class Visibility:
     directions: int = 128
     softness: float = SOFTNESS
     merging: float = MERGING
-    self_shadows: str = "spheres"
+    self_shadows: str = "traced"
     order: int = 8
     log: str = "eigen"
     base: str = "quadratic"

@@ -100,7 +100,8 @@ class Deformation(FreeOfBody):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Bend the body, mesh and spheres."""
         points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
-        found.change_body(self.number, mesh=replace(found.scene.bodies[self.number].mesh, positions=points))
+        mesh = replace(found.scene.bodies[self.number].mesh, positions=points)
+        found.change_body(self.number, mesh=mesh, self_shadows="spheres")  # as in the images of the fit
         spheres = found.spheres(self.number)
         if len(spheres):
             found.change_body(self.number, blockers=Spheres(centers, spheres.radii))
@@ -146,6 +147,5 @@ class Radii(FreeOfBody):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Swell and shrink the spheres."""
         spheres = found.spheres(self.number)
-        found.change_body(
-            self.number, blockers=Spheres(spheres.centers, spheres.radii * values["log"].exp().cpu().numpy())
-        )
+        radii = spheres.radii * values["log"].exp().cpu().numpy()
+        found.change_body(self.number, blockers=Spheres(spheres.centers, radii), self_shadows="spheres")

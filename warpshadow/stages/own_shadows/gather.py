@@ -58,7 +58,7 @@ def _gather(
     place = instance_in(batch, rows.shape[0])
     row = rows[place, receiver]
     share = places[instance_in(batch, places.shape[0]), receiver]
-    is_vertex = row[0] == row[1]
+    is_vertex = row[0] == row[1] and row[0] == row[2]
     for q in range(directions.shape[0]):
         passing = float(1.0)
         if wp.dot(normal, directions[q]) > 0.0:
@@ -104,7 +104,7 @@ def _gather_adjoint(
     place = instance_in(batch, rows.shape[0])
     row = rows[place, receiver]
     share = places[instance_in(batch, places.shape[0]), receiver]
-    is_vertex = row[0] == row[1]
+    is_vertex = row[0] == row[1] and row[0] == row[2]
     adj_share = wp.vec3()
     for q in range(directions.shape[0]):
         adj = adj_own[batch, receiver, q]

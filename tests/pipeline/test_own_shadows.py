@@ -1,0 +1,191 @@
+"""Own shadows in images: which bodies have them, how near they are to rays, and their gradients."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import warpshadow as ws
+from warpshadow.pipeline import own_shadows
+from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.renderer import Renderer
+from warpshadow.stages.own_shadows import trace
+from warpshadow.stages.poses import Poses
+from warpshadow.torch import TorchRenderer, rotation_matrices
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+# Differences of shading in float32, at a step where its curvature does not show.
+GRADIENT = 0.01
+STEP = 5e-4
+
+
+@pytest.fixture(scope="module", autouse=True)
+def empty_cache(tmp_path_factory):
+    """Nothing is known from before."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def cup() -> ws.Mesh:
+    """A ball with a deep dent, which darkens itself; its top is open where the dent meets the outside."""
+    ball = ws.icosphere(1.0, 3)
+    points = ball.positions.astype(np.float64)
+    radius = np.linalg.norm(points[:, [0, 2]], axis=1)
+    points[:, 1] = np.where(points[:, 1] > 0, points[:, 1] - 1.5 * np.clip(1 - (radius / 0.7) ** 2, 0, 1), points[:, 1])
+    return ws.Mesh(points, ball.faces)
+
+
+def scene_of(receivers="vertex", *, light=None, bodies=(), **visibility) -> ws.Scene:
+    light = ws.synthetic_sky((-0.6, 0.6, 0.3), height=32, sun_radius=8) if light is None else light
+    body = ws.Body(cup(), blockers=12, rotation=(30, 20, -50), receivers=receivers)
+    camera = ws.Camera.look_at((1.0, 2.5, 3.5), (0, 0, 0), size=(32, 32))
+    settings = {"directions": 64} | visibility
+    return ws.Scene((body, *bodies), light, camera, ws.Visibility.of({"method": "directional"} | settings), 1)
+
+
+def error_of(scene: ws.Scene) -> float:
+    truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility(method="ray-traced", samples=512)))
+    image, covered = ws.render(scene), truth[..., 3] == 1
+    return np.linalg.norm((image - truth)[covered]) / np.linalg.norm(truth[covered])
+
+
+def turned(renderer: Renderer, angles, requires_grad=False) -> Poses:
+    """The scene's poses, each body turned on by angles about the axes of the world."""
+    poses = renderer.scene_poses()
+    x, y, z = angles
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrices = (np.eye(3) + skew + skew @ skew / 2) @ poses.rotations.numpy()
+    rotations = wp.array(matrices, dtype=wp.mat33, device=renderer.device, requires_grad=requires_grad)
+    return Poses(rotations, poses.translations, poses.scales)
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_images_are_nearer_to_rays_than_with_spheres(receivers):
+    errors = [error_of(scene_of(receivers, self_shadows=how, directions=128)) for how in ("traced", "spheres")]
+    assert errors[0] < 0.6 * errors[1] and errors[0] < 0.06
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_gradients_to_rotations_are_central_differences(receivers, device):
+    """Of weighted shading, through vertices, normals, places in faces, and lookups."""
+    renderer = Renderer(scene_of(receivers), device=device)
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=3)
+
+    def shading_of(angles, requires_grad=False):
+        poses = turned(renderer, angles, requires_grad)
+        return poses, renderer.shade(view=renderer.view(renderer.placed(poses)))
+
+    with wp.Tape() as tape:
+        poses, shading = shading_of((0, 0, 0), requires_grad=True)
+    weights = rng.normal(size=(*shading.shape, 3)).astype(np.float32)
+    tape.backward(grads={shading: wp.array(weights, dtype=wp.vec3, device=device)})
+    ends, matrices = [], []
+    for sign in (1, -1):
+        moved, result = shading_of(sign * STEP * axis)
+        if result.shape != shading.shape:
+            pytest.fail("the step is so large that another part is seen")
+        ends.append((weights * result.numpy().astype(float)).sum())
+        matrices.append(moved.rotations.numpy().astype(float))
+    slope = (poses.rotations.grad.numpy() * (matrices[0] - matrices[1])).sum()
+    assert abs(slope - (ends[0] - ends[1])) < GRADIENT * abs(ends[0] - ends[1])
+
+
+def test_without_own_rows_all_is_as_spheres_have_it_in_one_group():
+    scene = scene_of(self_shadows="spheres")
+    renderer = Renderer(scene)
+    assert renderer.view().receivers.spans == ()
+    bodies = [dataclasses.replace(body, self_shadows="spheres") for body in scene.bodies]
+    each = dataclasses.replace(scene, bodies=bodies, visibility=ws.Visibility(directions=64))
+    np.testing.assert_array_equal(ws.render(each), renderer.render())
+
+
+def test_a_body_whose_shape_is_free_is_shadowed_by_its_spheres():
+    renderer = Renderer(scene_of())
+    positions = wp.clone(renderer.rest().positions)
+    geometry = renderer.placed(rest=renderer.deformed(0, positions))
+    assert geometry.deformed == (0,)
+    image = renderer.draw(view=renderer.view(geometry)).numpy()[0]
+    np.testing.assert_array_equal(image, ws.render(scene_of(self_shadows="spheres")))
+    assert "its shape is free" in renderer.explain(geometry=geometry)["own shadows"].forward.why
+
+
+def test_a_geometry_without_rotations_is_shadowed_by_spheres_and_explained():
+    renderer = Renderer(scene_of())
+    plain = Geometry(*renderer.geometry().arrays().values())
+    image = renderer.draw(view=renderer.view(plain)).numpy()[0]
+    np.testing.assert_array_equal(image, ws.render(scene_of(self_shadows="spheres")))
+    assert "geometry has no rotations" in renderer.explain(geometry=plain)["own shadows"].forward.why
+
+
+def test_bodies_that_are_flat_or_cast_no_shadow_are_not_traced(monkeypatch):
+    monkeypatch.setattr(own_shadows, "trace_rows", None)
+    floor, ball = ws.Body(ws.plane(4.0, 8)), ws.Body(ws.icosphere(0.5, 2), blockers=0)
+    scene = dataclasses.replace(scene_of(), bodies=(floor, ball))
+    ws.render(scene)
+
+
+def test_rows_are_traced_once_and_kept_on_disk(monkeypatch):
+    scene = scene_of()
+    renderer = Renderer(scene)
+    first = renderer.render()
+    assert "traced once, kept" in renderer.explain(ws.EnvironmentMap.constant())["own shadows"].items
+    monkeypatch.setattr(own_shadows, "trace_rows", None)
+    moved = dataclasses.replace(scene.bodies[0], translation=(0.1, 0, 0), scale=0.5)
+    ws.render(dataclasses.replace(scene, bodies=(moved,)))
+    np.testing.assert_array_equal(ws.render(scene), first)
+
+
+def test_a_batch_of_poses_is_poses_one_by_one(device):
+    renderer = Renderer(scene_of(), device=device)
+    angles = [(0, 0, 0), (0.3, -0.2, 0.1)]
+    poses = [turned(renderer, each) for each in angles]
+    both = Poses(
+        *(
+            wp.array(np.concatenate([getattr(each, name).numpy() for each in poses]), dtype=dtype, device=device)
+            for name, dtype in (("rotations", wp.mat33), ("translations", wp.vec3), ("scales", wp.float32))
+        )
+    )
+    images = renderer.draw(view=renderer.view(renderer.placed(both))).numpy()
+    for pose, image in zip(poses, images, strict=True):
+        alone = renderer.draw(view=renderer.view(renderer.placed(pose))).numpy()[0]
+        np.testing.assert_allclose(image, alone, atol=1e-5)
+
+
+def test_bodies_that_move_among_static_ones_have_own_shadows():
+    other = ws.Body(ws.icosphere(0.6, 2), blockers=ws.Spheres([[0, 0, 0]], [0.6]), translation=(-1.4, 0.3, 0))
+    renderer = Renderer(scene_of(bodies=(other,)))
+    geometry = renderer.placed(turned(renderer, (0.1, 0, 0)), moving=[0])
+    assert geometry.rotations is not None
+    explanation = renderer.explain(geometry=geometry)
+    assert explanation["own shadows"] and explanation["static shadows"]
+    whole = renderer.placed(turned(renderer, (0.1, 0, 0)))
+    images = [renderer.draw(view=renderer.view(each)).numpy() for each in (geometry, whole)]
+    assert np.abs(images[0] - images[1])[0, :, 16:].max() < 0.05
+
+
+def test_a_mesh_of_too_many_vertices_has_fewer_rays_and_says_so(monkeypatch, tmp_path):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(trace, "MOST_MEMORY", 2**18)
+    with pytest.warns(UserWarning, match=r"642 points have 1024 rays each for the body's shadow on itself"):
+        error = error_of(scene_of())
+    assert error < 0.08
+
+
+def test_torch_carries_rotations_and_what_is_deformed():
+    scene = scene_of()
+    renderer = TorchRenderer(scene)
+    angles = torch.zeros(1, 3, requires_grad=True)
+    rotations, translations, scales = renderer.scene_poses()
+    geometry = renderer.placed(rotation_matrices(angles) @ rotations, translations, scales)
+    assert geometry.rotations.requires_grad and geometry.rotations.shape == (1, 3, 3)
+    image = renderer(geometry=geometry)
+    np.testing.assert_allclose(image.detach().numpy(), ws.render(scene), atol=1e-4)
+    image.square().sum().backward()
+    assert torch.isfinite(angles.grad).all() and angles.grad.any()
+    rest = renderer.deformed(0, torch.tensor(scene.bodies[0].mesh.positions))
+    assert renderer.placed(rotations, translations, scales, rest=rest).deformed == (0,)
