@@ -228,6 +228,62 @@ def test_light_from_spheres_that_merge(double, device, check, quad):
     check(lambda *scene: sphere_light(*scene, None, directions, merging=1.0), *quad, *rest)
 
 
+@pytest.fixture
+def flats(double, device):
+    """A ground and a wall, each of two faces, whose frames are given as such."""
+    grids = double("stages.bounces.patches").find_flat_patches
+    square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
+    faces = np.int32([[0, 1, 2], [0, 2, 3]])
+    near = np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
+    found = [grids(square, faces, is_two_sided=is_two_sided, others=near) for is_two_sided in (False, True)]
+    module = double("stages.bounces.flats")
+    count = found[0].count
+    bodies = [
+        module.FlatBody(patches.grid, square, faces, 4 * number, number * count, True)
+        for number, patches in enumerate(found)
+    ]
+    return module.Flats.of(bodies, 3 * count, 8, device=device)
+
+
+FRAMES = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, -1], [0.1, 0.3, -1.1], [0.9, 0, 0], [0, 0.9, 0]]])
+
+
+def flat_receivers():
+    """Two above the ground in front of the wall, and one below the ground."""
+    return np.array([[[0.3, 0.4, 0.2], [-0.7, 0.9, -0.4], [0.2, -0.3, 0.6]]]), unit(random(3, 1, 3, 3))
+
+
+@pytest.mark.slow
+def test_light_of_flats(double, flats, check):
+    directions = double("maths.directions").fibonacci(16)
+    flat_light = double("stages.bounces.flat_light").flat_light
+    points, normals = flat_receivers()
+    radiosity = np.random.default_rng(0).uniform(size=(1, flats.texels_of_patches.shape[1], 3))
+    given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
+    fixed = wp.array(radiosity, dtype=wp.vec3d, device=flats.grids.device)
+    check(lambda *scene: flat_light(*scene, fixed, flats, directions), *given)
+
+
+def test_what_passes_flats(double, flats, check):
+    directions = double("maths.directions").fibonacci(16)
+    passing_flats = double("stages.bounces.flat_light").passing_flats
+    given = (wp.vec3d, flat_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
+    check(lambda *scene: passing_flats(*scene, flats, directions), *given)
+
+
+def test_radiosity_and_own_light(double, device, check):
+    sparse, own_light = double("stages.bounces.sparse").SparseMatrix, double("stages.bounces.own_light").own_light
+    radiosity = double("stages.bounces.radiosity")
+    mean = radiosity.mean_over_sources(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
+    factors = sparse.of(np.abs(random(0, 5, 3)), device=device)
+    rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
+
+    def light(albedo, shading, weights):
+        return own_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights)
+
+    check(light, (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3)), (wp.vec3d, random(3, 1, 2, 3)))
+
+
 def logs(*sizes):
     """Log-visibility of one instance, of these norms."""
     rows = random(0, 1, len(sizes), 9)
