@@ -136,6 +136,12 @@ def tune(
     ms: Annotated[
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
     ] = None,
+    bounces: Annotated[
+        Optional[int],
+        typer.Option(
+            help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried.", min=0, max=16
+        ),
+    ] = None,
     fit: Annotated[
         bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s each; they are kept for later.")
     ] = False,
@@ -154,7 +160,10 @@ def tune(
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
         loaded = load_scene(scene)
-        tuning = tune_scene(loaded, error=error, milliseconds=ms, fits=fit, device=_device(device), progress=True)
+        where = _device(device)
+        tuning = tune_scene(
+            loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True
+        )
         typer.echo(
             f"{scene}: error of the shading at points of the image, against rays; time of a warm image of "
             f"{loaded.camera.width} × {loaded.camera.height},\nof which shadows are timed on {TIMED_RECEIVERS} "

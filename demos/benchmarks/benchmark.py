@@ -96,6 +96,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         ws.Renderer(scene, device=device).render()
 
     torch_renderer = TorchRenderer(scene, device=device)
+    bounced = TorchRenderer(dataclasses.replace(scene, bounces=2), device=device)
     rotations, translations, scales = torch_renderer.scene_poses()
     translations.requires_grad_()
     batch = rotations.expand(8, *rotations.shape), translations.expand(8, *translations.shape)
@@ -108,9 +109,11 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     def fit_texture() -> None:
         torch_renderer(textures=[None, ground_texture]).square().sum().backward()
 
-    def fit_pose() -> None:
-        geometry = torch_renderer.placed(rotations, translations, scales)
-        torch_renderer(geometry=geometry).square().sum().backward()
+    def fit_pose(renderer: TorchRenderer = torch_renderer) -> None:
+        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
+
+    def fit_pose_with_bounces() -> None:
+        fit_pose(bounced)
 
     def fit_poses() -> None:
         torch_renderer(geometry=torch_renderer.placed(*batch, scales)).square().sum().backward()
@@ -139,10 +142,12 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         "project, rasterize, interpolate and smooth": draw_smoothly,
         "the same, forward and backward": draw_and_back,
         "image of bodies that have moved, directional": whole_image(renderer),
+        "image of bodies that have moved, two bounces": whole_image(bounced.warp),
         "image from the scene, set-up included": from_scratch,
         "iteration of a light fit in torch": fit_light,
         "iteration of a texture fit in torch, 256 × 256 texels": fit_texture,
         "iteration of a pose fit in torch": fit_pose,
+        "iteration of a pose fit in torch, two bounces": fit_pose_with_bounces,
         "iteration of 8 pose fits in a batch": fit_poses,
     }
     size = f"{points.shape[1]} vertices, {faces.shape[0]} faces, {radii.shape[1]} spheres"
@@ -179,6 +184,10 @@ def main(device: str, runs: int) -> None:
     for label, base in (("forward and backward / forward", forward), ("the same / forward, not smoothed", without)):
         ratios = [longer / shorter for longer, shorter in zip(both, base, strict=True)]
         print(f"  {label:54}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
+    for label in ("image of bodies that have moved, two bounces", "iteration of a pose fit in torch, two bounces"):
+        direct = times[label.replace("moved, two bounces", "moved, directional").replace(", two bounces", "")]
+        ratios = [longer / shorter for longer, shorter in zip(times[label], direct, strict=True)]
+        print(f"  {f'{label} / without':54}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
 
 
 def time_fits(device: str) -> None:

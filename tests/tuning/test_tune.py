@@ -302,3 +302,18 @@ def test_a_problem_makes_the_choice_once_and_its_still_method_is_not_left_open()
     assert inverse.Problem(scene, target, inverse.Albedo(0)).scene is resolved(scene)
     with pytest.raises(ValueError, match="still.method: got 'auto'"):
         inverse.Problem(scene, target, inverse.Albedo(0), still=ws.Visibility(method="auto"))
+
+
+def test_errors_can_be_against_all_light_that_bounces(instant, monkeypatch):
+    monkeypatch.setattr(tune, "BOUNCE_COUNTS", (0, 2))
+    tuning = tune.tune(make_scene(), error=1e-6, bounces=4)
+    errors = {count: min(t.error for t in tuning.trials if t.scene.bounces == count) for count in (0, 2)}
+    assert errors[2] < 0.7 * errors[0]
+    assert tuning.scene.bounces == 2
+    assert tomllib.loads(tuning.toml())["light"] == {"bounces": 2}
+
+
+def test_auto_of_a_scene_with_bounces_has_shadows_and_bounces(few):
+    scene = make_scene(visibility=ws.Visibility("auto", error=0.5))
+    chosen = resolved(dataclasses.replace(scene, bounces=1))
+    assert (chosen.visibility.method, chosen.bounces) == ("directional", 1)

@@ -41,6 +41,7 @@ class PointSample:
         scene: The scene; its method is not looked at.
         count: Number of points; fewer where the camera sees fewer.
         direction_count: Rays of each point, drawn in proportion to light.
+        bounces: How often light bounces in the truth, by default as in the scene.
         seed: Of the choice of points.
         device: Where to compute.
         progress: Show progress where something takes longer than a second.
@@ -58,6 +59,7 @@ class PointSample:
         *,
         count: int = 1024,
         direction_count: int = 2048,
+        bounces: int | None = None,
         seed: int = 0,
         device: wp.DeviceLike = "cpu",
         progress: bool = False,
@@ -65,6 +67,7 @@ class PointSample:
         self._device = wp.get_device(device)
         self._progress = progress
         self._direction_count = direction_count
+        self._bounces = scene.bounces if bounces is None else bounces
         bare = replace(scene, visibility=Visibility(method="none"), supersampling=1, bounces=0)
         stage = Renderer(bare, device=device)
         self._view = stage.view()
@@ -102,7 +105,8 @@ class PointSample:
     def _trace(self, receivers: str) -> np.ndarray:
         visibility = Visibility(method="ray-traced", samples=self._direction_count)
         bodies = tuple(replace(body, receivers=receivers) for body in self._scene.bodies)
-        return self.shading(replace(self._scene, bodies=bodies, visibility=visibility, supersampling=1))
+        scene = replace(self._scene, bodies=bodies, visibility=visibility, supersampling=1, bounces=self._bounces)
+        return self.shading(scene)
 
     def decided(self, scene: Scene) -> Scene:
         """A variant of the scene with what a renderer of the whole image chooses for receivers "auto"."""

@@ -25,7 +25,8 @@ def image_times(
     """Estimate how long images take once kernels are compiled and renderers made.
 
     The whole image is timed without shadows, once for each choice of receivers. What shadows add to that is timed on
-    TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them.
+    TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them. Where light bounces, which takes time
+    for patches, too, whatever the receivers, whole images are timed.
 
     Args:
         scenes: Variants of a scene, which differ in visibility, spheres and receivers.
@@ -36,6 +37,9 @@ def image_times(
     Returns:
         Milliseconds of each scene's image, forward.
     """
+    if any(scene.bounces for scene in scenes):
+        images = [whole_image(Renderer(scene, device=device)) for scene in scenes]
+        return median_times(images, runs, progress=progress)
     keys = [tuple(body.receivers for body in scene.bodies) for scene in scenes]
     firsts = dict(zip(reversed(keys), reversed(scenes), strict=True))
     stages = {key: _Stage(scene, device) for key, scene in firsts.items()}

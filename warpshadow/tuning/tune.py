@@ -20,7 +20,7 @@ from warpshadow import check
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility, check_bounces
 from warpshadow.spheres import Spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -28,6 +28,7 @@ from warpshadow.tuning.timing import image_times
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
+BOUNCE_COUNTS = (0, 1, 2, 4)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
 
 EQUAL = 0.1
@@ -97,10 +98,11 @@ class Tuning:
         """What was tried, a line each: "*" marks the Pareto front, ">" what was chosen."""
         front = pareto_front([(trial.milliseconds, trial.error) for trial in self.trials])
         fitted = fitted_counts(self.given)
-        lines = [f"  {'method':18}{'spheres':>12}  {'receivers':16}{'error':>8}{'image':>12}"]
+        lines = [f"  {'method':18}{'bounces':>8}{'spheres':>12}  {'receivers':16}{'error':>8}{'image':>12}"]
         for number, (scene, error, milliseconds) in enumerate(self.trials):
             mark = (">" if scene is self.scene else " ") + ("*" if number in front else " ")
-            columns = f"{_method(scene.visibility):18}{_spheres(scene, fitted):>12}  {_listed(_receivers(scene)):16}"
+            columns = f"{_method(scene.visibility):18}{scene.bounces:8}{_spheres(scene, fitted):>12}"
+            columns += f"  {_listed(_receivers(scene)):16}"
             lines.append(f"{mark}{columns}{error:8.2%}{milliseconds:9.2f} ms")
         return "\n".join(lines)
 
@@ -110,6 +112,8 @@ class Tuning:
         keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
         chosen = {key: getattr(visibility, key) for key in keys.get(visibility.method, ("method",))}
         blocks = [toml_tables.block("[visibility]", chosen)]
+        if self.scene.bounces != self.given.bounces:
+            blocks.insert(0, toml_tables.block("[light]", {"bounces": self.scene.bounces}))
         for number, (before, after) in enumerate(zip(self.given.bodies, self.scene.bodies, strict=True)):
             pairs = {key: (getattr(before, key), getattr(after, key)) for key in ("blockers", "receivers")}
             changes = {key: new for key, (old, new) in pairs.items() if new != old}
@@ -121,7 +125,7 @@ class Tuning:
 def describe(scene: Scene) -> str:
     """Name the settings of a scene in a few words."""
     spheres = f", {_spheres(scene, fitted_counts(scene))} spheres" if scene.visibility.method in SPHERE_METHODS else ""
-    return f"{_method(scene.visibility)}{spheres}, receivers {_listed(_receivers(scene))}"
+    return f"{_method(scene.visibility)}{_bounces(scene)}{spheres}, receivers {_listed(_receivers(scene))}"
 
 
 def _method(visibility: Visibility) -> str:
@@ -130,6 +134,10 @@ def _method(visibility: Visibility) -> str:
         "log-sh": f" {visibility.log} {visibility.order}",
     }
     return visibility.method + details.get(visibility.method, "")
+
+
+def _bounces(scene: Scene) -> str:
+    return f", {scene.bounces} bounce{'s' * (scene.bounces != 1)}" if scene.bounces else ""
 
 
 def _spheres(scene: Scene, fitted: Iterable[int]) -> str:
@@ -156,6 +164,7 @@ def tune(
     *,
     error: float | None = None,
     milliseconds: float | None = None,
+    bounces: int | None = None,
     fits: bool = False,
     device: wp.DeviceLike = "cpu",
     progress: bool = False,
@@ -169,6 +178,8 @@ def tune(
         scene: The scene; its "auto" is not looked at.
         error: Largest relative error of the shading, such as 0.03.
         milliseconds: In place of an error the longest time of an image.
+        bounces: How often light bounces in what errors are against, such as 12 for all that matters: then 0, 1, 2 and
+            4 bounces are tried, too, as far as there are so many. By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
             number is, and others where fits are kept already.
         device: Where to render.
@@ -189,7 +200,9 @@ def tune(
     if wanted is None or None not in given.values():
         raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
     check.positive("error" if milliseconds is None else "milliseconds", wanted)
-    sample = PointSample(scene, device=device, progress=progress)
+    if bounces is not None:
+        check_bounces(bounces)
+    sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE
     fine = [
         body.receivers if receivers == own.receivers else receivers
@@ -197,7 +210,9 @@ def tune(
             scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
         )
     ]
-    settings = list(_settings(scene, fine, fits, device))
+    counts = (scene.bounces,) if bounces is None else [count for count in BOUNCE_COUNTS if count <= bounces]
+    bounced = [replace(scene, bounces=count) for count in counts]
+    settings = [setting for each in bounced for setting in _settings(each, fine, fits, device)]
     bar = tqdm(settings, desc="measuring errors", unit="setting", delay=1, leave=False, disable=not progress)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
