@@ -101,12 +101,16 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
 
 
 def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
-    """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones."""
+    """Find the shape of a body that is bent, from coarse images with soft shadows to fine ones.
+
+    The last stage goes on as long as the loss falls: on six bends of three meshes (five under a bare sun) 40 iterations
+    end at a mean MDE of 2.4%, 150 at 2.2%. With 0.4 of the regularization they end farther off.
+    """
     middle, large = (_scale(problem, size) for size in (64, 128))
     return (
         Stage(50, 0.06, middle, supersampling=1, regularization=4.0, **_soft(problem, 0.7)),
         Stage(100, 0.04, middle, supersampling=1, regularization=2.0),
-        Stage(40, 0.02, large),
+        Stage(150, 0.02, large),
     )
 
 
