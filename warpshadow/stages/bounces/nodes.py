@@ -11,10 +11,10 @@ from warpshadow.maths.spatial_sort import z_order
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-NODE_COUNT = 4096
-"""Nodes of an image: of 256 × 256 pixels one in 16."""
+NODE_COUNT = 2048
+"""Nodes of an image: of 256 × 256 pixels one in 32."""
 
-_NEIGHBORS = 4
+_NEIGHBORS = 3
 
 _TURN = 0.1
 """Distance that a difference of normals by 1 counts as, in parts of the receivers' extent."""
@@ -34,7 +34,7 @@ def choose_nodes(points: np.ndarray, count: int = NODE_COUNT) -> np.ndarray:
 def interpolation(points: np.ndarray, normals: np.ndarray, nodes: np.ndarray) -> csr_matrix:
     """The matrix that interpolates between the nearest nodes, by place and normal.
 
-    With d_i the distances to the nearest nodes in order, the four nearest weigh (1/d_i − 1/d_5)² [Renka 1988].
+    With d_i the distances to the nearest nodes in order, the three nearest weigh (1/d_i − 1/d_4)² [Renka 1988].
 
     Args:
         points: Receivers, shape [receiver, 3].
