@@ -23,10 +23,10 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.directional import Cells, Directional
 from warpshadow.pipeline.lighting import Group, InParts, LitPoints, Seen, SphereMethod, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
+from warpshadow.pipeline.own_factors import own_factors
 from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
-from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
 from warpshadow.stages.bounces.flats import FlatBody, Flats
 from warpshadow.stages.bounces.own_light import own_light
@@ -397,12 +397,10 @@ class SphereBounces:
             sites, patches = self.method.own.sites(body), self.patches.of_body(body)
             faces = self.assembly.scene.bodies[body].mesh.surface.faces
             vertices = sites.positions[: self.assembly.first_vertex[body + 1] - self.assembly.first_vertex[body]]
-            pieces = patch_mesh(patches, vertices, faces, device=self.assembly.device)
             points, normals = sites.positions, sites.normals
             if self.assembly.is_two_sided[body]:
                 points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
-            found = trace_factors(
-                pieces, patches.of_pieces, patches.count, points, normals, progress=self.method.progress
-            )
+            given = patches, vertices, faces, points, normals
+            found = own_factors(*given, device=self.assembly.device, progress=self.method.progress)
             self._factors[body] = SparseMatrix.of(found, device=self.assembly.device)
         return self._factors[body]

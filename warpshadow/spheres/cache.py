@@ -49,7 +49,7 @@ def remembered(
                 held.enter_context(files.locked(path))
         if path.exists():
             try:
-                with np.load(path, allow_pickle=False) as stored:
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                     return read(stored)
             except Exception as problem:  # whatever a damaged file raises: it can always be made again
                 warnings.warn(f"cached {what} {path} cannot be read ({problem}); it is made again", stacklevel=5)

@@ -1,0 +1,72 @@
+"""Form factors between a body's patches and its own sites: found once, by rays in its frame, and kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warpshadow.spheres.cache import cache_path, remembered
+from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.patches import Patches
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+VERSION = 1
+"""Part of the key of cached form factors: raise it whenever they would come out differently."""
+
+_RAYS = 512
+"""Rays of a site."""
+
+
+def own_factors(
+    patches: Patches,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    device: wp.DeviceLike,
+    progress: bool = False,
+) -> csr_matrix:
+    """What share of the hemisphere of each site of a body its own patches take: from the cache, or traced.
+
+    Args:
+        patches: Of the body.
+        positions, faces: Its mesh, NumPy.
+        points: Its sites, shape [site, 3].
+        normals: Unit normals, shape [site, 3].
+        device: Where rays are traced.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        As :func:`~warpshadow.stages.bounces.factors.trace_factors` does.
+    """
+    key = hashlib.sha256(json.dumps([VERSION, _RAYS, patches.count, len(points)]).encode())
+    for array in (patches.pieces.positions(positions, faces), patches.of_pieces, points, normals):
+        key.update(np.ascontiguousarray(array).tobytes())
+
+    def read(stored: Mapping[str, np.ndarray]) -> csr_matrix:
+        from scipy.sparse import csr_matrix
+
+        found = csr_matrix((stored["data"], stored["indices"], stored["indptr"]), (len(points), patches.count))
+        found.check_format(full_check=True)
+        return found
+
+    def trace() -> csr_matrix:
+        mesh = patch_mesh(patches, positions, faces, device=device)
+        given = patches.of_pieces, patches.count, points, normals
+        return trace_factors(mesh, *given, rays=_RAYS, progress=progress)
+
+    return remembered(
+        cache_path("form_factors", key.hexdigest()),
+        read,
+        trace,
+        lambda found: {name: getattr(found, name) for name in ("data", "indices", "indptr")},
+        what="form factors",
+    )
