@@ -65,6 +65,25 @@ def test_in_a_white_furnace_all_is_as_bright_as_the_light(method):
     assert abs(shading - 1).max() < at_most
 
 
+def box(size: tuple[float, float, float], segments: int = 6) -> ws.Mesh:
+    """A box around the origin, with vertices of their own on each side."""
+    side = ws.plane(1.0, segments)  # looks up
+    turns = [np.roll(np.eye(3), shift, axis=0) for shift in range(3)]
+    turns += [np.diag([1, -1, -1]) @ turn for turn in turns]
+    positions = [(side.positions + (0, 0.5, 0)) @ turn for turn in turns]
+    faces = [side.faces + number * side.vertex_count for number in range(6)]
+    return ws.Mesh(np.concatenate(positions) * size, np.concatenate(faces))
+
+
+def test_in_a_white_furnace_a_box_has_no_dark_ground_beside_it():
+    """Its bottom, which lies on the ground and is black, does not count. Measured 0.083, and 0.213 if it does."""
+    body = ws.Body(box((1.6, 0.5, 1.0)), albedo=(1, 1, 1), translation=(0, 0.25, 0))
+    ground = ws.Body(ws.plane(6.0, 24), albedo=(1, 1, 1), blockers=1)
+    light = ws.EnvironmentMap.constant(1.0, height=16)
+    shading = ws.Renderer(ws.Scene([body, ground], light, ON_BOTH, bounces=8)).shade().numpy()
+    assert abs(shading - 1).max() < 0.1
+
+
 def test_bounces_add_ever_less_light():
     """Of albedo a the n-th bounce brings less than a times what the one before brought."""
     shadings = [furnace("directional", bounces, 0.5).mean() for bounces in range(5)]

@@ -202,12 +202,11 @@ def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
 
 
 def test_exitance_of_spheres(double, device, check):
-    directions = double("maths.directions").fibonacci(16)
     nodes = np.int32([0, 2, 3, 3]), np.int32([0, 1, 2])
     check(
-        lambda b, n: double("stages.bounces.exitance").sphere_exitance(b, n, np.ones(3), *nodes, directions),
+        lambda b, g: double("stages.bounces.exitance").sphere_exitance(b, g, np.ones(3), *nodes),
         (wp.vec3d, random(0, 2, 3, 3)),
-        (wp.vec3d, unit(random(1, 2, 3, 3))),
+        (wp.float64, random(1, 2, 3, 5) ** 2),
     )
 
 
@@ -269,6 +268,18 @@ def test_what_passes_flats(double, flats, check):
     passing_flats = double("stages.bounces.flat_light").passing_flats
     given = (wp.vec3d, flat_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
     check(lambda *scene: passing_flats(*scene, flats, directions), *given)
+
+
+def test_what_patches_show(double, flats, check, device):
+    directions = double("maths.directions").fibonacci(16)
+    openness, sparse = double("stages.bounces.openness"), double("stages.bounces.sparse").SparseMatrix
+    points, normals = flat_receivers()
+    spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
+    given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii)
+    check(lambda p, n, r, f: openness.turn_from_flats(p, n, r, spheres, f, flats), *given, (wp.vec3d, FRAMES))
+    mean = sparse.of(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
+    rest = (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2)
+    check(lambda n, t: openness.shown_areas(n, t, mean, directions), *rest)
 
 
 def test_radiosity_and_own_light(double, device, check):

@@ -225,14 +225,13 @@ def blocked_shares(points, centers, radii, directions, softness=0.35):
     return 1 - np.stack(alone, axis=1)
 
 
-def sphere_exitance(radiosity, normals, areas, patches, directions):
+def sphere_exitance(radiosity, shown, areas, patches):
     """Light and area that the patches of spheres show, [sphere, direction, 4]; ``patches`` lists those of a sphere."""
-    table = np.zeros((len(patches), len(directions), 4))
+    table = np.zeros((len(patches), shown.shape[1], 4))
     for row, own in zip(table, patches, strict=True):
-        shown = np.maximum(-normals[own] @ directions.T, 0) + 0.01
         share = areas[own] / areas[own].sum()
-        row[:, 3] = share @ shown if len(own) else 0.25
-        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown, radiosity[own])
+        row[:, 3] = share @ (shown[own] + 0.01) if len(own) else 0.25
+        row[:, :3] = np.einsum("p,pq,pc->qc", share, shown[own] + 0.01, radiosity[own])
     return table
 
 

@@ -137,7 +137,8 @@ def test_a_white_sphere_above_a_plane_sends_what_its_form_factor_says(count, err
     patches /= np.linalg.norm(patches, axis=-1, keepdims=True)
     white = wp.full((1, 40), wp.vec3(0.5, 1.0, 2.0), dtype=wp.vec3, device=device)
     nodes = patches_of_nodes(np.zeros(40, int), np.zeros(1, int))
-    table = sphere_exitance(white, wp.array(patches, dtype=wp.vec3, device=device), np.ones(40), *nodes, directions)
+    shown = wp.array(np.maximum(-patches @ directions.T, 0), dtype=wp.float32, device=device)
+    table = sphere_exitance(white, shown, np.ones(40), *nodes)
     arrays = put([v[None] for v in (points, normals, center, np.array([radius]))] + [None] * 3, device)[:4]
     passing = transmittance(*arrays, directions)
     got = stage.sphere_light(*arrays, table, passing, None, directions).numpy()[0]

@@ -29,11 +29,13 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
 from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
 from warpshadow.stages.bounces.flats import FlatBody, Flats
+from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.radiosity import patch_radiosity
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.bounces.sparse import SparseMatrix
 from warpshadow.stages.bounces.sphere_light import sphere_light
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
 
 CELLS = fibonacci(64)
@@ -55,7 +57,7 @@ class Outgoing:
         bounces: How light bounces.
         senders: The bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
-        normals: Mean normals of the patches in the world, vec3 of shape [batch, patch].
+        shown: Part of the area of each patch that it shows towards each cell, [batch, patch, cell].
         spheres: Centers and radii of all spheres.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · flat].
     """
@@ -65,12 +67,12 @@ class Outgoing:
         bounces: SphereBounces,
         senders: Senders,
         radiosity: wp.array,
-        normals: wp.array,
+        shown: wp.array,
         spheres: tuple[wp.array, wp.array],
         frames: wp.array,
     ):
         self._bounces, self.senders, self.radiosity = bounces, senders, radiosity
-        self._normals, self._spheres, self.frames = normals, spheres, frames
+        self._shown, self._spheres, self.frames = shown, spheres, frames
         self._of_spheres: dict[int | None, tuple[wp.array, wp.array, wp.array]] = {}
 
     def of_body(self, body: int) -> wp.array:
@@ -84,8 +86,8 @@ class Outgoing:
             bounces, senders = self._bounces, self.senders
             others = bounces.blocking(body)
             centers, radii = bounces.assembly.spheres_of(others, self._spheres)
-            given = self.radiosity, self._normals, senders.areas, *bounces.patches_of_spheres(senders, body)
-            self._of_spheres[body] = centers, radii, sphere_exitance(*given, directions)
+            given = self.radiosity, self._shown, senders.areas, *bounces.patches_of_spheres(senders, body)
+            self._of_spheres[body] = centers, radii, sphere_exitance(*given)
         return self._of_spheres[body]
 
 
@@ -213,13 +215,13 @@ class Radiosity(Node):
         """Reflect direct light, then light that has bounced once, and so on."""
         sources, lit, albedo, spheres, frames = self.values(call)
         mean = self._senders.mean
-        normals = multiply(mean, sources.normals)
+        shown = self._bounces.shown(self._senders, sources, [part.cells for part in lit], spheres, frames)
         direct = joined([part.shading for part in lit])
         bounced: list[wp.array] = []
         for bounce in range(self._bounces.count):
             light = total_light([direct, *bounced])
             radiosity = self._reflect.run(call, albedo, light, mean)
-            outgoing = Outgoing(self._bounces, self._senders, radiosity, normals, spheres, frames)
+            outgoing = Outgoing(self._bounces, self._senders, radiosity, shown, spheres, frames)
             if bounce + 1 < self._bounces.count:
                 bounced = [joined([self._gather(call, part, outgoing) for part in lit])]
         return outgoing
@@ -285,6 +287,7 @@ class SphereBounces:
         self.flats = self.patches.flats
         self._factors: dict[int, SparseMatrix] = {}
         self._flats: dict[Senders, PlacedFlats] = {}
+        self._spheres_of_sources: dict[Senders, np.ndarray] = {}
         self._nodes: dict[tuple[Senders, int | None], tuple[np.ndarray, np.ndarray]] = {}
         if isinstance(method, Directional):
             method.flats = self.flats
@@ -359,6 +362,41 @@ class SphereBounces:
     def blocking(self, body: int | None) -> list[int]:
         """Bodies whose spheres block the light of a body's receivers: neither flat ones nor itself."""
         return [other for other in range(len(self.assembly.scene.bodies)) if other != body and other not in self.flats]
+
+    def shown(
+        self,
+        senders: Senders,
+        sources: Receivers,
+        cells: list[SeenCells],
+        spheres: tuple[wp.array, wp.array],
+        frames: wp.array | None,
+    ) -> wp.array:
+        """What patches show of their area towards cells, [batch, patch, cell].
+
+        Args:
+            senders: The bodies whose patches they are.
+            sources: Where these are lit.
+            cells: What the sources see, in parts.
+            spheres: Centers and radii of all spheres.
+            frames: Where flat bodies are.
+        """
+        normals, flats = sources.normals, self.flats_of(senders)
+        if flats is not None:
+            _, radii = self.assembly.spheres_of(self.blocking(None), spheres)
+            normals = turn_from_flats(sources.points, normals, radii, self._spheres_of(senders), frames, flats.all)
+        rows = [
+            wp.full_like(part.through, 1.0, requires_grad=False) if part.own is None else part.own for part in cells
+        ]
+        passing = joined([row.reshape((len(row), -1)) for row in rows])
+        directions = cells[0].directions
+        passing = passing.reshape((len(passing), len(senders.sides), len(directions)))
+        return shown_areas(normals, passing, senders.mean, directions)
+
+    def _spheres_of(self, senders: Senders) -> np.ndarray:
+        """The sphere that stands in for each source, among those of bodies that are not flat; −1 for none."""
+        if senders not in self._spheres_of_sources:
+            self._spheres_of_sources[senders] = self._nearest(senders, None)[0][senders.patch_of_source]
+        return self._spheres_of_sources[senders]
 
     def past_flats(self, group: Group, seen: Seen, light: Any, senders: Senders, frames: wp.array | None) -> Seen:
         """What a group sees past flat bodies, too, where no spheres stand in for these."""

@@ -142,6 +142,7 @@ class Senders:
         areas: Of all patches, in units of their bodies, float32 of shape [patch].
         sides: Side of a face that each source lies on, int32 of shape [source].
         barycentrics: And where on it, float32 of shape [source, 3].
+        patch_of_source: The patch that it belongs to, int32 of shape [source].
         mean: The matrix of means over sources, [patch, source].
     """
 
@@ -157,9 +158,10 @@ class Senders:
         self.sides = _joined(sides, np.int32)
         self.barycentrics = _joined([each.sources.barycentrics for each in patches], np.float32).reshape(-1, 3)
         self.areas = _joined([each.areas for each in patches], np.float32)
+        self.patch_of_source = _joined(owners, np.int32)
         weights = _joined([each.sources.weights for each in patches], np.float32)
         self._bodies = np.repeat(bodies, [len(each) for each in sides])
-        self.mean = mean_over_sources(_joined(owners, np.int32), weights, int(self.first[-1]), device=assembly.device)
+        self.mean = mean_over_sources(self.patch_of_source, weights, int(self.first[-1]), device=assembly.device)
 
     def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
         """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""

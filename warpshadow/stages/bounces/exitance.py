@@ -2,16 +2,17 @@
 
 A patch p belongs to a sphere near it. Towards a receiver that sees the sphere in direction ω, its patches send
 
-    E_j(ω) = Σ_p A_p g_p B_p / Σ_p A_p g_p,   g_p = max(−n_p·ω, 0) + 0.01
+    E_j(ω) = Σ_p A_p (g_p + 0.01) B_p / Σ_p A_p (g_p + 0.01)
 
-the mean of their radiosities B by the area that they show. Patches that face away count for a hundredth of their area:
-where none shows itself the mean is still one, so it is smooth, and nothing is divided by zero.
+the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.openness`). Patches that face
+away, or are hidden, count for a hundredth of their area: where none shows itself the mean is still one, so it is
+smooth, and nothing is divided by zero.
 
 What a receiver sees through a cell is a mean over the spheres in it (:mod:`warpshadow.stages.bounces.sphere_light`).
 There, too, patches should count by the area that they show: the spheres on the far side of a body show none. So
-numerator and denominator stay apart, both over Σ_p A_p. On a ground around a bunny of 64 spheres that is in the sky
-and the sun the light that the bunny sends is 14% off by either, of a sun alone 33%, where equal weights give 37%; of
-a white bunny 8% and without bias, where equal weights lose 6% of the light.
+numerator and denominator stay apart, both over Σ_p A_p. By g_p = max(−n_p·ω, 0), on a ground around a bunny of 64
+spheres that is in the sky and the sun the light that the bunny sends is 14% off by either, of a sun alone 33%, where
+equal weights give 37%; of a white bunny 8% and without bias, where equal weights lose 6% of the light.
 """
 
 import numpy as np
@@ -21,10 +22,9 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.maths.directions import check_directions
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
-_TURNED = wp.constant(0.01)
+_HIDDEN = wp.constant(0.01)
 """Part of its area that a patch counts for where it shows none."""
 
 _SHOWN = wp.constant(0.25)
@@ -57,22 +57,22 @@ def patches_of_nodes(
 class Patches:
     """Patches of nodes, as kernels see them."""
 
-    normals: wp.array2d(dtype=wp.vec3)
+    shown: wp.array3d(dtype=wp.float32)
     areas: wp.array(dtype=wp.float32)
     starts: wp.array(dtype=wp.int32)
     numbers: wp.array(dtype=wp.int32)
 
 
 @wp.func
-def _sum_up(batch: int, node: int, direction: wp.vec3, radiosity: wp.array2d(dtype=wp.vec3), patches: Patches):
-    """Σ A g B and Σ A g, both over Σ A, and Σ A."""
+def _sum_up(batch: int, node: int, direction: int, radiosity: wp.array2d(dtype=wp.vec3), patches: Patches):
+    """Σ A (g + 0.01) B and Σ A (g + 0.01), both over Σ A, and Σ A."""
     light = wp.vec3()
     shown = float(0.0)
     area = float(0.0)
     for k in range(patches.starts[node], patches.starts[node + 1]):
         patch = patches.numbers[k]
-        normal = patches.normals[instance_in(batch, patches.normals.shape[0]), patch]
-        part = patches.areas[patch] * (wp.max(-wp.dot(normal, direction), 0.0) + _TURNED)
+        open = patches.shown[instance_in(batch, patches.shown.shape[0]), patch, direction]
+        part = patches.areas[patch] * (open + _HIDDEN)
         light += part * radiosity[instance_in(batch, radiosity.shape[0]), patch]
         shown += part
         area += patches.areas[patch]
@@ -89,13 +89,12 @@ def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     patches: Patches,
-    directions: wp.array(dtype=wp.vec3),
     # out
     exitance: wp.array3d(dtype=wp.vec4),
 ):
     """A thread owns a node and a direction."""
     batch, node, direction = wp.tid()
-    light, shown, _area = _sum_up(batch, node, directions[direction], radiosity, patches)
+    light, shown, _area = _sum_up(batch, node, direction, radiosity, patches)
     exitance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], shown)
 
 
@@ -104,40 +103,36 @@ def _tabulate_adjoint(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
     patches: Patches,
-    directions: wp.array(dtype=wp.vec3),
     adj_exitance: wp.array3d(dtype=wp.vec4),
     # out
     adj_radiosity: wp.array2d(dtype=wp.vec3),
-    adj_normals: wp.array2d(dtype=wp.vec3),
+    adj_shown: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a node and a direction:  B̄_p = A g L̄ / ΣA,  n̄_p = −ω A (L̄·B_p + s̄) / ΣA where −n·ω > 0."""
-    batch, node, number = wp.tid()
-    direction = directions[number]
-    adj = adj_exitance[batch, node, number]
+    """A thread owns a node and a direction:  B̄_p = A (g + 0.01) L̄ / ΣA,  ḡ_p = A (L̄·B_p + s̄) / ΣA."""
+    batch, node, direction = wp.tid()
+    adj = adj_exitance[batch, node, direction]
     adj_light = wp.vec3(adj[0], adj[1], adj[2])
     _light, _shown, area = _sum_up(batch, node, direction, radiosity, patches)
     if area > 0.0:
         for k in range(patches.starts[node], patches.starts[node + 1]):
             patch = patches.numbers[k]
-            normal_batch = instance_in(batch, patches.normals.shape[0])
+            shown_batch = instance_in(batch, patches.shown.shape[0])
             radiosity_batch = instance_in(batch, radiosity.shape[0])
             share = patches.areas[patch] / area
-            cosine = -wp.dot(patches.normals[normal_batch, patch], direction)
             if adj_radiosity:
-                factor = share * (wp.max(cosine, 0.0) + _TURNED)
+                factor = share * (patches.shown[shown_batch, patch, direction] + _HIDDEN)
                 wp.atomic_add(adj_radiosity, radiosity_batch, patch, factor * adj_light)
-            if adj_normals and cosine > 0.0:
+            if adj_shown:
                 pull = share * (wp.dot(adj_light, radiosity[radiosity_batch, patch]) + adj[3])
-                wp.atomic_add(adj_normals, normal_batch, patch, -pull * direction)
+                wp.atomic_add(adj_shown, shown_batch, patch, direction, pull)
 
 
 def sphere_exitance(
     radiosity: wp.array,
-    normals: wp.array,
+    shown: wp.array,
     areas: np.ndarray,
     starts: np.ndarray,
     numbers: np.ndarray,
-    directions: np.ndarray,
 ) -> wp.array:
     """Light that spheres send towards cells of directions, for :func:`.sphere_light.sphere_light`.
 
@@ -145,21 +140,20 @@ def sphere_exitance(
 
     Args:
         radiosity: Of patches: what white under a radiance of 1 sends is 1, vec3 of shape [batch, patch].
-        normals: Unit normals of patches in the world, vec3 of shape [batch, patch].
+        shown: g, part of its area that each patch shows towards each cell, float32 of shape [batch, patch, direction],
+            from :func:`.openness.shown_areas`.
         areas: Of patches [scene units², or any other, the same for all], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_nodes`.
-        directions: Unit vectors ω from a receiver towards the sphere, NumPy of shape [direction, 3].
 
     Returns:
-        Σ A g B / Σ A and Σ A g / Σ A, vec4 of shape [batch, node, direction].
+        Σ A (g + 0.01) B / Σ A and Σ A (g + 0.01) / Σ A, vec4 of shape [batch, node, direction].
 
-    Differentiable: radiosity, normals.
+    Differentiable: radiosity, shown.
     """
-    check_directions(directions)
-    batch_count = common_batch({"radiosity": radiosity, "normals": normals})
+    batch_count = common_batch({"radiosity": radiosity, "shown": shown})
     patch_count = len(areas)
     check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
-    check.shape("normals", normals.shape, (normals.shape[0], patch_count))
+    check.shape("shown", shown.shape, (shown.shape[0], patch_count, "direction"))
     check.finite("areas", np.asarray(areas), least=0.0)
     if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(numbers):
         raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(numbers)} numbers, rising")
@@ -167,17 +161,17 @@ def sphere_exitance(
         raise ValueError(f"numbers: got {min(numbers)} to {max(numbers)}, expected patches, 0 to {patch_count - 1}")
     device = radiosity.device
     patches = Patches()
-    patches.normals = normals
+    patches.shown = shown
     patches.areas = constant(np.asarray(areas, np.float32), wp.float32, device)
     patches.starts = constant(np.asarray(starts, np.int32), wp.int32, device)
     patches.numbers = constant(np.asarray(numbers, np.int32), wp.int32, device)
-    inputs = [radiosity, patches, constant(directions, wp.vec3, device)]
-    shape = batch_count, len(starts) - 1, len(directions)
+    inputs = [radiosity, patches]
+    shape = batch_count, len(starts) - 1, shown.shape[2]
     return differentiable(
         lambda exitance: launch(_tabulate, shape, inputs=inputs, outputs=[exitance]),
         lambda adj_exitance: launch(
-            _tabulate_adjoint, shape, inputs=[*inputs, adj_exitance], outputs=[radiosity.grad, normals.grad]
+            _tabulate_adjoint, shape, inputs=[*inputs, adj_exitance], outputs=[radiosity.grad, shown.grad]
         ),
         result=wp.empty(shape, dtype=wp.vec4, device=device),
-        variables=[radiosity, normals],
+        variables=[radiosity, shown],
     )
