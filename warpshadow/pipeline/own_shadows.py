@@ -28,7 +28,7 @@ from warpshadow.stages.own_shadows.trace import RAYS, OwnRows, ray_count, trace_
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers, Span
 
-VERSION = 1
+VERSION = 2
 """Part of the key of cached rows: raise it whenever they would come out differently."""
 
 _FLAT = 1.0e-5

@@ -82,23 +82,35 @@ def _slope(toward: wp.vec3):
 
 
 @wp.func
-def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
-    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
+def is_met(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Whether a ray from a receiver meets a face of a mesh."""
+    a, b, c, across, _lies_on = _seen_from(
+        point,
+        normal,
+        wp.mesh_get_point(mesh, 3 * face),
+        wp.mesh_get_point(mesh, 3 * face + 1),
+        wp.mesh_get_point(mesh, 3 * face + 2),
+    )
+    return _meets(toward, a, across, _volumes(toward, a, b, c))
+
+
+@wp.func
+def find_blocker(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Find a face of a mesh that a ray from a receiver meets, not always the first, -1 for none; mesh 0 has none."""
     if mesh == wp.uint64(0):
-        return True
+        return int(-1)
     query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
     face = int(0)
     while wp.bvh_query_next(query, face):
-        a, b, c, across, _lies_on = _seen_from(
-            point,
-            normal,
-            wp.mesh_get_point(mesh, 3 * face),
-            wp.mesh_get_point(mesh, 3 * face + 1),
-            wp.mesh_get_point(mesh, 3 * face + 2),
-        )
-        if _meets(toward, a, across, _volumes(toward, a, b, c)):
-            return False
-    return True
+        if is_met(mesh, face, point, normal, toward):
+            return face
+    return int(-1)
+
+
+@wp.func
+def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
+    """Whether a ray from a receiver meets no face of a mesh; 0 is the mesh that has none."""
+    return find_blocker(mesh, point, normal, toward) < 0
 
 
 @wp.struct

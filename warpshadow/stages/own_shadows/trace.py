@@ -4,18 +4,23 @@ Rays leave in D Fibonacci directions. Each run of 8 of them is a coarse cell, wh
 escape, weighted with their cosines. A ray below the horizon of its site takes the fate of the ray mirrored at the
 tangent plane: so a cell at the horizon, half of which is below, is as open as its upper half.
 
+Of each bundle of 4 rays, the one in the middle is traced first, the probe. The others are traced if the 9 probes in and
+around the bundle differ; else they take their fate. Two fifths of the rays so find the edges of shadows: of a bunny
+0.03% of the bits differ. Rods less than 3° wide, which pass between probes, lose a few percent of their shadows.
+
 A site takes D/8 bytes of bits and D/8 bytes of cells, 1 kB with 4096 rays; its back takes as much. Of a body whose
 sites would so take more than :data:`MOST_MEMORY`, fewer rays are traced.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
-from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.ray_tracing import RAY_COST, escapes, parts
+from warpshadow.maths.directions import BUNDLE, cell_radius, fibonacci
+from warpshadow.stages.ray_tracing import RAY_COST, find_blocker, is_met, parts
 
 RAYS = 4096
 """Rays of a site, if memory allows."""
@@ -31,6 +36,9 @@ MOST_MEMORY = 2**28
 
 _MIRRORED = 3.5
 """Angle below the horizon to which rays are mirrored, in radii of a coarse cell: no lookup reaches farther."""
+
+_PROBES = 9
+"""Probes that must agree: a bundle's own and those next to it."""
 
 
 class OwnRows(NamedTuple):
@@ -58,8 +66,40 @@ def ray_count(row_count: int) -> int:
     return count
 
 
+class _Pass(NamedTuple):
+    """Bundles of rays that are traced unless probes agree.
+
+    Args:
+        members: Rays of each bundle, first its probe if that is known: int32 of shape [bundle, 4].
+        probes: Those that must agree, int32 of shape [bundle, 9]; none in the first pass.
+        known: Members whose fate is known before.
+    """
+
+    members: np.ndarray
+    probes: np.ndarray
+    known: int
+
+
+@functools.cache
+def _passes(count: int) -> tuple[_Pass, _Pass]:
+    """Find the probes, and then what is between them."""
+    directions, members = fibonacci(count), np.arange(count).reshape(-1, BUNDLE)
+    cosines = np.einsum("bmx,bx->bm", directions[members], directions[members].sum(axis=1))
+    members = np.take_along_axis(members, np.argsort(-cosines, axis=1), axis=1)
+    probes = members[:, 0]
+    nearest = np.argpartition(-directions[probes] @ directions[probes].T, _PROBES - 1, axis=1)[:, :_PROBES]
+    first = probes.reshape(-1, BUNDLE)
+    return _Pass(first, np.empty((len(first), 0), int), 0), _Pass(members, probes[nearest], 1)
+
+
+@wp.func
+def _bit(bits: wp.array2d(dtype=wp.uint32), row: int, ray: int):
+    """Whether a ray escapes, 1 or 0."""
+    return int((bits[row, ray // 32] >> wp.uint32(ray % 32)) & wp.uint32(1))
+
+
 @wp.kernel(enable_backward=False)
-def _trace_rows(
+def _trace_pass(
     first_row: int,
     worker: int,
     # in
@@ -68,35 +108,68 @@ def _trace_rows(
     normals: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     lowest: float,
+    members: wp.array2d(dtype=wp.int32),
+    probes: wp.array2d(dtype=wp.int32),
+    known: int,
     # out
     bits: wp.array2d(dtype=wp.uint32),
-    cells: wp.array2d(dtype=wp.uint8),
 ):
-    """A thread owns a row."""
+    """A thread owns a row, whose bits are zero before the first pass."""
     row = first_row + wp.tid()
     point = points[row]
     normal = normals[row]
-    for word in range(bits.shape[1]):
-        found = wp.uint32(0)
-        for cell in range(4):
-            passing = float(0.0)
-            total = float(0.0)
-            for i in range(8):
-                toward = directions[32 * word + 8 * cell + i]
+    last = int(-1)
+    for bundle in range(members.shape[0]):
+        count = int(0)
+        open_count = int(0)
+        for k in range(probes.shape[1]):
+            probe = probes[bundle, k]
+            if wp.dot(normal, directions[probe]) > -lowest:
+                count += 1
+                open_count += _bit(bits, row, probe)
+        is_open = count > 0 and open_count == count
+        is_blocked = count > 0 and open_count == 0
+        if not is_blocked:
+            for k in range(known, members.shape[1]):
+                ray = members[bundle, k]
+                toward = directions[ray]
                 cosine = wp.dot(normal, toward)
                 if cosine > -lowest:
-                    up = toward
-                    if cosine < 0.0:
-                        up = toward - 2.0 * cosine * normal
-                    total += wp.abs(cosine)
-                    if escapes(mesh, point, normal, up):
-                        passing += wp.abs(cosine)
-                        found |= wp.uint32(1) << wp.uint32(8 * cell + i)
-            share = float(1.0)
-            if total > 0.0:
-                share = passing / total
-            cells[row, 4 * word + cell] = wp.uint8(int(255.0 * share + 0.5))
-        bits[row, word] = found
+                    blocker = int(-1)
+                    if not is_open:
+                        up = toward - 2.0 * wp.min(cosine, 0.0) * normal
+                        blocker = last  # the likeliest
+                        if last < 0 or not is_met(mesh, last, point, normal, up):
+                            blocker = find_blocker(mesh, point, normal, up)
+                    if blocker < 0:
+                        bits[row, ray // 32] = bits[row, ray // 32] | (wp.uint32(1) << wp.uint32(ray % 32))
+                    else:
+                        last = blocker
+
+
+@wp.kernel(enable_backward=False)
+def _average(
+    # in
+    normals: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    lowest: float,
+    bits: wp.array2d(dtype=wp.uint32),
+    # out
+    cells: wp.array2d(dtype=wp.uint8),
+):
+    """A thread owns a coarse cell of a row."""
+    row, cell = wp.tid()
+    passing = float(0.0)
+    total = float(0.0)
+    for ray in range(RUN * cell, RUN * cell + RUN):
+        cosine = wp.dot(normals[row], directions[ray])
+        if cosine > -lowest:
+            total += wp.abs(cosine)
+            passing += wp.abs(cosine) * float(_bit(bits, row, ray))
+    share = float(1.0)
+    if total > 0.0:
+        share = passing / total
+    cells[row, cell] = wp.uint8(int(255.0 * share + 0.5))
 
 
 def trace_rows(
@@ -116,17 +189,18 @@ def trace_rows(
     device, row_count = mesh.points.device, len(points)
     places, facing = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals))
     directions = wp.array(fibonacci(count), dtype=wp.vec3, device=device)
+    passes = [
+        (*(wp.array(rays, dtype=wp.int32, device=device) for rays in (step.members, step.probes)), step.known)
+        for step in _passes(count)
+    ]
     rows = OwnRows(
-        wp.empty((row_count, count // 32), dtype=wp.uint32, device=device),
+        wp.zeros((row_count, count // 32), dtype=wp.uint32, device=device),
         wp.empty((row_count, count // RUN), dtype=wp.uint8, device=device),
     )
     lowest = float(np.sin(min(_MIRRORED * cell_radius(count // RUN), np.pi / 2)))
     for part in parts(row_count, 2**21 // count, progress):
-        launch(
-            _trace_rows,
-            part.stop - part.start,
-            inputs=[mesh.id, places[part], facing[part], directions, lowest],
-            outputs=[array[part] for array in rows],
-            cost=RAY_COST * count / 2,
-        )
+        at, cost = (places[part], facing[part], directions, lowest), RAY_COST * count / 8
+        for step in passes:
+            launch(_trace_pass, len(at[0]), inputs=[mesh.id, *at, *step], outputs=[rows.bits[part]], cost=cost)
+    launch(_average, rows.cells.shape, inputs=[facing, directions, lowest, rows.bits], outputs=[rows.cells])
     return rows
