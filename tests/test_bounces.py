@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -27,8 +28,9 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline import lighting
-from warpshadow.torch import TorchRenderer
+from warpshadow.pipeline import bounces as pipeline_bounces
+from warpshadow.pipeline import kept_bounces, lighting
+from warpshadow.torch import TorchRenderer, rotation_matrices
 
 METHODS = ("directional", "log-sh")
 
@@ -131,9 +133,13 @@ def test_black_bodies_send_nothing():
 def test_it_says_what_runs_for_bounces_and_what_does_not():
     renderer = ws.Renderer(bounced("directional", ON_BOTH))
     light = wp.zeros((1, renderer.basis.size), dtype=wp.vec3, requires_grad=True)
-    explained = renderer.explain(light)
+    explained = renderer.explain(light, geometry=renderer.placed())
     for name in ("own light", "flat light", "sphere light", "radiosity", "own light of sources"):
         assert explained[name].forward and explained[name].backward, name
+    still = renderer.explain(light)
+    for name in ("form factors", "transfer of sources", "bounces"):
+        assert still[name].forward, name
+    assert still["bounces"].backward and not still["form factors"].backward
     only = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[:1])
     explained = ws.Renderer(only).explain()
     assert explained["flat light"].forward.why == "nothing flat reflects"
@@ -252,3 +258,82 @@ def test_one_instance_of_anything_serves_all_with_bounces(name):
     for instance in range(2):
         one = {key: value[instance : instance + 1] if key in varied else value for key, value in given.items()}
         torch.testing.assert_close(image_of_batch(renderer, one)[0], images[instance], rtol=1e-5, atol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------------- what stands still
+
+
+@pytest.mark.parametrize("name", ["light", "albedo"])
+@pytest.mark.parametrize("method", METHODS)
+def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monkeypatch):
+    """Rays find form factors once, for nearly the image by spheres; nothing of geometry is computed again."""
+    image_of = Given(TorchRenderer(bounced(method, ON_BOTH)), name)
+    renderer = image_of.renderer
+    values = image_of.start.reshape(image_of.shape)
+    given = {"light": values} if name == "light" else {"albedo": list(values)}
+    with torch.no_grad():
+        kept = image_of(image_of.start)
+        anew = renderer(**given, geometry=renderer.placed(*renderer.scene_poses()))
+        direct = TorchRenderer(dataclasses.replace(renderer.scene, bounces=0))(**given)
+    assert relative_error(direct[..., :3].numpy(), anew[..., :3].numpy()) > 0.04
+    assert relative_error(kept[..., :3].numpy(), anew[..., :3].numpy()) < 0.02
+
+    def refuse(*_, **__):
+        raise AssertionError("it is computed again")
+
+    monkeypatch.setattr(kept_bounces, "trace_factors", refuse)
+    monkeypatch.setattr(type(renderer.warp._method), "see", refuse)
+    monkeypatch.setattr(pipeline_bounces, "passing_flats", refuse)
+    with torch.no_grad():
+        assert torch.equal(image_of(image_of.start), kept)
+        assert not torch.equal(image_of(0.5 * image_of.start), kept)
+
+
+def test_transfer_vectors_are_refused_where_light_bounces():
+    renderer = ws.Renderer(bounced("directional", ON_BOTH))
+    with pytest.raises(
+        ValueError, match=r"scene\.bounces: got 2, expected 0 for transfer vectors.* shade and draw take"
+    ):
+        renderer.transfer()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_flat_body_is_not_bent_where_light_bounces(method):
+    renderer = ws.Renderer(bounced(method, ON_BOTH, blockers=1))
+    bent = renderer.scene.bodies[1].mesh.positions[None].copy()
+    bent[..., 1] += 0.2 * bent[..., 0] ** 2
+    bent = wp.array(bent, dtype=wp.vec3)
+    with pytest.raises(ValueError, match=r"positions: got some for body 1 \('plane'\), which is flat; expected None"):
+        renderer.deformed(1, bent)
+    renderer.deformed(1, radii=renderer.rest().radii[:, -1:])
+    ws.Renderer(dataclasses.replace(renderer.scene, bounces=0)).deformed(1, bent)
+
+
+# ---------------------------------------------------------------------------------------------- as anything else runs
+
+
+def test_bodies_that_stand_among_moving_ones_are_lit_as_if_they_moved():
+    """With bounces nothing is kept of what stands: images are the same, and so are gradients to what moves."""
+    renderer = TorchRenderer(bounced("directional", ON_GROUND, blockers=1, directions=32))
+    images, gradients = [], []
+    for moving in ([0], None):
+        turns = torch.full((2, 3), 0.1, requires_grad=True)
+        rotations, translations, scales = renderer.scene_poses()
+        rotations = torch.cat([rotation_matrices(turns[:1]) @ rotations[:1], rotations[1:]])
+        image = renderer(geometry=renderer.placed(rotations, translations, scales, moving=moving))
+        image.square().sum().backward()
+        images.append(image.detach())
+        gradients.append(turns.grad)
+    torch.testing.assert_close(*images, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-3 * float(gradients[1].abs().max()))
+    assert gradients[1][0].any()
+
+
+def test_threads_share_a_renderer_of_light_that_bounces():
+    renderer = ws.Renderer(bounced("directional", ON_BOTH, directions=32))
+    black = {0: wp.zeros((1, 1), dtype=wp.vec3)}
+    expected = [ws.Renderer(renderer.scene).draw(albedo=given).numpy() for given in (None, black)] * 2
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda given: renderer.draw(albedo=given).numpy(), [None, black] * 2))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)

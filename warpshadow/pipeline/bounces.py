@@ -21,6 +21,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.directional import Cells, Directional
+from warpshadow.pipeline.kept_bounces import KeptBounces
 from warpshadow.pipeline.lighting import Group, InParts, LitPoints, Seen, SphereMethod, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.own_factors import own_factors
@@ -36,6 +37,7 @@ from warpshadow.stages.bounces.sparse import SparseMatrix
 from warpshadow.stages.bounces.sphere_light import sphere_light
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.shading import shade
 from warpshadow.stages.visibility.directional import transmittance
 
 CELLS = fibonacci(64)
@@ -158,6 +160,11 @@ class Gathering:
         return sphere_light(*given, softness=visibility.softness, merging=visibility.merging)
 
 
+def _shade(transfers: list[wp.array], light: wp.array) -> wp.array:
+    """Light receivers by what groups of them see of free light. Differentiable: light."""
+    return joined([shade(transfer, light) for transfer in transfers])
+
+
 def _expanded(rows: wp.array, count: int) -> wp.array:
     """Repeat an array [1, receiver, cell] for every instance. Differentiable: rows."""
     return expand(rows.reshape((len(rows), -1)), count).reshape((count, *rows.shape[1:]))
@@ -186,6 +193,21 @@ class LitSources(InParts):
         seen = self.see(call, part, own)
         shading = self.light(call, part, self._bounces.past_flats(part, seen, own, self._senders, frames), own)
         return LitPart(shading, part, self._bounces.cells(part, seen, own, spheres))
+
+
+class DirectLight(InParts):
+    """Direct light, or transfer vectors, past flat bodies; arguments are those of :class:`InParts`."""
+
+    def __init__(self, bounces: SphereBounces, senders: Senders, frames: Node, *given: Any, **options: Any):
+        self._bounces, self._senders = bounces, senders
+        super().__init__(bounces.method, *given, extra=(frames,), **options)
+
+    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
+        """Light a part."""
+        (frames,) = extra
+        return self.light(
+            call, part, self._bounces.past_flats(part, self.see(call, part, own), own, self._senders, frames), own
+        )
 
 
 class Radiosity(Node):
@@ -305,16 +327,55 @@ class SphereBounces:
         if not senders.bodies:
             idle = Node("bounces", None, idle="every body is black")
             return InParts(self.method, points, own, light, joined, beside=(idle,))
-        spheres, flats = points.spheres, self.flats_of(senders)
-        frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
+        frames = self._frames(points, senders)
         words = f"{len(senders.sides):,} sources"
         sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
-        given = self.method, materials, points.vertices, spheres, sources, points.call
-        at_sources = LitPoints(*given, normals=points.normals, traced=points.traced)
-        lit = LitSources(self, senders, at_sources, own, light, frames)
+        lit = LitSources(self, senders, self._at(sources, points, materials), own, light, frames)
         albedo = self.patches.albedo(materials, senders.bodies)
-        radiosity = Radiosity(self, senders, sources, lit, albedo, spheres, frames)
+        radiosity = Radiosity(self, senders, sources, lit, albedo, points.spheres, frames)
         return BouncedShading(self, points, own, light, frames, radiosity, senders)
+
+    def kept_shading(self, points: LitPoints, own: Any, light: Source, materials: Materials) -> Node:
+        """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.
+
+        Args:
+            points: The receivers, among bodies that stand where the scene has them.
+            own: What the method takes of the light, or of any where it is free.
+            light: The light, known or free.
+            materials: What the bodies reflect.
+        """
+        sources, where = self._still.sources(points, materials), " of sources"
+        at_sources = points.kept("lit sources", sources, lambda: self._at(sources, points, materials))
+        if isinstance(light.value(), wp.array):
+            direct = Node("shading", _shade, points.transfers, light)
+            transfers = points.kept("transfer", sources, lambda: self.method.transfers(at_sources, where))
+            lit = Node(f"shading{where}", _shade, transfers, light)
+        else:
+            direct = points.kept("direct", light, lambda: self.direct(points, own, light, joined))
+            make = functools.partial(self.direct, at_sources, own, light, joined, where=where)
+            lit = points.kept("direct at sources", (light, sources), make)
+        return self._still.shading(direct, lit, points, materials)
+
+    def direct(
+        self, points: LitPoints, own: Any, light: Source | None, finish: Callable, **options: Any
+    ) -> DirectLight:
+        """Direct light of points, as :class:`InParts` finds it, past flat bodies."""
+        senders = self.patches.senders(points.materials)
+        return DirectLight(self, senders, self._frames(points, senders), points, own, light, finish, **options)
+
+    @functools.cached_property
+    def _still(self) -> KeptBounces:
+        return KeptBounces(self.patches, self.count, progress=self.method.progress)
+
+    def _at(self, sources: Node, points: LitPoints, materials: Materials) -> LitPoints:
+        """Sources, to be lit among the bodies among which points are."""
+        given = self.method, materials, points.vertices, points.spheres, sources, points.call
+        return LitPoints(*given, normals=points.normals, traced=points.traced)
+
+    def _frames(self, points: LitPoints, senders: Senders) -> Node:
+        """Node of where flat bodies are; its value is None without any."""
+        flats = self.flats_of(senders)
+        return Node("", flats.all.frames if flats else lambda _: None, points.vertices)
 
     def flats_of(self, senders: Senders) -> PlacedFlats | None:
         """The flat bodies among the senders; None without any."""

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
@@ -29,6 +29,8 @@ KnownLight = EnvironmentMap | np.ndarray
 Light = KnownLight | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
+Kept = TypeVar("Kept")
+
 PART = 1 << 13
 """Receivers that are lit at once where no gradient is asked for."""
 
@@ -49,6 +51,7 @@ class LitPoints:
         static: The static bodies among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         traced: The bodies whose own spheres do not block their light.
+        stands: Whether bodies and points are where the scene and its camera have them, for good.
     """
 
     def __init__(
@@ -62,8 +65,9 @@ class LitPoints:
         static: Static | None = None,
         normals: Node | None = None,
         traced: Traced = NOT_TRACED,
+        stands: bool = False,
     ):
-        self.traced = traced
+        self.traced, self.stands = traced, stands
         self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
@@ -71,10 +75,10 @@ class LitPoints:
         self._scene_shading: Node | None = None
         self._known: tuple[Source, Node] | None = None
         self._transfers: Node | None = None
-        self._kept: dict[str, tuple[Hashable, Node]] = {}
+        self._kept: dict[str, tuple[Hashable, Any]] = {}
 
-    def kept(self, name: str, given: Hashable, make: Callable[[], Node]) -> Node:
-        """A node that a method makes for the points: that which the name has, as long as it is asked for the same."""
+    def kept(self, name: str, given: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What a method makes for the points: that which the name has, as long as it is asked for the same."""
         if name not in self._kept or self._kept[name][0] != given:
             self._kept[name] = given, make()
         return self._kept[name][1]
@@ -295,10 +299,22 @@ class Seen(NamedTuple):
 
 
 class Bouncing(Protocol):
-    """How light bounces in a scene: what is added to a method of spheres."""
+    """How light bounces in a scene: what is added to a method of spheres.
+
+    Attributes:
+        flats: Bodies that lie in a plane.
+    """
+
+    flats: tuple[int, ...]
 
     def shading(self, points: LitPoints, own: Node, light: Source, materials: Materials) -> Node:
         """Shading of points, direct and bounced, given what the method takes of the light."""
+
+    def kept_shading(self, points: LitPoints, own: Any, light: Source, materials: Materials) -> Node:
+        """The same of points that stand still; what does not depend on light and materials is kept."""
+
+    def direct(self, points: LitPoints, own: Any, light: Source | None, finish: Callable, **options: Any) -> Node:
+        """Direct light of points, as :class:`InParts` finds it, past flat bodies."""
 
 
 class SphereMethod(Method):
@@ -351,23 +367,27 @@ class SphereMethod(Method):
         """Shading of points in known light, which bounces from the materials."""
         own = self._in_scene_light if light is self.light else Node("", self.in_known, light)
         if self.bounces is not None:
-            return self.bounces.shading(points, own, light, materials)
+            is_kept = points.stands and materials is not points.materials
+            return (self.bounces.kept_shading if is_kept else self.bounces.shading)(points, own, light, materials)
         return InParts(self, points, own, light, joined)
 
     def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces, found with the light as if that were known."""
         if self.bounces is None:
             return super().free_shading(points, light, materials)
+        if points.stands:
+            return self.bounces.kept_shading(points, self.in_free, light, materials)
         return self.bounces.shading(points, Node("", self._in_given, light), light, materials)
 
     def _in_given(self, light: wp.array) -> Any:
         """What the method takes of free light that is given. Differentiable: light."""
         return self.in_free._replace(coefficients=_converted(light, self.own_from_basis))
 
-    def transfers(self, points: LitPoints) -> Node:
+    def transfers(self, points: LitPoints, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to what the method computes in."""
         matrix = self.own_from_basis
-        own = InParts(self, points, self.in_free, None, list, keeps=matrix is None)
+        make = functools.partial(InParts, self) if self.bounces is None else self.bounces.direct
+        own = make(points, self.in_free, None, list, keeps=matrix is None, where=where)
         if matrix is None or own.requires_grad:
             return own
 

@@ -204,8 +204,20 @@ class Renderer:
         Returns:
             All bodies at rest, for :meth:`placed`, in arrays of their own.
 
+        Raises:
+            ValueError: for other vertices of a flat body where light bounces by spheres, for which it stays in its
+                plane.
+
         Differentiable: positions, centers, radii, rest.
         """
+        if positions is not None and isinstance(self._method, SphereMethod) and self._method.bounces is not None:
+            number = self.scene.body_number(body)
+            if number in self._method.bounces.flats:
+                raise ValueError(
+                    f"positions: got some for body {number} ({self.scene.bodies[number].called!r}), which is flat; "
+                    f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
+                    'reflects and blocks as a part of a plane; set bounces = 0, or take method "ray-traced"'
+                )
         return self.assembly.deformed(body, positions, centers, radii, rest=rest)
 
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
@@ -290,6 +302,7 @@ class Renderer:
             call=self._call(),
             camera=self.cameras[0],
             counts=(len(poses), image_count),
+            stands=geometry is None and clip_matrices is None and image_count == 1,
         )
 
     def _traced(self, geometry: Geometry | None, last: LitPoints | None = None) -> Traced:
@@ -381,7 +394,15 @@ class Renderer:
         """Transfer vectors of what the scene shows to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
         Cameras share the receivers at vertices, for which there is one view. Not to be written to.
+
+        Raises:
+            ValueError: where light bounces, which a vector for all colors cannot say.
         """
+        if self.scene.bounces:
+            raise ValueError(
+                f"scene.bounces: got {self.scene.bounces}, expected 0 for transfer vectors, which are of direct light; "
+                "shade and draw take free light that bounces, with any method"
+            )
         view = self._own_view
         parts = view.transfers.value(self._call(view))
         if len(parts) == 1:

@@ -40,6 +40,7 @@ class View(LitPoints):
         call: Has what may not be kept of it.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
+        stands: As for :class:`LitPoints`.
 
     Attributes:
         given: Vertices, spheres, cameras, static bodies and traced ones.
@@ -59,6 +60,7 @@ class View(LitPoints):
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
+        stands: bool = False,
     ):
         self.given = vertices, spheres, cameras, static, traced
         self._apart = method.apart(traced)
@@ -67,7 +69,7 @@ class View(LitPoints):
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, cameras, static)
-        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, traced)
+        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, traced, stands)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
