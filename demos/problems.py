@@ -1,7 +1,7 @@
 """The inverse problems of the paper on a body and a ground: the true scene, where a fit starts, and how it is measured.
 
 Targets are ray traced with sixteen samples a pixel, sampled otherwise than what a fit traces for itself, so that no fit
-is given its own errors.
+is given its own errors. With ``bounces`` they are path traced; ``Case.by`` says how often light bounces in the fit.
 """
 
 import dataclasses
@@ -36,12 +36,18 @@ class Case:
     measure: Callable[[ws.Scene], dict[str, float]]
     shown: Callable[[ws.Scene], ws.Scene] = staticmethod(lambda scene: scene)
 
-    def by(self, visibility: ws.Visibility | None) -> inverse.Problem:
-        """The problem, computed by another method wherever it is; None for rays where nothing moves."""
-        if visibility is None:
+    def by(self, visibility: ws.Visibility | None, bounces: int = 0) -> inverse.Problem:
+        """The problem, solved by another method wherever it is; None for rays where nothing moves.
+
+        Args:
+            visibility: The method.
+            bounces: How often light bounces in the fit, whatever the targets have.
+        """
+        own = self.problem.scene
+        if visibility is None and bounces == own.bounces:
             return self.problem
-        scene = dataclasses.replace(self.problem.scene, visibility=visibility)
-        return dataclasses.replace(self.problem, scene=scene, still=None)
+        scene = dataclasses.replace(own, visibility=visibility or own.visibility, bounces=bounces)
+        return dataclasses.replace(self.problem, scene=scene, still=None if visibility else self.problem.still)
 
 
 def ray_traced(scene: ws.Scene, samples: int = 2048) -> np.ndarray:
@@ -50,10 +56,17 @@ def ray_traced(scene: ws.Scene, samples: int = 2048) -> np.ndarray:
     return ws.render(dataclasses.replace(scene, visibility=visibility, supersampling=4))
 
 
-def body_on_ground(mesh: ws.Mesh, sky: ws.EnvironmentMap, size: int = SIZE, spheres: int = 64) -> ws.Scene:
-    """A body of 2 units on a ground of 6, a pixel image of ``size``."""
+def body_on_ground(
+    mesh: ws.Mesh, sky: ws.EnvironmentMap, size: int = SIZE, spheres: int = 64, bounces: int = 0
+) -> ws.Scene:
+    """A body of 2 units on a ground of 6, an image of ``size`` × ``size`` pixels, and as many bounces of light."""
     scene = on_ground(mesh, sky, blockers=spheres)
-    return dataclasses.replace(scene, camera=scene.camera.resized(size / scene.camera.width))
+    return dataclasses.replace(scene, camera=scene.camera.resized(size / scene.camera.width), bounces=bounces)
+
+
+def unshadowed(scene: ws.Scene) -> ws.Scene:
+    """A scene of which no more than what the camera sees is asked."""
+    return dataclasses.replace(scene, visibility=DIRECT, bounces=0)
 
 
 def changed(scene: ws.Scene, number: int, **changes: object) -> ws.Scene:
@@ -76,40 +89,42 @@ def pattern(seed: int, size: int = 128) -> np.ndarray:
     return np.clip(colors * wave[..., None], 0, 1).astype(np.float32)
 
 
-def texture_case(mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_hidden: bool = False) -> Case:
+def texture_case(
+    mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_hidden: bool = False, bounces: int = 0
+) -> Case:
     """The texture of the ground, in the shadow of a body that the camera may not see; light and shapes are known.
 
     The image has 256 × 256 pixels, so that they are not much larger than texels.
     """
-    truth = changed(body_on_ground(mesh, sky, size=256), 1, texture=pattern(seed))
+    truth = changed(body_on_ground(mesh, sky, size=256, bounces=bounces), 1, texture=pattern(seed))
     if is_hidden:
         camera = ws.Camera.look_at((1.9, 4.0, 0.2), (1.9, 0.0, 0.2), up=(0, 0, -1), fov_y=24)  # beside the body
         truth = dataclasses.replace(truth, camera=camera)
     start = changed(truth, 1, texture=np.full_like(truth.bodies[1].texture, 0.5))
     problem = inverse.Problem(start, inverse.Target(ray_traced(truth)), inverse.Texture(1))
-    seen = ws.Renderer(dataclasses.replace(truth, visibility=DIRECT)).seen_texels(1) >= 4  # samples: a pixel
+    seen = ws.Renderer(unshadowed(truth)).seen_texels(1) >= 4  # samples: a pixel
 
     def measure(scene: ws.Scene) -> dict[str, float]:
         difference = (scene.bodies[1].texture - truth.bodies[1].texture)[seen]
         return {"texture MSE": float(np.mean(difference**2))}
 
-    def unshadowed(scene: ws.Scene) -> ws.Scene:
+    def evenly_lit(scene: ws.Scene) -> ws.Scene:
         return dataclasses.replace(scene, light=ws.EnvironmentMap.constant(1.0))
 
-    return Case(problem, truth, (inverse.Stage(200, learning_rate=0.05),), measure, unshadowed)
+    return Case(problem, truth, (inverse.Stage(200, learning_rate=0.05),), measure, evenly_lit)
 
 
 # ------------------------------------------------------------------------------------------------ light
 
 
 def light_case(
-    mesh: ws.Mesh, sky: ws.EnvironmentMap, others: list[ws.Mesh], *, light: inverse.Light | None = None, **sizes: int
+    mesh: ws.Mesh, sky: ws.EnvironmentMap, others: list[ws.Mesh], *, light: inverse.Light | None = None, **options: int
 ) -> Case:
     """The light on a body and its ground, judged by the images of other bodies in it."""
-    truth = body_on_ground(mesh, sky, **sizes)
+    truth = body_on_ground(mesh, sky, **options)
     start = dataclasses.replace(truth, light=ws.EnvironmentMap.constant(0.5))
     problem = inverse.Problem(start, inverse.Target(ray_traced(truth)), light or inverse.Light())
-    relit = [body_on_ground(other, sky, **sizes) for other in others]
+    relit = [body_on_ground(other, sky, **options) for other in others]
     images = [ray_traced(scene) for scene in relit]
 
     def measure(scene: ws.Scene) -> dict[str, float]:
@@ -163,9 +178,11 @@ def displaced(body: ws.Body, rng: np.random.Generator) -> ws.Body:
     return dataclasses.replace(body, rotation=rotation.as_rotvec(degrees=True), translation=translation)
 
 
-def pose_case(mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_shadow_alone: bool = False, **sizes: int) -> Case:
+def pose_case(
+    mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_shadow_alone: bool = False, **options: int
+) -> Case:
     """Six numbers: where a body is, from one image of it and its shadow, or of the ground alone."""
-    truth = body_on_ground(mesh, sky, **sizes)
+    truth = body_on_ground(mesh, sky, **options)
     start = changed(truth, 0, **placement(displaced(truth.bodies[0], np.random.default_rng(seed))))
     target = inverse.Target(ray_traced(truth), ground_alone(truth) if is_shadow_alone else None)
     problem = inverse.Problem(start, target, inverse.Pose(0), inverse.Loss("huber"))
@@ -184,7 +201,7 @@ def placement(body: ws.Body) -> dict[str, object]:
 
 def ground_alone(scene: ws.Scene) -> np.ndarray:
     """Mask of the pixels that see nothing but the ground, the second body."""
-    ids = ws.Renderer(dataclasses.replace(scene, visibility=DIRECT, supersampling=4)).body_ids()[0]
+    ids = ws.Renderer(dataclasses.replace(unshadowed(scene), supersampling=4)).body_ids()[0]
     height, width = scene.camera.height, scene.camera.width
     return (ids.reshape(height, 4, width, 4) == 1).all(axis=(1, 3)).astype(np.float32)
 
@@ -211,10 +228,10 @@ def bent(mesh: ws.Mesh, seed: int) -> ws.Mesh:
 
 
 def deformation_case(
-    mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_shadow_alone: bool = False, **sizes: int
+    mesh: ws.Mesh, sky: ws.EnvironmentMap, seed: int, *, is_shadow_alone: bool = False, **options: int
 ) -> Case:
     """The shape of a body that was bent, from one image of it and its shadow, or of the ground alone."""
-    start = body_on_ground(mesh, sky, **sizes)
+    start = body_on_ground(mesh, sky, **options)
     truth = changed(start, 0, mesh=bent(mesh, seed))
     target = inverse.Target(ray_traced(truth), ground_alone(truth) if is_shadow_alone else None)
     problem = inverse.Problem(start, target, inverse.Deformation(0), inverse.Loss("huber"))

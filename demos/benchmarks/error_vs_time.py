@@ -14,7 +14,11 @@ pixels, against rays through the meshes, 4096 a pixel.
 
 Also measured: rays at few directions; Mitsuba 3 where it is installed, and how many times as long it needs to come as
 near to its own image of 4096 samples as our default does; whether any setting is both faster and more accurate than
-the default; and what the default's error consists of. It prints tables and writes error_vs_time.json and .png.
+the default; and what the default's error consists of.
+
+Then the same against full light, path traced with all bounces: without shadows, the default, which knows direct light
+alone, and the default with 1, 2 and 4 bounces, beside Mitsuba's path integrator. It prints tables and writes
+error_vs_time.json and .png.
 """
 
 import argparse
@@ -24,9 +28,11 @@ import itertools
 import json
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -47,6 +53,8 @@ SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
 RAY_COUNTS = (16, 64, 256)
 PATH_COUNTS = (4, 16, 64, 256, 1024)
 TRUE_COUNT = 4096  # rays or paths of a pixel
+BOUNCES = (1, 2, 4)
+ALL_BOUNCES = 12  # of full light: what comes after is less than the noise of the truth
 RECHECKS = 4  # times as many runs where it matters who is faster
 MARGIN = 0.1  # by which a setting has to be better than the default in both
 CONVERGED = 1 / 16  # threshold of the exponential
@@ -94,7 +102,10 @@ def main(data: Path | None, output: Path, runs: int, quick: bool) -> None:
     results = {}
     for name, scene in scenes.items():
         print(f"\n{name}", flush=True)
-        results[name] = compare(scene, counts, runs, true_count=1024 if quick else TRUE_COUNT)
+        true_count = 1024 if quick else TRUE_COUNT
+        results[name] = compare(scene, counts, runs, true_count=true_count)
+        print("against full light")
+        results[name]["full"] = compare_full(scene, runs, true_count=true_count)
     output.mkdir(exist_ok=True)
     (output / "error_vs_time.json").write_text(json.dumps(results, indent=1, ensure_ascii=False))
     plot(results, output / "error_vs_time.png")
@@ -108,21 +119,13 @@ def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_co
     front = [ours[number] for number in pareto_front([(each.milliseconds, each.error) for each in ours])]
     better = better_than(default, ours)
     parts = error_parts(scene)
-    print(f"  {'':42}{'error':>9}{'image':>14}")
-    for each in sorted(measured, key=lambda each: each.milliseconds):
-        mark = ">" if each is default else "*" if each in front else " "
-        print(f"{mark} {each.label:42}{each.error:9.2%}{each.milliseconds:11.2f} ms")
+    print_table(measured, {default.label: ">"} | {each.label: "*" for each in front if each is not default})
     print("> default    * no other setting is both faster and more accurate")
     print(f"both faster and more accurate than the default by {MARGIN:.0%}: ", end="")
     print("; ".join(each.label for each in better) or "none")
     for method, of_method in parts.items():
         print(f"error of {method}: " + ", ".join(f"{part} {value:.2%}" for part, value in of_method.items()))
-    if equal:
-        print(
-            f"Mitsuba takes {equal['times_as_long']:.0f} times as long to come as near to its image of "
-            f"{TRUE_COUNT} samples as the default ({equal['error']:.2%})",
-            flush=True,
-        )
+    print_equal(equal)
     return {
         "settings": [dataclasses.asdict(each) for each in measured],
         "default": default.label,
@@ -131,6 +134,31 @@ def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_co
         "parts": parts,
         "equal_error": equal,
     }
+
+
+def compare_full(scene: ws.Scene, runs: int, *, true_count: int) -> dict:
+    """Measure and print how near a scene comes to light of all bounces."""
+    measured, equal = measure(scene, full_settings(scene), runs, true_count, bounces=ALL_BOUNCES)
+    print_table(measured)
+    print_equal(equal)
+    return {"settings": [dataclasses.asdict(each) for each in measured], "equal_error": equal}
+
+
+def print_table(measured: Sequence[Measured], marks: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Print figures, the fastest first."""
+    print(f"  {'':42}{'error':>9}{'image':>14}")
+    for each in sorted(measured, key=lambda each: each.milliseconds):
+        print(f"{marks.get(each.label, ' ')} {each.label:42}{each.error:9.2%}{each.milliseconds:11.2f} ms")
+
+
+def print_equal(equal: Mapping[str, Mapping[str, float]]) -> None:
+    """Print how long a path tracer takes to come as near to the truth."""
+    for label, figures in equal.items():
+        print(
+            f"Mitsuba takes {figures['times_as_long']:.0f} times as long to come as near to its image of "
+            f"{TRUE_COUNT} samples as {label} ({figures['error']:.2%})",
+            flush=True,
+        )
 
 
 def default_among(measured: Sequence[Measured]) -> int:
@@ -242,6 +270,22 @@ def methods(scene: ws.Scene, details: str) -> list[Setting]:
     return directional + harmonic
 
 
+def full_settings(scene: ws.Scene) -> list[Setting]:
+    """What is compared with full light: models of direct light, and of 1, 2 and 4 bounces."""
+    return [
+        Setting("none", 8, "", with_visibility(scene, method="none")),
+        Setting("directional", 128, "", scene),
+        *(
+            Setting("directional", 128, f"{count} {'bounce' if count == 1 else 'bounces'}", with_bounces(scene, count))
+            for count in BOUNCES
+        ),
+    ]
+
+
+def with_bounces(scene: ws.Scene, count: int) -> ws.Scene:
+    return dataclasses.replace(scene, bounces=count)
+
+
 def with_visibility(scene: ws.Scene, **options: object) -> ws.Scene:
     return dataclasses.replace(scene, visibility=ws.Visibility(**options))
 
@@ -258,14 +302,25 @@ def with_receivers(scene: ws.Scene, receivers: str) -> ws.Scene:
 
 
 def measure(
-    scene: ws.Scene, compared: Sequence[Setting], runs: int, true_count: int
-) -> tuple[list[Measured], dict[str, float]]:
-    """Measure settings, and Mitsuba where it is installed: all that was measured, and the comparison at equal error."""
-    truth = ws.render(with_visibility(scene, method="ray-traced", samples=true_count), progress=True)
+    scene: ws.Scene, compared: Sequence[Setting], runs: int, true_count: int, *, bounces: int = 0
+) -> tuple[list[Measured], dict[str, dict[str, float]]]:
+    """Measure settings, and Mitsuba where it is installed.
+
+    Args:
+        scene: The scene with the default settings.
+        compared: Other ways to compute its image.
+        runs: Timed calls of each.
+        true_count: Samples of the truth, for a pixel.
+        bounces: Of the truth.
+
+    Returns:
+        All that was measured; and for the default, or each number of bounces, the comparison at equal error.
+    """
+    reference = with_bounces(with_visibility(scene, method="ray-traced", samples=true_count), bounces)
+    truth = ws.render(reference, progress=True)
     draws = [whole_image(ws.Renderer(setting.scene)) for setting in compared]
     errors = [image_error(draw().numpy()[0], truth) for draw in draws]
-    default = ws.render(scene)
-    paths = paths_of(scene) if importlib.util.find_spec("mitsuba") else None
+    paths = paths_of(scene, bounces) if importlib.util.find_spec("mitsuba") else None
     path_counts = PATH_COUNTS if paths else ()
     calls = [(lambda count=count: paths(count, seed=1)) for count in path_counts]
     times = median_times([*draws, *calls], runs, progress=True)
@@ -279,19 +334,22 @@ def measure(
     path_truth = np.dstack([paths(TRUE_COUNT, seed=2), truth[..., 3]])
     path_times = times[len(compared) :]
     path_errors = [error_of_paths(paths(count, seed=1), path_truth) for count in path_counts]
+    equal = {}
+    for setting, own in zip(compared, measured, strict=True):
+        if setting.scene.bounces or setting.scene is compared[default_among(measured)].scene:
+            error = image_error(ws.render(setting.scene), path_truth)
+            longer = time_at_error(path_times, path_errors, error)
+            equal[own.label] = {
+                "error": error,
+                "milliseconds": own.milliseconds,
+                "path_milliseconds": longer,
+                "times_as_long": longer / own.milliseconds,
+            }
     measured += [
         Measured("Mitsuba", count, "", milliseconds, error)
         for count, milliseconds, error in zip(path_counts, path_times, path_errors, strict=True)
     ]
-    own = measured[default_among(measured)]
-    error = image_error(default, path_truth)
-    longer = time_at_error(path_times, path_errors, error)
-    return measured, {
-        "error": error,
-        "milliseconds": own.milliseconds,
-        "path_milliseconds": longer,
-        "times_as_long": longer / own.milliseconds,
-    }
+    return measured, equal
 
 
 def time_again(measured: list[Measured], draws: Sequence[Callable[[], object]], runs: int) -> None:
@@ -307,13 +365,14 @@ def time_again(measured: list[Measured], draws: Sequence[Callable[[], object]], 
         timed.update(doubtful)
 
 
-def paths_of(scene: ws.Scene) -> Callable[..., np.ndarray]:
-    """Make the function that renders an image of direct light in Mitsuba, [height, width, 3]."""
+def paths_of(scene: ws.Scene, bounces: int) -> Callable[..., np.ndarray]:
+    """Make the function that renders an image in Mitsuba, [height, width, 3], of direct light or with bounces."""
     import mitsuba as mi
 
     from demos.benchmarks.mitsuba_fits import RayTracer
 
-    tracer = RayTracer(scene, {"type": "direct"})
+    path = {"type": "path", "max_depth": bounces + 2}  # what is seen, the light, and what lies between
+    tracer = RayTracer(scene, path if bounces else {"type": "direct"})
     return lambda samples, seed: np.array(mi.render(tracer.scene, spp=samples, seed=seed))
 
 
@@ -429,33 +488,45 @@ class Rays:
 
 
 def plot(results: dict[str, dict], path: Path) -> None:
-    """Draw error over time for each scene, with the Pareto front of the library's settings."""
+    """Draw error over time for each scene, with the Pareto front of our settings; below, against full light."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(results), figsize=(5.5 * len(results), 4.5), squeeze=False)
-    for axis, (name, result) in zip(axes[0], results.items(), strict=True):
-        measured = [Measured(**each) for each in result["settings"]]
-        for family, color in COLORS.items():
-            of_family = sorted((each.milliseconds, 100 * each.error) for each in measured if each.family == family)
-            style = "o-" if family in ("Mitsuba", "ray-traced") else "o"
-            if of_family:
-                axis.plot(*zip(*of_family, strict=True), style, color=color, markersize=4, alpha=0.7, label=family)
+    figure, axes = plt.subplots(2, len(results), figsize=(5.5 * len(results), 8.5), squeeze=False)
+    for column, (name, result) in enumerate(results.items()):
+        upper, lower = axes[:, column]
+        measured = draw_points(upper, result["settings"], f"{name}: direct light")
         front = [(each.milliseconds, 100 * each.error) for each in measured if each.label in result["front"]]
-        axis.step(*zip(*sorted(front), strict=True), where="post", color="k", linewidth=1, label="Pareto front")
+        upper.step(*zip(*sorted(front), strict=True), where="post", color="k", linewidth=1, label="Pareto front")
         default = next(each for each in measured if each.label == result["default"])
-        axis.plot(default.milliseconds, 100 * default.error, "k*", markersize=13, label="default")
-        axis.set(xscale="log", yscale="log", xlabel="image [ms]", ylabel="error [%]", title=name)
-        for each in (axis.xaxis, axis.yaxis):
-            each.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter("{x:g}")
-        axis.grid(which="both", alpha=0.2)
-    axes[0, -1].legend(fontsize=8)
+        upper.plot(default.milliseconds, 100 * default.error, "k*", markersize=13, label="default")
+        for each in draw_points(lower, result["full"]["settings"], "full light"):
+            if each.family not in ("Mitsuba", "none"):
+                words = each.details or "direct"
+                lower.annotate(words, (each.milliseconds, 100 * each.error), (5, 3), textcoords="offset points")
+    for axis in axes[:, -1]:
+        axis.legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def draw_points(axis: Any, settings: list[dict], title: str) -> list[Measured]:
+    """Draw what was measured."""
+    measured = [Measured(**each) for each in settings]
+    for family, color in COLORS.items():
+        of_family = sorted((each.milliseconds, 100 * each.error) for each in measured if each.family == family)
+        style = "o-" if family in ("Mitsuba", "ray-traced") else "o"
+        if of_family:
+            axis.plot(*zip(*of_family, strict=True), style, color=color, markersize=4, alpha=0.7, label=family)
+    axis.set(xscale="log", yscale="log", xlabel="image [ms]", ylabel="error [%]", title=title)
+    for each in (axis.xaxis, axis.yaxis):
+        each.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("{x:g}")
+    axis.grid(which="both", alpha=0.2)
+    return measured
 
 
 if __name__ == "__main__":

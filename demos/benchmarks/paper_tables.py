@@ -2,6 +2,7 @@
 
     python demos/benchmarks/paper_tables.py [--data FOLDER] [--scenes 10] [--iterations N]
                                             [--problems texture light pose geometry]
+    python demos/benchmarks/paper_tables.py --bounces 2 [as above]
     python demos/benchmarks/paper_tables.py --ablation
 
 Ten scenes: a body of 2 units on a ground of 6, 128 × 128 pixels (texture: 256 × 256), targets ray traced with 2048
@@ -16,7 +17,9 @@ pose       MDE, mean distance of vertices to where they belong [% of the boundin
            rotations [rad]; TE, squared distance between the translations
 geometry   MDE of a body that was bent, twisted and stretched
 
-Where geometry stands still, "ray traced" is what a fit does by default. ``--ablation`` repeats the pose for 50 to 200
+Where geometry stands still, "ray traced" is what a fit does by default. With ``--bounces`` targets are path traced with
+all bounces, and fits that know direct light alone stand beside those that know so many; results are kept in
+OUTPUT/full_light_tables.json. ``--ablation`` repeats the pose for 50 to 200
 spheres and 16 to 64 coefficients of log-SH. Mitsuba 3 takes part where it is installed (mitsuba_fits.py).
 """
 
@@ -29,7 +32,8 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +47,28 @@ from demos.problems import Case
 from demos.scenes import shipped_mesh
 from warpshadow import inverse
 
-COLUMNS: dict[str, ws.Visibility | None] = {
-    "direct illumination": problems.DIRECT,
-    "log-SH cap": ws.Visibility(method="log-sh", log="cap"),
-    "log-SH eigen": ws.Visibility(method="log-sh"),
-    "directional": ws.Visibility(),
-    "ray traced": None,
+
+@dataclass(frozen=True)
+class Column:
+    """How a fit computes images.
+
+    Args:
+        visibility: The method; None for what a fit does by default where nothing moves.
+        bounces: How often light bounces.
+    """
+
+    visibility: ws.Visibility | None
+    bounces: int = 0
+
+
+COLUMNS: dict[str, Column] = {
+    "direct illumination": Column(problems.DIRECT),
+    "log-SH cap": Column(ws.Visibility(method="log-sh", log="cap")),
+    "log-SH eigen": Column(ws.Visibility(method="log-sh")),
+    "directional": Column(ws.Visibility()),
+    "ray traced": Column(None),
 }
+ALL_BOUNCES = 12  # of targets with bounces: what comes after is less than their noise
 STILL = ("texture", "light")
 CELLS = "ray traced, 512 cells"
 MITSUBA = "Mitsuba 3"
@@ -73,20 +92,27 @@ def scenes(data: Path | None) -> list[tuple[ws.Mesh, str, ws.EnvironmentMap]]:
     return [(meshes[i % len(meshes)], names[i % len(names)], skies[names[i % len(names)]]) for i in range(10)]
 
 
-def cases(pairs: list[tuple[ws.Mesh, str, ws.EnvironmentMap]]) -> dict[str, Callable[..., Case]]:
-    """How each problem is made for a scene of a number."""
+def columns_with_bounces(bounces: int) -> dict[str, Column]:
+    """Fits that know direct light alone, and fits that know bounces."""
+    ours = {"directional": ws.Visibility(), "ray traced": None}
+    known = {f"{name}, {bounces} bounces": Column(visibility, bounces) for name, visibility in ours.items()}
+    return {name: COLUMNS[name] for name in ("direct illumination", *ours)} | known
+
+
+def cases(pairs: list[tuple[ws.Mesh, str, ws.EnvironmentMap]], bounces: int = 0) -> dict[str, Callable[..., Case]]:
+    """How each problem is made for a scene of a number; the targets have so many bounces."""
     meshes = list({mesh.name: mesh for mesh, *_ in pairs}.values())
 
     def light(number: int) -> Case:
         mesh, _, sky = pairs[number]
         others = [other for other in meshes if other.name != mesh.name]
-        return problems.light_case(mesh, sky, [others[number % len(others)], others[(number + 1) % len(others)]])
+        return problems.light_case(mesh, sky, [others[(number + k) % len(others)] for k in (0, 1)], bounces=bounces)
 
     return {
-        "texture": lambda number: problems.texture_case(*_pair(pairs, number), number),
+        "texture": lambda number: problems.texture_case(*_pair(pairs, number), number, bounces=bounces),
         "light": light,
-        "pose": lambda number, **sizes: problems.pose_case(*_pair(pairs, number), number, **sizes),
-        "geometry": lambda number: problems.deformation_case(*_pair(pairs, number), number),
+        "pose": lambda number, **options: problems.pose_case(*_pair(pairs, number), number, bounces=bounces, **options),
+        "geometry": lambda number: problems.deformation_case(*_pair(pairs, number), number, bounces=bounces),
     }
 
 
@@ -112,7 +138,7 @@ class Results:
         os.replace(unfinished, self.path)
 
 
-def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
+def solve(case: Case, column: str, iterations: int | None, columns: Mapping[str, Column] = COLUMNS) -> dict[str, Any]:
     """Figures of one fit; one that fails has its error in place of them."""
     stages = [
         dataclasses.replace(stage, iterations=min(stage.iterations, iterations or stage.iterations))
@@ -125,7 +151,8 @@ def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
 
             scene, seconds, count, reason = fit_by_mitsuba(case, iterations)
         else:
-            problem = case.by(COLUMNS.get(column))
+            how = columns.get(column, Column(None))
+            problem = case.by(how.visibility, how.bounces)
             if column == CELLS:  # a map in place of 25 coefficients: lamps and suns, not their blur
                 problem = dataclasses.replace(problem, free=inverse.Light(order=None, directions=512))
                 stages = [
@@ -142,25 +169,30 @@ def solve(case: Case, column: str, iterations: int | None) -> dict[str, Any]:
     return figures | {"ms": 1e3 * seconds, "iterations": count, "seconds": seconds_in_all, "reason": reason}
 
 
-def main(data: Path | None, output: Path, count: int, names: list[str], iterations: int | None) -> None:
+def main(
+    data: Path | None, output: Path, count: int, names: list[str], iterations: int | None, bounces: int = 0
+) -> None:
     prepare(output)
-    results, pairs = Results(output / "paper_tables.json"), scenes(data)
-    make = cases(pairs)
-    has_mitsuba = importlib.util.find_spec("mitsuba") is not None
+    results = Results(output / ("full_light_tables.json" if bounces else "paper_tables.json"))
+    pairs = scenes(data)
+    make = cases(pairs, ALL_BOUNCES if bounces else 0)
+    columns = columns_with_bounces(bounces) if bounces else COLUMNS
+    has_mitsuba = not bounces and importlib.util.find_spec("mitsuba") is not None  # its fits are of direct light
     for number, name in itertools.product(range(count), names):
         mesh, sky_name, _ = pairs[number]
-        columns = [column for column in COLUMNS if name in STILL or COLUMNS[column] is not None]
+        own = [column for column in columns if name in STILL or columns[column].visibility is not None]
+        more = [CELLS] if name == "light" and not bounces else []
         wanted = {
             column: f"{name} | {number:02} {mesh.name}, {sky_name} | {column}"
-            for column in [*columns, *([CELLS] if name == "light" else []), *([MITSUBA] if has_mitsuba else [])]
+            for column in [*own, *more, *([MITSUBA] if has_mitsuba else [])]
         }
         missing = {column: key for column, key in wanted.items() if key not in results.figures}
         case = make[name](number) if missing else None
         for column, key in missing.items():
-            results.add(key, solve(case, column, iterations))
+            results.add(key, solve(case, column, iterations, columns))
             print(f"{key}: {shown(results.figures[key])}", flush=True)
     for name in names:
-        print(f"\n{table(name, results.figures)}")
+        print(f"\n{table(name, results.figures, columns)}")
 
 
 def ablate(data: Path | None, output: Path, count: int, iterations: int | None) -> None:
@@ -172,8 +204,8 @@ def ablate(data: Path | None, output: Path, count: int, iterations: int | None) 
     for number, (spheres, order) in itertools.product(range(count), settings):
         key = f"{spheres} spheres, {order**2} coefficients | {number:02} {pairs[number][0].name}, {pairs[number][1]}"
         if key not in results.figures:
-            COLUMNS["ablation"] = ws.Visibility(method="log-sh", order=order)
-            results.add(key, solve(make(number, spheres=spheres), "ablation", iterations))
+            columns = {"ablation": Column(ws.Visibility(method="log-sh", order=order))}
+            results.add(key, solve(make(number, spheres=spheres), "ablation", iterations, columns))
             print(f"{key}: {shown(results.figures[key])}", flush=True)
     print("\n| spheres | coefficients | pose MDE [%] | ms per iteration |\n| --- | --- | --- | --- |")
     for spheres, order in settings:
@@ -194,15 +226,15 @@ def prepare(output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
 
 
-def table(name: str, figures: dict[str, dict[str, Any]]) -> str:
+def table(name: str, figures: dict[str, dict[str, Any]], columns: Mapping[str, Column] = COLUMNS) -> str:
     """Markdown of one problem: a row for each method, mean ± standard deviation over the scenes, and what failed."""
-    columns = [column for column in [*COLUMNS, CELLS, MITSUBA] if any(_is(key, name, column) for key in figures)]
+    present = [column for column in [*columns, CELLS, MITSUBA] if any(_is(key, name, column) for key in figures)]
     kinds = {"texture": ["texture MSE"], "light": ["relighting MSE"], "pose": ["pose MDE", "RE", "TE"]}
     kinds["geometry"] = ["geometry MDE"]
     lines = [f"| {name} | " + " | ".join(kinds[name]) + " | ms per iteration | scenes |"]
     lines.append("| --- |" + " --- |" * (len(kinds[name]) + 2))
     failures = []
-    for column in columns:
+    for column in present:
         own = {key: row for key, row in figures.items() if _is(key, name, column)}
         failures += [f"- failed: {key}: {row['error']}" for key, row in own.items() if "error" in row]
         rows = [row for row in own.values() if "error" not in row]
@@ -235,9 +267,17 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", type=int, default=10, choices=range(1, 11), help="the first so many")
     parser.add_argument("--problems", nargs="+", default=["texture", "light", "pose", "geometry"])
     parser.add_argument("--iterations", type=int, help="at most so many for each stage")
+    parser.add_argument("--bounces", type=int, default=0, help="targets of full light; bounces that our fits know")
     parser.add_argument("--ablation", action="store_true", help="spheres and coefficients in place of methods")
     arguments = parser.parse_args()
     if arguments.ablation:
         ablate(arguments.data, arguments.output, arguments.scenes, arguments.iterations)
     else:
-        main(arguments.data, arguments.output, arguments.scenes, arguments.problems, arguments.iterations)
+        main(
+            arguments.data,
+            arguments.output,
+            arguments.scenes,
+            arguments.problems,
+            arguments.iterations,
+            arguments.bounces,
+        )

@@ -1,10 +1,10 @@
-"""The main job, on meshes that ship with Warp: soft shadows by every method, then the light recovered from an image.
+"""The main job, on meshes that ship with Warp: soft shadows, light that bounces, and the light recovered from an image.
 
     make demo        or        python demos/examples/bunny.py --output out
 
-A bunny stands on a textured ground under an HDR sky with a sun. It is rendered without shadows, with each method,
-and ray traced. Then the light is forgotten and recovered from the ray-traced image, once by a renderer with shadows
-and once by one without (direct illumination), and both estimates relight a bear.
+A bunny stands on a textured ground under an HDR sky with a sun. It is rendered without shadows, with them, with light
+that bounces, and by a path tracer that follows all bounces. Then the light is forgotten and recovered from the path
+traced image, by renderers that know of as much, and each estimate relights a bear.
 """
 
 import argparse
@@ -14,22 +14,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageFont
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import image_error, on_ground, shipped_mesh
-from warpshadow.torch import TorchRenderer
+from warpshadow import inverse
 
-METHODS = {
-    "no shadows": ws.Visibility(method="none"),
-    "log-SH, cap": ws.Visibility(method="log-sh", log="cap"),
-    "log-SH, eigen": ws.Visibility(method="log-sh"),
-    "directional": ws.Visibility(method="directional"),
-}
-RAY_TRACED = ws.Visibility(method="ray-traced", samples=400)
-LIGHT_ORDER = 5
+BOUNCES = 2
+ALL_BOUNCES = 8  # of the path tracer: what comes after is 0.1% of the light
+SAMPLES = 400  # of the path tracer, for a pixel
+CELLS = 256  # of the light that is recovered: it is never negative
 
 
 def main(output: Path, iterations: int) -> None:
@@ -44,27 +39,25 @@ def main(output: Path, iterations: int) -> None:
     bunny, bear = (on_ground(shipped_mesh(name), sky, ground=ground) for name in ("bunny", "bear"))
 
     print("rendering the bunny")
-    truth, truth_seconds = timed(bunny, RAY_TRACED)
-    ws.write_image(output / "ray_traced.exr", truth)
+    truth, truth_seconds = timed(path_traced(bunny))
+    ws.write_image(output / "path_traced.exr", truth)
     panels = []
-    for label, visibility in METHODS.items():
-        timed(bunny, visibility)  # compiles kernels and fits spheres
-        image, seconds = timed(bunny, visibility)
+    for label, scene in models(bunny).items():
+        timed(scene)  # compiles kernels, fits spheres and traces what bodies shadow of themselves
+        image, seconds = timed(scene)
         panels.append((image, f"{label}\n{image_error(image, truth):.1%} error, {1e3 * seconds:.0f} ms"))
-        ws.write_image(output / f"{label.replace(', ', '_').replace(' ', '_')}.exr", image)
-    panels.append((truth, f"ray traced\n{RAY_TRACED.samples} directions, {1e3 * truth_seconds:.0f} ms"))
+        ws.write_image(output / f"{label.replace(' ', '_')}.exr", image)
+    panels.append((truth, f"path traced\n{SAMPLES} samples, {1e3 * truth_seconds:.0f} ms"))
 
-    print(f"recovering {LIGHT_ORDER**2} SH coefficients of the light from the ray-traced image")
-    relit_truth, _ = timed(bear, RAY_TRACED)
+    print(f"recovering {CELLS} cells of the light from the path traced image")
+    relit_truth = ws.render(path_traced(bear), progress=True)
     relit = []
-    for label, visibility in (("directional", METHODS["directional"]), ("no shadows", METHODS["no shadows"])):
-        estimate, seconds = recover_light(bunny, visibility, truth, iterations)
-        image, _ = timed(dataclasses.replace(bear, light=estimate), METHODS["directional"])
-        relit.append(
-            (image, f"light recovered with {label}\n{image_error(image, relit_truth):.1%} error, {seconds:.1f} s")
-        )
-        np.save(output / f"light_{label.replace(' ', '_')}.npy", estimate)
-    relit.append((relit_truth, "true light\nray traced"))
+    for label, scene in models(bunny).items():
+        light, seconds = recover_light(scene, truth, iterations)
+        light.write(output / f"light_{label.replace(' ', '_')}.exr")
+        image = ws.render(dataclasses.replace(bear, light=light, bounces=BOUNCES))
+        relit.append((image, f"light by {label}\n{image_error(image, relit_truth):.1%} error, {seconds:.1f} s"))
+    relit.append((relit_truth, "true light\npath traced"))
 
     sheet = contact_sheet([panels, relit])
     sheet.save(output / "demo.png")
@@ -72,6 +65,21 @@ def main(output: Path, iterations: int) -> None:
         name, figures = caption.split("\n")
         print(f"  {name:38}{figures}")
     print(f"{output / 'demo.png'} and EXR files beside it; {time.perf_counter() - start:.0f} s in all")
+
+
+def models(scene: ws.Scene) -> dict[str, ws.Scene]:
+    """A scene as renderers see it that know of more and more."""
+    return {
+        "no shadows": dataclasses.replace(scene, visibility=ws.Visibility(method="none")),
+        "shadows": scene,
+        f"{BOUNCES} bounces": dataclasses.replace(scene, bounces=BOUNCES),
+    }
+
+
+def path_traced(scene: ws.Scene) -> ws.Scene:
+    """A scene as it is, all but the noise."""
+    visibility = ws.Visibility(method="ray-traced", samples=SAMPLES)
+    return dataclasses.replace(scene, visibility=visibility, bounces=ALL_BOUNCES)
 
 
 def checkers(size: int = 512, tiles: int = 12) -> np.ndarray:
@@ -82,29 +90,22 @@ def checkers(size: int = 512, tiles: int = 12) -> np.ndarray:
     return (colors * grain).astype(np.float32)
 
 
-def timed(scene: ws.Scene, visibility: ws.Visibility) -> tuple[np.ndarray, float]:
-    """Render a scene from nothing kept but kernels and sphere fits."""
+def timed(scene: ws.Scene) -> tuple[np.ndarray, float]:
+    """Render a scene from nothing kept but what is on disk, and kernels."""
     start = time.perf_counter()
-    image = ws.render(dataclasses.replace(scene, visibility=visibility), progress=True)
+    image = ws.render(scene, progress=True)
     return image, time.perf_counter() - start
 
 
-def recover_light(
-    scene: ws.Scene, visibility: ws.Visibility, target: np.ndarray, iterations: int
-) -> tuple[np.ndarray, float]:
-    """Fit SH light to an image with Adam, from darkness."""
+def recover_light(scene: ws.Scene, target: np.ndarray, iterations: int) -> tuple[ws.EnvironmentMap, float]:
+    """Fit a map of light to an image, from a gray sky: with rays past what stands still, if the scene has shadows."""
     start = time.perf_counter()
-    renderer = TorchRenderer(dataclasses.replace(scene, visibility=visibility), basis=ws.HarmonicBasis(LIGHT_ORDER))
-    wanted = torch.from_numpy(target)
-    light = torch.zeros(LIGHT_ORDER**2, 3, requires_grad=True)
-    optimizer = torch.optim.Adam([light], lr=0.1)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
-    for _ in range(iterations):
-        optimizer.zero_grad()
-        torch.nn.functional.mse_loss(renderer(light), wanted).backward()
-        optimizer.step()
-        schedule.step()
-    return light.detach().numpy(), time.perf_counter() - start
+    unknown = dataclasses.replace(scene, light=ws.EnvironmentMap.constant(0.5))
+    still = ws.Visibility(method="none" if scene.visibility.method == "none" else "ray-traced")
+    light = inverse.Light(None, directions=CELLS, smoothness=1e-3)
+    problem = inverse.Problem(unknown, inverse.Target(target), light, still=still)
+    result = inverse.fit(problem, [inverse.Stage(iterations, learning_rate=0.15)], progress=True)
+    return result.scene.light, time.perf_counter() - start
 
 
 def contact_sheet(rows: list[list[tuple[np.ndarray, str]]], margin: int = 44) -> Image.Image:
@@ -127,6 +128,6 @@ def contact_sheet(rows: list[list[tuple[np.ndarray, str]]], margin: int = 44) ->
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the pictures")
-    parser.add_argument("--iterations", type=int, default=150, help="Adam steps of each recovery")
+    parser.add_argument("--iterations", type=int, default=500, help="steps of each recovery")
     arguments = parser.parse_args()
     main(arguments.output, arguments.iterations)
