@@ -47,6 +47,14 @@ def test_settings_differ_in_their_labels_and_one_of_them_is_the_default(ball):
     assert receivers == {"pixel"}
 
 
+def test_full_light_is_compared_with_none_direct_light_and_bounces(ball):
+    settings = error_vs_time.full_settings(ball)
+    assert [each.scene.bounces for each in settings] == [0, 0, *error_vs_time.BOUNCES]
+    labels = [Measured(each.family, each.size, each.details, 1, 1).label for each in settings]
+    assert labels[:3] == ["none 8", "directional 128", "directional 128, 1 bounce"]
+    assert len(set(labels)) == len(labels)
+
+
 def test_a_setting_is_better_if_both_faster_and_more_accurate_by_the_margin():
     default = measured(10, 0.1)
     others = [measured(8.9, 0.089), measured(9.1, 0.01), measured(1, 0.091), measured(1, 0.2), measured(99, 0.001)]
@@ -98,7 +106,7 @@ def test_a_path_tracer_is_compared_at_the_error_of_the_default(ball, monkeypatch
         return truth[..., :3] + (seed == 1) * noise / np.sqrt(samples)
 
     monkeypatch.setattr(error_vs_time.importlib.util, "find_spec", lambda name: name == "mitsuba")
-    monkeypatch.setattr(error_vs_time, "paths_of", lambda scene: path)
+    monkeypatch.setattr(error_vs_time, "paths_of", lambda scene, bounces: path)
     counts = error_vs_time.PATH_COUNTS
     times = [4.0] * len(error_vs_time.settings(ball, ())) + [2.0 * count for count in counts]
     monkeypatch.setattr(error_vs_time, "median_times", lambda functions, *_, **__: times[: len(functions)])
@@ -107,8 +115,9 @@ def test_a_path_tracer_is_compared_at_the_error_of_the_default(ball, monkeypatch
     assert [each.size for each in paths] == list(counts)
     np.testing.assert_allclose([each.error for each in paths], 1 / np.sqrt(counts), rtol=1e-4)
     error = image_error(ws.render(ball), truth)
-    assert equal["error"] == pytest.approx(error, rel=1e-6)
-    assert equal["times_as_long"] == pytest.approx(2 / error**2 / 4, rel=1e-3)
+    assert list(equal) == ["directional 128"]
+    assert equal["directional 128"]["error"] == pytest.approx(error, rel=1e-6)
+    assert equal["directional 128"]["times_as_long"] == pytest.approx(2 / error**2 / 4, rel=1e-3)
 
 
 def test_what_seems_better_than_the_default_is_timed_again_until_none_is_left_in_doubt(monkeypatch):
@@ -141,7 +150,9 @@ def test_the_demo_writes_its_figures_and_draws_them(tmp_path, monkeypatch, capsy
     assert all(a.milliseconds <= b.milliseconds and a.error > b.error for a, b in zip(front, front[1:], strict=False))
     assert by_label["ray-traced 256"].error < 0.6 * by_label["ray-traced 16"].error
     assert by_label["directional 128"].error < 0.5 * by_label["none 8"].error
-    assert result["equal_error"] == {}
+    assert result["equal_error"] == {} and result["full"]["equal_error"] == {}
+    full = {each.label: each.error for each in (Measured(**each) for each in result["full"]["settings"])}
+    assert full["directional 128, 2 bounces"] < 0.5 * full["directional 128"] < full["none 8"]
     assert np.ptp(ws.read_image(tmp_path / "error_vs_time.png")[..., :3]) > 0.1
     printed = capsys.readouterr().out
     assert all(label in printed for label in by_label)

@@ -81,6 +81,22 @@ def test_results_are_kept_at_once_and_with_those_of_other_processes(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["results.json"]
 
 
+def test_columns_with_bounces_are_those_of_direct_light_and_the_same_with_bounces():
+    columns = tables.columns_with_bounces(2)
+    assert [column.bounces for column in columns.values()] == [0, 0, 0, 2, 2]
+    assert columns["directional, 2 bounces"].visibility.method == "directional"
+    assert columns["ray traced, 2 bounces"].visibility is None
+
+
+def test_a_case_is_solved_with_as_many_bounces_as_are_asked_for_whatever_its_targets_have(ball_case):
+    full = dataclasses.replace(ball_case.problem.scene, bounces=12)
+    case = dataclasses.replace(ball_case, problem=dataclasses.replace(ball_case.problem, scene=full))
+    ours, direct = case.by(ws.Visibility(), 2), case.by(None)
+    assert (ours.scene.bounces, ours.still) == (2, None)
+    assert (direct.scene.bounces, direct.still) == (0, case.problem.still)
+    assert case.by(problems.DIRECT).scene.visibility.method == "none"
+
+
 def test_a_case_by_another_method_traces_no_rays(ball_case):
     direct = ball_case.by(problems.DIRECT)
     assert direct.still is None and direct.scene.visibility.method == "none"
