@@ -24,7 +24,7 @@ from warpshadow import inverse
 BOUNCES = 2
 ALL_BOUNCES = 8  # of the path tracer: what comes after is 0.1% of the light
 SAMPLES = 400  # of the path tracer, for a pixel
-CELLS = 256  # of the light that is recovered: it is never negative
+CELLS = 512  # of the light that is recovered: it is never negative
 
 
 def main(output: Path, iterations: int) -> None:
@@ -102,7 +102,7 @@ def recover_light(scene: ws.Scene, target: np.ndarray, iterations: int) -> tuple
     start = time.perf_counter()
     unknown = dataclasses.replace(scene, light=ws.EnvironmentMap.constant(0.5))
     still = ws.Visibility(method="none" if scene.visibility.method == "none" else "ray-traced")
-    light = inverse.Light(None, directions=CELLS, smoothness=1e-3)
+    light = inverse.Light(None, directions=CELLS)
     problem = inverse.Problem(unknown, inverse.Target(target), light, still=still)
     result = inverse.fit(problem, [inverse.Stage(iterations, learning_rate=0.15)], progress=True)
     return result.scene.light, time.perf_counter() - start
