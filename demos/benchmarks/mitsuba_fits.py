@@ -251,7 +251,7 @@ def _reflectance(body: ws.Body) -> dict[str, Any]:
     import mitsuba as mi
 
     if body.texture is not None:
-        return {"type": "bitmap", "bitmap": mi.Bitmap(body.texture), "raw": True}
+        return {"type": "bitmap", "bitmap": mi.Bitmap(body.texture.copy()), "raw": True}
     if body.albedo.ndim > 1:
         raise ValueError("Mitsuba: got a body with a color for each vertex, expected one color or a texture")
     return {"type": "rgb", "value": body.albedo.tolist()}
