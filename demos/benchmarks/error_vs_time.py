@@ -1,6 +1,6 @@
 """What each millisecond buys: error against the time of an image, for all settings and for a path tracer.
 
-    python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--quick]
+    python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--light direct full] [--quick]
 
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
@@ -16,9 +16,9 @@ Also measured: rays at few directions; Mitsuba 3 where it is installed, and how 
 near to its own image of 4096 samples as our default does; whether any setting is both faster and more accurate than
 the default; and what the default's error consists of.
 
-Then the same against full light, path traced with all bounces: without shadows, the default, which knows direct light
-alone, and the default with 1, 2 and 4 bounces, beside Mitsuba's path integrator. It prints tables and writes
-error_vs_time.json and .png.
+Against full light, path traced with all bounces, there is less to compare: no shadows, the default, which knows direct
+light alone, the default with 1, 2 and 4 bounces, and Mitsuba's path integrator. The demo prints tables and writes
+error_vs_time.json and .png, and full_light_vs_time.json and .png.
 """
 
 import argparse
@@ -32,7 +32,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -94,21 +93,23 @@ class Measured:
         return f"{self.family} {self.size}{', ' if self.details else ''}{self.details}"
 
 
-def main(data: Path | None, output: Path, runs: int, quick: bool) -> None:
+def main(data: Path | None, output: Path, runs: int, quick: bool, lights: Sequence[str] = ("direct", "full")) -> None:
     ws.quiet()
     warnings.filterwarnings("ignore", module="warpshadow")  # many spheres in spherical harmonics; coarse faces
     scenes = quick_scenes() if quick else load_scenes(data)
-    counts = () if quick else SPHERE_COUNTS
-    results = {}
-    for name, scene in scenes.items():
-        print(f"\n{name}", flush=True)
-        true_count = 1024 if quick else TRUE_COUNT
-        results[name] = compare(scene, counts, runs, true_count=true_count)
-        print("against full light")
-        results[name]["full"] = compare_full(scene, runs, true_count=true_count)
+    true_count = 1024 if quick else TRUE_COUNT
     output.mkdir(exist_ok=True)
-    (output / "error_vs_time.json").write_text(json.dumps(results, indent=1, ensure_ascii=False))
-    plot(results, output / "error_vs_time.png")
+    for light in lights:
+        results = {}
+        for name, scene in scenes.items():
+            print(f"\n{name}, {light} light", flush=True)
+            if light == "full":
+                results[name] = compare_full(scene, runs, true_count=true_count)
+            else:
+                results[name] = compare(scene, () if quick else SPHERE_COUNTS, runs, true_count=true_count)
+        path = output / ("full_light_vs_time.json" if light == "full" else "error_vs_time.json")
+        path.write_text(json.dumps(results, indent=1, ensure_ascii=False))
+        plot(results, path.with_suffix(".png"))
 
 
 def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_count: int) -> dict:
@@ -488,45 +489,38 @@ class Rays:
 
 
 def plot(results: dict[str, dict], path: Path) -> None:
-    """Draw error over time for each scene, with the Pareto front of our settings; below, against full light."""
+    """Draw error over time for each scene: with the Pareto front of our settings, or with the number of bounces."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, len(results), figsize=(5.5 * len(results), 8.5), squeeze=False)
-    for column, (name, result) in enumerate(results.items()):
-        upper, lower = axes[:, column]
-        measured = draw_points(upper, result["settings"], f"{name}: direct light")
-        front = [(each.milliseconds, 100 * each.error) for each in measured if each.label in result["front"]]
-        upper.step(*zip(*sorted(front), strict=True), where="post", color="k", linewidth=1, label="Pareto front")
-        default = next(each for each in measured if each.label == result["default"])
-        upper.plot(default.milliseconds, 100 * default.error, "k*", markersize=13, label="default")
-        for each in draw_points(lower, result["full"]["settings"], "full light"):
-            if each.family not in ("Mitsuba", "none"):
-                words = each.details or "direct"
-                lower.annotate(words, (each.milliseconds, 100 * each.error), (5, 3), textcoords="offset points")
-    for axis in axes[:, -1]:
-        axis.legend(fontsize=8)
+    figure, axes = plt.subplots(1, len(results), figsize=(5.5 * len(results), 4.5), squeeze=False)
+    for axis, (name, result) in zip(axes[0], results.items(), strict=True):
+        measured = [Measured(**each) for each in result["settings"]]
+        for family, color in COLORS.items():
+            of_family = sorted((each.milliseconds, 100 * each.error) for each in measured if each.family == family)
+            style = "o-" if family in ("Mitsuba", "ray-traced") else "o"
+            if of_family:
+                axis.plot(*zip(*of_family, strict=True), style, color=color, markersize=4, alpha=0.7, label=family)
+        if "front" in result:
+            front = [(each.milliseconds, 100 * each.error) for each in measured if each.label in result["front"]]
+            axis.step(*zip(*sorted(front), strict=True), where="post", color="k", linewidth=1, label="Pareto front")
+            default = next(each for each in measured if each.label == result["default"])
+            axis.plot(default.milliseconds, 100 * default.error, "k*", markersize=13, label="default")
+        else:
+            for each in (each for each in measured if each.family == "directional"):
+                at = (each.milliseconds, 100 * each.error)
+                axis.annotate(each.details or "direct light", at, (6, 3), textcoords="offset points", fontsize=8)
+        axis.set(xscale="log", yscale="log", xlabel="image [ms]", ylabel="error [%]", title=name)
+        for each in (axis.xaxis, axis.yaxis):
+            each.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.grid(which="both", alpha=0.2)
+    axes[0, -1].legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def draw_points(axis: Any, settings: list[dict], title: str) -> list[Measured]:
-    """Draw what was measured."""
-    measured = [Measured(**each) for each in settings]
-    for family, color in COLORS.items():
-        of_family = sorted((each.milliseconds, 100 * each.error) for each in measured if each.family == family)
-        style = "o-" if family in ("Mitsuba", "ray-traced") else "o"
-        if of_family:
-            axis.plot(*zip(*of_family, strict=True), style, color=color, markersize=4, alpha=0.7, label=family)
-    axis.set(xscale="log", yscale="log", xlabel="image [ms]", ylabel="error [%]", title=title)
-    for each in (axis.xaxis, axis.yaxis):
-        each.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter("{x:g}")
-    axis.grid(which="both", alpha=0.2)
-    return measured
 
 
 if __name__ == "__main__":
@@ -534,6 +528,9 @@ if __name__ == "__main__":
     parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the JSON and the picture")
     parser.add_argument("--runs", type=int, default=5, help="timed calls of each setting")
+    parser.add_argument(
+        "--light", nargs="+", choices=["direct", "full"], default=["direct", "full"], help="what errors are against"
+    )
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
     arguments = parser.parse_args()
-    main(arguments.data, arguments.output, arguments.runs, arguments.quick)
+    main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light)

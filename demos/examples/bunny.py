@@ -23,7 +23,7 @@ from warpshadow import inverse
 
 BOUNCES = 2
 ALL_BOUNCES = 8  # of the path tracer: what comes after is 0.1% of the light
-SAMPLES = 400  # of the path tracer, for a pixel
+SAMPLES = 1600  # of the path tracer, for a pixel
 CELLS = 512  # of the light that is recovered: it is never negative
 
 
