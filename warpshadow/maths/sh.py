@@ -207,6 +207,27 @@ def rotation_matrix(order: int, rotation: np.ndarray) -> np.ndarray:
     return (turned * weights[:, None]).T @ evaluate(order, directions)
 
 
+@functools.cache
+def rotation_generators(order: int) -> np.ndarray:
+    """Generators G of rotations about x, y and z: turned on by a small δ, coefficients change by Σ_a δ_a G_a f.
+
+    About z, cos mφ becomes cos m(φ − δ), and sin mφ sin m(φ − δ). The others are that, with z turned to their axis.
+
+    Args:
+        order: Number of bands n.
+
+    Returns:
+        Shape [3, order², order²].
+    """
+    band = band_of(order)
+    degree = np.arange(order**2) - band**2 - band
+    about_z = np.zeros((order**2, order**2))
+    about_z[np.arange(order**2) - 2 * degree, np.arange(order**2)] = degree
+    to_axis = np.roll(np.eye(3), 1, axis=0), np.roll(np.eye(3), 2, axis=0), np.eye(3)  # z to x, to y, and to z
+    turns = [rotation_matrix(order, turn) for turn in to_axis]
+    return np.stack([turn @ about_z @ turn.T for turn in turns])
+
+
 # ---------------------------------------------------------------------------------------------- products
 
 

@@ -12,6 +12,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, map_of
 from warpshadow.pipeline.node import Source
+from warpshadow.pipeline.own_shadows import OwnLookup
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
@@ -52,6 +53,10 @@ class Directional(SphereMethod):
         """Number of coefficients that take part: all."""
         return len(self._directions)
 
+    def own_shadows(self, bodies: tuple[int, ...], rotations: wp.array, light: Cells) -> dict[int, OwnLookup]:
+        """What receivers of some bodies look up of these. Differentiable: rotations."""
+        return self.own.lookups(bodies, rotations, light.directions, light.spreads)
+
     def see(self, group: Group, light: Cells) -> Seen:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
         points, normals, centers, radii, kept = group[:5]
@@ -71,7 +76,7 @@ class Directional(SphereMethod):
         """What receivers see past their own body."""
         if group.own is None or not group.points.size:
             return None
-        assert group.places is not None
+        assert group.places is not None and isinstance(group.own, OwnLookup)
         rows, lookup, supports = group.own
         return gather_own(group.normals, group.places, lookup, supports, rows)
 

@@ -16,7 +16,7 @@ from warpshadow.device.launch import varies
 from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
-from warpshadow.pipeline.own_shadows import NOT_TRACED, OwnLookup, OwnShadows, Traced
+from warpshadow.pipeline.own_shadows import NOT_TRACED, OwnLobes, OwnLookup, OwnShadows, Traced
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows
@@ -263,7 +263,7 @@ class Group(NamedTuple):
     kept: KeptRows | None = None  # of static bodies, which block their light, too
     body: int | None = None  # whose receivers they are, where bodies are told apart
     places: Places | None = None  # where they lie on that body
-    own: OwnLookup | None = None  # what they see past it, if that is not up to its spheres; None for all
+    own: OwnLookup | OwnLobes | None = None  # what they see past it, if that is not up to its spheres; None for all
 
     def parts(self) -> Iterator["Group"]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
@@ -272,11 +272,11 @@ class Group(NamedTuple):
         """
         points, normals, centers, radii, kept, _, places, _ = self
         size = points.shape[1]
-        turns = None if self.own is None else self.own.lookup.counts
+        turns = None if self.own is None else self.own.turned
         if radii.shape[1] or turns is not None:
             count = common_batch({"points": points, "centers": centers, "radii": radii, "rotations": turns})
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
-        varying = [*self[:4], *([] if self.own is None else [self.own.lookup.weights])]
+        varying = [*self[:4], turns]
         if kept is not None or size <= PART or varies(varying):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
             return
@@ -341,6 +341,10 @@ class SphereMethod(Method):
 
     def coefficient_count(self, light: Source | None) -> int:
         """Number of coefficients of known light that take part; None for free light."""
+        raise NotImplementedError
+
+    def own_shadows(self, bodies: tuple[int, ...], rotations: wp.array, light: Any) -> dict[int, Any]:
+        """What receivers of some bodies see past these, :attr:`Group.own` by body. Differentiable: rotations."""
         raise NotImplementedError
 
     def see(self, group: Group, light: Any) -> Seen:
@@ -492,7 +496,7 @@ class InParts(Node):
         return transfer if self._shading is None else self._shading.run(call, transfer, part, own)
 
     def _groups(
-        self, receivers: Receivers, spheres: tuple[wp.array, wp.array], looked_up: dict[int, OwnLookup]
+        self, receivers: Receivers, spheres: tuple[wp.array, wp.array], looked_up: dict[int, Any]
     ) -> Iterator[Group]:
         """Receivers that may move, in groups that the same spheres block."""
         method = self._method
@@ -542,7 +546,7 @@ def _own_shadows(method: SphereMethod, points: LitPoints, light: Any) -> Node:
         state = f"{missing} to be traced, or read from the cache" if missing else "traced once, kept"
         return f"{len(named)} {'body' if len(named) == 1 else 'bodies'}: {state}"
 
-    return Node("own shadows", functools.partial(method.own.lookups, bodies), rotations, light, items=traced)
+    return Node("own shadows", functools.partial(method.own_shadows, bodies), rotations, light, items=traced)
 
 
 def _why_no_own(method: SphereMethod, points: LitPoints) -> str:

@@ -11,9 +11,11 @@ from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
 from warpshadow.pipeline.node import Source
+from warpshadow.pipeline.own_shadows import OwnLobes
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import add_rows
-from warpshadow.stages.transfer import sh_transfer
+from warpshadow.stages.own_shadows.lobes import own_lobes
+from warpshadow.stages.transfer import sh_product, sh_transfer
 from warpshadow.stages.visibility import exponential, log_sh
 
 
@@ -33,7 +35,8 @@ class LogSH(SphereMethod):
         self._order = order = assembly.scene.visibility.order
         super().__init__(assembly, HarmonicBasis(order), basis, progress=progress)
         self.in_free = Bands(min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order)
-        if self.visibility.method == "none":
+        self.traces_own = self.visibility.method == "log-sh"
+        if not self.traces_own:
             self.why_no_shadows = "the method is to have no shadows"
 
     def in_known(self, light: KnownLight) -> Bands:
@@ -52,6 +55,10 @@ class LogSH(SphereMethod):
             return self.in_free.bands**2
         return self._band_count(known) ** 2
 
+    def own_shadows(self, bodies: tuple[int, ...], rotations: wp.array, light: Bands) -> dict[int, OwnLobes]:
+        """The lobes of some bodies, turned. Differentiable: rotations."""
+        return self.own.turned_lobes(bodies, rotations, self._order)
+
     def see(self, group: Group, light: Bands) -> Seen:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
         points, _, _, radii, kept = group[:5]
@@ -67,6 +74,13 @@ class LogSH(SphereMethod):
 
     def transfer(self, seen: Seen, group: Group, light: Bands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
+        if group.own is not None and group.points.size:
+            assert group.places is not None and isinstance(group.own, OwnLobes)
+            lobes, turn = group.own
+            if seen.through is None:
+                return own_lobes(lobes, group.places, turn, order=self._order, bands=light.bands)
+            own = own_lobes(lobes, group.places, turn, order=self._order)
+            return sh_product(seen.through, own, order=self._order, bands=light.bands)
         return sh_transfer(seen.through, group.normals, order=self._order, bands=light.bands)
 
     def kept_rows(self, static: Static, light: Source | None) -> Rows:

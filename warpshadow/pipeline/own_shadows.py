@@ -9,7 +9,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -22,6 +22,7 @@ from warpshadow.pipeline.node import Source
 from warpshadow.spheres.cache import cache_path, remembered
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.own_shadows.lobes import Turned, find_turned, project_rows
 from warpshadow.stages.own_shadows.lookup import Lookup, Supports, find_lookups, find_supports
 from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, cuts_of, find_sites
 from warpshadow.stages.own_shadows.trace import RAYS, OwnRows, ray_count, trace_rows
@@ -54,6 +55,23 @@ class OwnLookup(NamedTuple):
     lookup: Lookup
     supports: Supports
 
+    @property
+    def turned(self) -> wp.array:
+        """What of it depends on the rotations, of shape [batch, …]."""
+        return self.lookup.weights
+
+
+class OwnLobes(NamedTuple):
+    """The same where light is in harmonics: the body's lobes, and how they are turned."""
+
+    lobes: wp.array  # [row, order²]
+    turn: Turned
+
+    @property
+    def turned(self) -> wp.array:
+        """What of it depends on the rotations, of shape [batch, …]."""
+        return self.turn.rotations
+
 
 class OwnShadows:
     """What rays found of the bodies' shadows on themselves, each in its own frame.
@@ -69,6 +87,7 @@ class OwnShadows:
         self._sites: dict[int, Sites] = {}
         self._tables: dict[int, SiteTable] = {}
         self._rows: dict[int, OwnRows] = {}
+        self._lobes: dict[tuple[int, int], wp.array] = {}
 
     # ------------------------------------------------------------------------------------------ which bodies
 
@@ -137,15 +156,30 @@ class OwnShadows:
 
     # ------------------------------------------------------------------------------------------ what
 
-    def lookups(self, bodies: tuple[int, ...], rotations: wp.array, light: Any) -> dict[int, OwnLookup]:
-        """What receivers of bodies look up of them, for the cells of some light. Differentiable: rotations."""
+    def lookups(
+        self, bodies: tuple[int, ...], rotations: wp.array, directions: np.ndarray, spreads: np.ndarray | None
+    ) -> dict[int, OwnLookup]:
+        """What receivers of bodies look up of them for cells, as for find_supports. Differentiable: rotations."""
         found = {}
         for body in bodies:
             if not self.is_flat[body]:
                 rows = self.rows(body)
-                supports = find_supports(light.directions, light.spreads, rows.ray_count, rotations.device)
+                supports = find_supports(directions, spreads, rows.ray_count, rotations.device)
                 found[body] = OwnLookup(rows, find_lookups(rotations, body, supports), supports)
         return found
+
+    def turned_lobes(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, OwnLobes]:
+        """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
+        return {
+            body: OwnLobes(self._lobes_of(body, order), find_turned(rotations, body, order))
+            for body in bodies
+            if not self.is_flat[body]
+        }
+
+    def _lobes_of(self, body: int, order: int) -> wp.array:
+        if (body, order) not in self._lobes:
+            self._lobes[body, order] = project_rows(self.rows(body), self._normals(body), order)
+        return self._lobes[body, order]
 
     def missing(self, bodies: tuple[int, ...]) -> int:
         """Number of bodies, of some, of which nothing is in memory yet."""
@@ -153,6 +187,11 @@ class OwnShadows:
 
     def _row_count(self, body: int) -> int:
         return len(self.sites(body).positions) * (1 + bool(self._assembly.is_two_sided[body]))
+
+    def _normals(self, body: int) -> np.ndarray:
+        """Normals of the sites of a body, and of their backs if it is open."""
+        sides = (1, -1) if self._assembly.is_two_sided[body] else (1,)
+        return np.concatenate([side * self.sites(body).normals for side in sides])
 
     def rows(self, body: int) -> OwnRows:
         """What the sites of a body see past it: in memory, on disk, or traced."""
@@ -181,9 +220,8 @@ class OwnShadows:
             def trace() -> OwnRows:
                 points = wp.array(sites.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
                 whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
-                sides = (1, -1) if self._assembly.is_two_sided[body] else (1,)
-                normals = np.concatenate([side * sites.normals for side in sides])
-                places = np.tile(sites.positions, (len(sides), 1))
+                normals = self._normals(body)
+                places = np.tile(sites.positions, (len(normals) // len(sites.normals), 1))
                 with unrecorded():
                     return trace_rows(whole, places, normals, count, progress=self._progress)
 

@@ -30,7 +30,7 @@ READ_BY = {
     "directions": ("directional",),
     "softness": ("directional", AUTO),
     "merging": (*SPHERE_METHODS, AUTO),
-    "self_shadows": ("directional", AUTO),
+    "self_shadows": (*SPHERE_METHODS, AUTO),
     "order": ("log-sh", "none", "ray-traced", AUTO),
     "log": ("log-sh",),
     "base": ("log-sh",),

@@ -200,6 +200,90 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     )
 
 
+@functools.cache
+def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    find_group, load_rows, add_rows = fn.find_group, fn.load_rows, fn.add_rows
+    multiply = make_multiply(order, lanes)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def multiply_sh(
+        first_row: int,
+        worker: int,
+        # in
+        first_factor: wp.array3d(dtype=wp.float32),
+        second_factor: wp.array3d(dtype=wp.float32),
+        table: ProductTable,
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        products: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
+        row = first_row + wp.tid()
+        batch, group = find_group(row, products.shape[1])
+        place = scratch_place(worker, row)
+        first = scratch[place, 0]
+        second = scratch[place, 1]
+        product = scratch[place, 2]
+        for i in range(second_factor.shape[2], wp.static(order**2)):
+            second[i] = Lane(0.0)
+        load_rows(first_factor[batch], group, first)
+        load_rows(second_factor[batch], group, second)
+        multiply(first, second, table, product)
+        add_rows(product, group, products[batch])
+
+    return multiply_sh
+
+
+def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int | None = None) -> wp.array:
+    """Transfer vectors of lobes that are not the clamped cosine: (V * K)_k.
+
+    Args:
+        visibility: V, float32 of shape [batch, vertex, order²].
+        lobes: K, float32 of shape [batch, vertex, order²].
+        order: Number of SH bands, 2 to 8.
+        bands: As for :func:`sh_transfer`.
+
+    Returns:
+        Transfer vectors, float32 of shape [batch, vertex, bands²].
+
+    Differentiable: visibility, lobes.
+    """
+    sh.check_order(order)
+    bands = order if bands is None else bands
+    check.choice("bands", bands, range(1, order + 1))
+    check.shape("lobes", lobes.shape, visibility.shape)
+    device = visibility.device
+    lanes = lane_count(device)
+    batch_count, vertex_count, _ = visibility.shape
+    row_count = batch_count * group_count(vertex_count, lanes)
+
+    def add_product(first: wp.array, second: wp.array, table: ProductTable, total: wp.array) -> None:
+        launch(
+            _sh_product_kernel(order, lanes),
+            row_count,
+            inputs=[first, second, table],
+            scratch=[Scratch((3, order**2), lane_type(lanes))],
+            outputs=[total],
+            cost=2 * PRODUCT_COST * lanes * order**2 * bands**2,
+        )
+
+    def adjoint(adj: wp.array) -> None:
+        """Γ is symmetric:  V̄ = K * T̄  and  K̄ = V * T̄."""
+        table = product_table(order, str(device), tuple(range(bands)))
+        for factor, other in ((visibility, lobes), (lobes, visibility)):
+            if factor.requires_grad:
+                add_product(other, adj, table, factor.grad)
+
+    return differentiable(
+        lambda transfer: add_product(visibility, lobes, product_table(order, str(device), None, bands), transfer),
+        adjoint,
+        result=wp.zeros((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        variables=[visibility, lobes],
+    )
+
+
 @wp.kernel(enable_backward=False)
 def _transfer_directions(
     first_row: int,
