@@ -14,6 +14,7 @@ from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.stages import transfer
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.interpolate import _make_interpolate, _make_interpolate_adjoint
+from warpshadow.stages.own_shadows import lobes
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -49,6 +50,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for make in (transfer._sh_transfer_kernel, transfer._sh_transfer_adjoint_kernel)
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
+    **{f"_sh_product_kernel {order}": partial(transfer._sh_product_kernel, order, LANES) for order in ORDERS},
+    **{f"_make_evaluate {order}": partial(lobes._make_evaluate, order) for order in ORDERS},
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (

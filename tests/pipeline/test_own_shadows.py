@@ -69,10 +69,21 @@ def test_images_are_nearer_to_rays_than_with_spheres(receivers):
     assert errors[0] < 0.6 * errors[1] and errors[0] < 0.06
 
 
+@pytest.mark.parametrize("order", [4, 8])
+def test_images_in_harmonics_are_nearer_to_rays_than_with_spheres(order):
+    light = ws.synthetic_sky((-0.6, 0.6, 0.3), height=32, sun_radius=40)
+    scenes = [scene_of(light=light, method="log-sh", order=order, self_shadows=how) for how in ("traced", "spheres")]
+    errors = [error_of(scene) for scene in scenes]
+    assert errors[0] < 0.75 * errors[1]
+
+
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
-def test_gradients_to_rotations_are_central_differences(receivers, device):
-    """Of weighted shading, through vertices, normals, places in faces, and lookups."""
-    renderer = Renderer(scene_of(receivers), device=device)
+def test_gradients_to_rotations_are_central_differences(receivers, method, device):
+    """Of weighted shading, through vertices, normals, places in faces, and lookups or turned lobes."""
+    other = ws.Body(ws.icosphere(0.6, 2), blockers=ws.Spheres([[0, 0, 0]], [0.6]), translation=(-1.4, 0.3, 0))
+    bodies = (other,) if method == "log-sh" else ()
+    renderer = Renderer(scene_of(receivers, method=method, order=4, bodies=bodies), device=device)
     rng = np.random.default_rng(0)
     axis = rng.normal(size=3)
 
@@ -140,8 +151,9 @@ def test_rows_are_traced_once_and_kept_on_disk(monkeypatch):
     np.testing.assert_array_equal(ws.render(scene), first)
 
 
-def test_a_batch_of_poses_is_poses_one_by_one(device):
-    renderer = Renderer(scene_of(), device=device)
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_a_batch_of_poses_is_poses_one_by_one(method, device):
+    renderer = Renderer(scene_of(method=method, order=4), device=device)
     angles = [(0, 0, 0), (0.3, -0.2, 0.1)]
     poses = [turned(renderer, each) for each in angles]
     both = Poses(
@@ -166,6 +178,16 @@ def test_bodies_that_move_among_static_ones_have_own_shadows():
     whole = renderer.placed(turned(renderer, (0.1, 0, 0)))
     images = [renderer.draw(view=renderer.view(each)).numpy() for each in (geometry, whole)]
     assert np.abs(images[0] - images[1])[0, :, 16:].max() < 0.05
+
+
+@pytest.mark.parametrize("moving", [0, 1])
+def test_static_bodies_keep_their_lobes(moving):
+    other = ws.Body(ws.icosphere(0.6, 2), blockers=ws.Spheres([[0, 0, 0]], [0.6]), translation=(-1.4, 0.3, 0))
+    renderer = Renderer(scene_of(bodies=(other,), method="log-sh", order=4))
+    poses = renderer.scene_poses()
+    geometries = renderer.placed(poses, moving=[moving]), renderer.placed(poses)
+    images = [renderer.draw(view=renderer.view(each)).numpy() for each in geometries]
+    np.testing.assert_allclose(*images, atol=1e-4)
 
 
 def test_a_mesh_of_too_many_vertices_has_fewer_rays_and_says_so(monkeypatch, tmp_path):

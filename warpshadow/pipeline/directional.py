@@ -12,7 +12,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, map_of
 from warpshadow.pipeline.node import Source
-from warpshadow.pipeline.own_shadows import OwnLookup
+from warpshadow.pipeline.own_shadows import OwnLookup, Traced
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
@@ -93,7 +93,7 @@ class Directional(SphereMethod):
             return light_cells(transfer, group.kept)
         return super().light_part(transfer, group, light)
 
-    def kept_rows(self, static: Static, light: Source | None) -> Rows:
+    def kept_rows(self, static: Static, light: Source | None, traced: Traced) -> Rows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
         is_scenes = light is self.light
         return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))

@@ -359,8 +359,8 @@ class SphereMethod(Method):
         """Shading of a group in known light."""
         return shade(transfer, light.coefficients, most=LARGEST_COEFFICIENT)
 
-    def kept_rows(self, static: Static, light: Source | None) -> Rows:
-        """Rows of what static bodies block, of known light or of any."""
+    def kept_rows(self, static: Static, light: Source | None, traced: Traced) -> Rows:
+        """Rows of what static bodies block, of known light or of any, given whose own spheres do not."""
         raise NotImplementedError
 
     @functools.cached_property
@@ -563,7 +563,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Source | Non
     static = points.static
     if static is None or not static.spheres[1].shape[1]:
         return Node("static shadows", None, idle="no static body has blockers")
-    rows = method.kept_rows(static, light)
+    rows = method.kept_rows(static, light, points.traced)
 
     def missing() -> int:
         receivers = points.receivers_node.known(points.call)

@@ -1,5 +1,6 @@
 """The log-SH method: visibility in spherical harmonics, the exponential of a sum of logarithms over the spheres."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
 from warpshadow.pipeline.node import Source
-from warpshadow.pipeline.own_shadows import OwnLobes
+from warpshadow.pipeline.own_shadows import OwnLobes, Traced
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import add_rows
 from warpshadow.stages.own_shadows.lobes import own_lobes
@@ -74,22 +75,59 @@ class LogSH(SphereMethod):
 
     def transfer(self, seen: Seen, group: Group, light: Bands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
-        if group.own is not None and group.points.size:
-            assert group.places is not None and isinstance(group.own, OwnLobes)
-            lobes, turn = group.own
-            if seen.through is None:
-                return own_lobes(lobes, group.places, turn, order=self._order, bands=light.bands)
-            own = own_lobes(lobes, group.places, turn, order=self._order)
-            return sh_product(seen.through, own, order=self._order, bands=light.bands)
-        return sh_transfer(seen.through, group.normals, order=self._order, bands=light.bands)
+        own = self._own_lobes(seen, group, light)
+        if own is None:
+            return sh_transfer(seen.through, group.normals, order=self._order, bands=light.bands)
+        return own if seen.through is None else sh_product(seen.through, own, order=self._order, bands=light.bands)
 
-    def kept_rows(self, static: Static, light: Source | None) -> Rows:
-        """The log-visibility of the static spheres, [row, 1, order²], for any light."""
+    def _own_lobes(self, seen: Seen, group: Group, light: Bands) -> wp.array | None:
+        """Lobes that receivers' own bodies leave, [batch, receiver, order²]; only the light's bands if nothing blocks.
+
+        None where they are clamped cosines.
+        """
+        if group.kept is not None and group.kept.rows.shape[1] == 2:
+            assert seen.through is not None
+            lobes = wp.zeros(seen.through.shape, dtype=wp.float32, device=seen.through.device)
+            add_rows(group.kept, lobes, channel=1)
+            return lobes
+        if group.own is None or not group.points.size:
+            return None
+        assert group.places is not None and isinstance(group.own, OwnLobes)
+        bands = light.bands if seen.through is None else self._order
+        return own_lobes(group.own.lobes, group.places, group.own.turn, order=self._order, bands=bands)
+
+    def kept_rows(self, static: Static, light: Source | None, traced: Traced) -> Rows:
+        """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
+        if any(body in traced.bodies for body in static.bodies):
+            find = functools.partial(self._accumulate_and_turn, traced.bodies)
+            return static.rows(("log sums and lobes", traced.bodies), find)
         return static.rows("log sums", self._accumulate)
 
     def _accumulate(self, static: Static, vertices: np.ndarray, normals: wp.array) -> wp.array:
         logs = self._logs(*static.gathered(vertices, normals), *static.spheres)
         return logs.reshape((len(vertices), 1, self._order**2))
+
+    def _accumulate_and_turn(
+        self, traced: tuple[int, ...], static: Static, vertices: np.ndarray, normals: wp.array
+    ) -> wp.array:
+        """Log sums of the spheres of other bodies, and lobes, [vertex, 2, order²]."""
+        assert static.rotations is not None
+        body_of_vertex, device = self.assembly.body_of_vertex, self.assembly.device
+        rows = np.empty((len(vertices), 2, self._order**2), np.float32)
+        bodies = body_of_vertex[vertices % len(body_of_vertex)]
+        turned = self.own.turned_lobes(tuple(np.intersect1d(traced, bodies).tolist()), static.rotations, self._order)
+        for body in np.unique(bodies).tolist():
+            of_body = np.flatnonzero(bodies == body)
+            given = static.gathered(vertices[of_body], normals)
+            blocking = [other for other in static.bodies if not (other == body and body in traced)]
+            rows[of_body, 0] = self._logs(*given, *static.spheres_of(blocking)).numpy()[0]
+            if body in turned:
+                lobes, turn = turned[body]
+                own = own_lobes(lobes, self.own.places_of(body, vertices[of_body]), turn, order=self._order)
+            else:
+                own = sh_transfer(None, given[1], order=self._order)
+            rows[of_body, 1] = own.numpy()[0]
+        return wp.array(rows, dtype=wp.float32, device=device)
 
     def _logs(self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
         log, merging = self.visibility.log, self.visibility.merging

@@ -140,6 +140,10 @@ class OwnShadows:
         assert seen is not None
         return table.of_samples(Fragments(cut(seen.face_ids, first, end), cut(seen.barycentrics, first, end)))
 
+    def places_of(self, body: int, vertices: np.ndarray) -> Places:
+        """Where vertices of a body, after the last of which backs are numbered, lie among its sites."""
+        return self._table(body).of_vertices(wp.array(vertices, dtype=wp.int32, device=self._assembly.device))
+
     def _table(self, body: int) -> SiteTable:
         if body not in self._tables:
             assembly, sites = self._assembly, self.sites(body)

@@ -112,10 +112,19 @@ class Static:
 
     # ------------------------------------------------------------------------------------------ what blocks light
 
+    @property
+    def rotations(self) -> wp.array | None:
+        """How all bodies are turned, mat33 of shape [1, body]; those of moving ones mean nothing. None if unknown."""
+        return self._geometry.rotations
+
+    def spheres_of(self, bodies: list[int]) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of some of them."""
+        return self._assembly.spheres_of(bodies, (self._geometry.centers, self._geometry.radii))
+
     @functools.cached_property
     def spheres(self) -> tuple[wp.array, wp.array]:
         """Centers and radii of their spheres."""
-        return self._assembly.spheres_of(self.bodies, (self._geometry.centers, self._geometry.radii))
+        return self.spheres_of(self.bodies)
 
     def moving_spheres(self, spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of what moves, of those of all bodies. Differentiable: spheres."""

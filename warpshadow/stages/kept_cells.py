@@ -138,6 +138,7 @@ def _add_rows(
     # in
     index: wp.array(dtype=wp.int32),
     rows: wp.array3d(dtype=wp.float32),
+    channel: int,
     # out
     sums: wp.array3d(dtype=wp.float32),
 ):
@@ -145,16 +146,17 @@ def _add_rows(
     batch, receiver = wp.tid()
     row = index[receiver]
     for item in range(rows.shape[2]):
-        sums[batch, receiver, item] = sums[batch, receiver, item] + rows[row, 0, item]
+        sums[batch, receiver, item] = sums[batch, receiver, item] + rows[row, channel, item]
 
 
-def add_rows(kept: KeptRows, sums: wp.array) -> None:
+def add_rows(kept: KeptRows, sums: wp.array, channel: int = 0) -> None:
     """Add the kept sums over static bodies to sums over moving bodies, in place.
 
     No adjoint is needed: a constant leaves the gradient as it is.
 
     Args:
-        kept: Of shape [row, 1, item].
+        kept: Of shape [row, channel, item].
         sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
+        channel: Which is added.
     """
-    launch(_add_rows, sums.shape[:2], inputs=[kept.index, kept.rows], outputs=[sums])
+    launch(_add_rows, sums.shape[:2], inputs=[kept.index, kept.rows, channel], outputs=[sums])

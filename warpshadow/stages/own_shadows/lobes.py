@@ -2,7 +2,8 @@
 
     L_k = 1/π ∫ S(ω) max(n·ω, 0) y_k(ω) dω
 
-S the visibility that rays found (:mod:`.trace`). A rotation R of the body turns harmonics band by band, so receivers have
+S the visibility that rays found (:mod:`.trace`). A rotation R of the body turns harmonics band by band, so receivers
+have
 
     K = D(R) Σ_j b_j L[row_j]
 
@@ -120,7 +121,7 @@ class Turned(NamedTuple):
 
 
 def find_turned(rotations: wp.array, body: int, order: int) -> Turned:
-    """Find how a body turns harmonics. :func:`own_lobes` is differentiable in the rotations, through what is returned."""
+    """Find how a body turns harmonics. Differentiable: rotations, in :func:`own_lobes`."""
     count, device = len(rotations), rotations.device
     directions, weights = sh.quadrature(2 * order - 2)
     weighted = constant((weights[:, None] * sh.evaluate(order, directions)).astype(np.float32), wp.float32, device)
@@ -232,7 +233,11 @@ def _generator_rows(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The generators as sparse rows: entries of row k are at first[k] … first[k + 1], each an index and a vec3."""
     generators = sh.rotation_generators(order)
     k, i = np.nonzero(np.abs(generators).max(axis=0) > 1e-9)
-    return np.searchsorted(k, np.arange(order**2 + 1)).astype(np.int32), i.astype(np.int32), generators[:, k, i].T.reshape(-1, 3)
+    return (
+        np.searchsorted(k, np.arange(order**2 + 1)).astype(np.int32),
+        i.astype(np.int32),
+        generators[:, k, i].T.reshape(-1, 3),
+    )
 
 
 def own_lobes(lobes: wp.array, places: Places, turned: Turned, *, order: int, bands: int | None = None) -> wp.array:
