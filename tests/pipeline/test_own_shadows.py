@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 # Differences of shading in float32, at a step where its curvature does not show.
 GRADIENT = 0.01
-STEP = 5e-4
+STEP = 2.5e-4
 
 
 @pytest.fixture(scope="module", autouse=True)
