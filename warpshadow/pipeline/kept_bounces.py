@@ -20,7 +20,7 @@ from warpshadow.pipeline.lighting import LitPoints, receiver_words
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.stages.bounces.factors import trace_factors
+from warpshadow.stages.bounces.factors import loose_mesh, trace_factors
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
@@ -82,8 +82,9 @@ class KeptBounces:
             if factors.shape[0] > 1:
                 if len(bounced) > 1:
                     raise ValueError(
-                        f"light, albedo, textures: got a batch of {len(bounced)} for {factors.shape[0]} views, "
-                        "expected one, which bounces past rays for them all"
+                        f"light, albedo, textures: got a batch of {len(bounced)} for {factors.shape[0]} views by "
+                        'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
+                        "batches"
                     )
                 bounced = bounced.reshape(factors.shape)
             return total_light([direct, bounced])
@@ -104,8 +105,8 @@ class KeptBounces:
 
             if len(positions) > 1:
                 raise ValueError(
-                    f"geometry: got a batch of {len(positions)} for free light or reflectance that bounces past rays, "
-                    "expected one"
+                    f'geometry: got a batch of {len(positions)} for method "ray-traced" with bounces and free light or '
+                    'given reflectance, expected one; method = "directional" takes batches'
                 )
             mesh, of_faces = self._mesh(positions.numpy()[0], senders)
 
@@ -155,7 +156,4 @@ class KeptBounces:
             else:
                 corners.append(own[faces])
                 owners.append(np.full((2, len(faces)), -1))
-        joined = np.concatenate(corners).reshape(-1, 3)
-        points = wp.array(joined, dtype=wp.vec3, device=assembly.device)
-        indices = wp.array(np.arange(len(joined)), dtype=wp.int32, device=assembly.device)
-        return wp.Mesh(points, indices), np.concatenate(owners, axis=1)
+        return loose_mesh(np.concatenate(corners), device=assembly.device), np.concatenate(owners, axis=1)

@@ -142,9 +142,6 @@ class Method:
     traces_own = False
     """Whether bodies' shadows on themselves may come from rays, where the others' come from spheres."""
 
-    can_bounce = False
-    """Whether it finds light that bounces."""
-
     def __init__(self, assembly: Assembly, own_basis: Basis, basis: Basis | None, *, progress: bool = False):
         self.assembly, self.own_basis, self.progress = assembly, own_basis, progress
         self.basis = own_basis if basis is None else basis
@@ -331,7 +328,6 @@ class SphereMethod(Method):
     in_free: Any
     why_no_shadows = ""
     joins_kept = False
-    can_bounce = True
     bounces: "Bouncing | None" = None
     flats: tuple[int, ...] = ()
 

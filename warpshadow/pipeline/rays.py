@@ -26,7 +26,6 @@ class Rays(Method):
     """Visibility of the meshes."""
 
     lights_samples = True
-    can_bounce = True
 
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
@@ -34,7 +33,8 @@ class Rays(Method):
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn.
 
-        It bounces along paths from what the scene's bodies reflect; from what a call gives, past what rays found once.
+        By what the scene's bodies reflect, light bounces along paths, without a gradient; by reflectance that a call
+        gives, it bounces between patches, whose form factors rays find once.
         """
         meshes = self._meshes(points)
 

@@ -91,9 +91,6 @@ class Renderer:
         where = check.device("device", device)
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
         make_method = METHODS[scene.visibility.method]
-        if scene.bounces and not make_method.can_bounce:
-            method = scene.visibility.method
-            raise ValueError(f"scene.bounces: got {scene.bounces}, which {method!r} does not find yet, expected 0")
         self._arguments = {
             "scene": scene,
             "cameras": cameras,
@@ -321,6 +318,9 @@ class Renderer:
 
     def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
         """Points to be lit by :meth:`shade` that are given, not found in an image.
+
+        Nobody knows which body a point is on: all spheres block its light, and where light bounces, none comes from its
+        own body as such. For points of bodies take :meth:`on_faces`.
 
         Args:
             points: Positions [scene units], vec3 of shape [batch, receiver].

@@ -69,9 +69,13 @@ def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, de
         positions, faces: The mesh that they are pieces of, NumPy.
         device: Where rays are traced.
     """
-    corners = patches.pieces.positions(positions, faces).reshape(-1, 3)
-    indices = np.arange(len(corners), dtype=np.int32)
-    return wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), wp.array(indices, dtype=wp.int32, device=device))
+    return loose_mesh(patches.pieces.positions(positions, faces), device=device)
+
+
+def loose_mesh(corners: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
+    """Make a mesh of triangles that share no vertices, given their corners [face, 3, 3]."""
+    points = wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device)
+    return wp.Mesh(points, wp.array(np.arange(points.size), dtype=wp.int32, device=device))
 
 
 def trace_factors(

@@ -6,6 +6,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.interpolate import at_point
 
 
 @wp.kernel
@@ -21,11 +22,7 @@ def _mix_sites(
     batch, receiver = wp.tid()
     lit = instance_in(batch, site_light.shape[0])
     placed = instance_in(batch, rows.shape[0])
-    row = rows[placed, receiver]
-    weight = weights[placed, receiver]
-    light[batch, receiver] = (
-        weight[0] * site_light[lit, row[0]] + weight[1] * site_light[lit, row[1]] + weight[2] * site_light[lit, row[2]]
-    )
+    light[batch, receiver] = at_point(site_light[lit], rows[placed, receiver], weights[placed, receiver])
 
 
 def own_light(factors: SparseMatrix, radiosity: wp.array, rows: wp.array, weights: wp.array) -> wp.array:

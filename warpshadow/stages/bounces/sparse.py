@@ -20,7 +20,7 @@ _ITEM_COST = 2.0
 """Nanoseconds that an entry takes."""
 
 
-class Rows(NamedTuple):
+class Entries(NamedTuple):
     """Entries of a sparse matrix, those of a row after one another."""
 
     starts: wp.array  # [row + 1] int32
@@ -39,8 +39,8 @@ class SparseMatrix:
     """
 
     shape: tuple[int, int]
-    rows: Rows
-    columns: Rows
+    rows: Entries
+    columns: Entries
 
     @staticmethod
     def of(matrix: np.ndarray | spmatrix | sparray, *, device: wp.DeviceLike) -> SparseMatrix:
@@ -48,12 +48,12 @@ class SparseMatrix:
         from scipy.sparse import csr_matrix
 
         by_rows = csr_matrix(matrix)
-        return SparseMatrix(by_rows.shape, _rows(by_rows, device), _rows(by_rows.T.tocsr(), device))
+        return SparseMatrix(by_rows.shape, _entries(by_rows, device), _entries(by_rows.T.tocsr(), device))
 
 
-def _rows(matrix: csr_matrix, device: wp.DeviceLike) -> Rows:
+def _entries(matrix: csr_matrix, device: wp.DeviceLike) -> Entries:
     matrix.eliminate_zeros()
-    return Rows(
+    return Entries(
         wp.array(matrix.indptr, dtype=wp.int32, device=device),
         wp.array(matrix.indices, dtype=wp.int32, device=device),
         wp.array(matrix.data, dtype=wp.float32, device=device),
@@ -98,7 +98,7 @@ def multiply(matrix: SparseMatrix, values: wp.array) -> wp.array:
     """
     check.shape("values", values.shape, ("batch", matrix.shape[1]))
 
-    def times(entries: Rows, factors: wp.array, products: wp.array, *, adds: bool) -> None:
+    def times(entries: Entries, factors: wp.array, products: wp.array, *, adds: bool) -> None:
         cost = _ITEM_COST * (entries.columns.size / max(products.shape[1], 1) + 1)
         inputs = [*entries, factors, int(adds)]
         launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
