@@ -90,9 +90,10 @@ def render(
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
     ] = None,
-    samples: Annotated[Optional[int], typer.Option(help="Directions of the ray-traced method.", min=1)] = None,
+    samples: Annotated[Optional[int], typer.Option(help="Rays of a pixel, of the ray-traced method.", min=1)] = None,
     bounces: Annotated[
-        Optional[int], typer.Option(help="How often light bounces, in place of the scene's.", min=0, max=16)
+        Optional[int],
+        typer.Option(help="How often light bounces, in place of the scene's; ray-traced: along paths.", min=0, max=16),
     ] = None,
     device: Device = "cpu",
 ) -> None:

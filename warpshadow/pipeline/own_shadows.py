@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
 from warpshadow.device.tape import unrecorded
@@ -25,7 +26,7 @@ from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.own_shadows.lobes import Turned, find_turned, project_rows
 from warpshadow.stages.own_shadows.lookup import Lookup, Supports, find_lookups, find_supports
 from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, cuts_of, find_sites
-from warpshadow.stages.own_shadows.trace import RAYS, OwnRows, ray_count, trace_rows
+from warpshadow.stages.own_shadows.trace import RAYS, RUN, OwnRows, ray_count, trace_rows
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers, Span
 
@@ -215,11 +216,11 @@ class OwnShadows:
             key.update(np.asarray(faces, np.int32).tobytes())
 
             def read(stored: Mapping[str, np.ndarray]) -> OwnRows:
-                arrays = (wp.array(stored[name], device=device) for name in OwnRows._fields)
-                found = OwnRows(*arrays)
-                if found.bits.shape != (self._row_count(body), count // 32):
-                    raise ValueError(f"got bits of shape {found.bits.shape}")
-                return found
+                for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RUN)):
+                    check.shape(name, stored[name].shape, (self._row_count(body), width))
+                    if stored[name].dtype != dtype:
+                        raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
+                return OwnRows(*(wp.array(stored[name], device=device) for name in OwnRows._fields))
 
             def trace() -> OwnRows:
                 points = wp.array(sites.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)

@@ -54,6 +54,9 @@ def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object)
 def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> Scene:
     with check.located("the scene"):
         check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
+        for table in ("visibility", "camera"):
+            if "bounces" in (scene.get(table) or {}):
+                raise ValueError(f"[{table}]: got bounces, expected it in [light]")
     for name in ("camera", "light", "body"):
         if name not in scene:
             raise ValueError(f"[{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
