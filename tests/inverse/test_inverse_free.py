@@ -275,6 +275,13 @@ def test_a_texture_starts_from_a_color_and_at_another_size(scene):
     assert np.allclose(halved, ground.texture.reshape(3, 2, 5, 3).mean(axis=1), atol=1e-6)
 
 
+def test_a_texture_is_found_where_light_bounces(scene):
+    problem, setting, values = prepared(dataclasses.replace(scene, bounces=1), [Texture(GROUND)])
+    found = problem.found(values, setting).scene
+    assert found.bounces == 1
+    assert found.bodies[GROUND].texture.shape == scene.bodies[GROUND].texture.shape
+
+
 def setting_of(scene):
     return prepared(scene, [Exposure()])[1]
 

@@ -126,6 +126,6 @@ class Texture(FreeOfBody):
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
         texels = values["texels"].cpu().numpy()
         found.change_body(self.number, texture=texels)
-        unshadowed = replace(found.scene, visibility=Visibility(method="none"))
+        unshadowed = replace(found.scene, visibility=Visibility(method="none"), bounces=0)
         renderer = Renderer(unshadowed, cameras=found.cameras, device=str(setting.device))
         found.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))
