@@ -246,7 +246,8 @@ class TorchRenderer(torch.nn.Module):
 
         Returns:
             Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one; tensors of their
-            own, which may be written to.
+            own, which may be written to. Who changes a body's shape that way gives a geometry without ``rotations``:
+            with them the body's shadow on itself is that of its mesh.
 
         Differentiable: all.
         """

@@ -558,7 +558,9 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Source | Non
     """Node of what static bodies block of the light of receivers on them; its value is None where there is nothing."""
     static = points.static
     if static is None or not static.spheres[1].shape[1]:
-        return Node("static shadows", None, idle="no static body has blockers")
+        bouncing = method.assembly.scene.bounces > 0
+        why = "light bounces: nothing of static bodies is kept" if bouncing else "no static body has blockers"
+        return Node("static shadows", None, idle=why)
     rows = method.kept_rows(static, light, points.traced)
 
     def missing() -> int:

@@ -107,7 +107,7 @@ class OwnShadows:
         if geometry is not None and body in geometry.deformed:
             return "its shape is free"
         if geometry is not None and geometry.rotations is None:
-            return "geometry has no rotations"
+            return "geometry has no rotations, as placed() gives them"
         return ""
 
     @functools.cached_property
