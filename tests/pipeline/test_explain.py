@@ -460,7 +460,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
     if module in ("device.batch", "stages.poses", "stages.own_shadows.sites"):
         return None
-    if module in ("stages.own_shadows.trace", "stages.own_shadows.lookup"):
+    if module in ("stages.own_shadows.trace", "stages.own_shadows.lookup", "stages.own_shadows.lobes"):
         return "own shadows"
     of_visibility = "stages.visibility", "stages.own_shadows.gather", "stages.ray_tracing"
     if module.startswith(of_visibility) or key == "_add_rows":

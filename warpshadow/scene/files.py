@@ -55,7 +55,7 @@ def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> 
     with check.located("the scene"):
         check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
         for table in ("visibility", "camera"):
-            if "bounces" in (scene.get(table) or {}):
+            if isinstance(scene.get(table), dict) and "bounces" in scene[table]:
                 raise ValueError(f"[{table}]: got bounces, expected it in [light]")
     for name in ("camera", "light", "body"):
         if name not in scene:
