@@ -121,14 +121,24 @@ def squared_difference(image, target):
 
 @pytest.mark.usefixtures("captures")
 @pytest.mark.parametrize(
-    ("method", "receivers"), [("directional", "vertex"), ("log-sh", "vertex"), ("none", "vertex"), ("none", "pixel")]
+    ("method", "receivers", "bounces"),
+    [
+        ("directional", "vertex", 0),
+        ("directional", "vertex", 2),
+        ("log-sh", "vertex", 0),
+        ("log-sh", "vertex", 2),
+        ("none", "vertex", 0),
+        ("none", "pixel", 0),
+    ],
 )
-def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, receivers, scene, device, monkeypatch):
+def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(
+    method, receivers, bounces, scene, device, monkeypatch
+):
     """As on a GPU, all vertices are receivers."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
     visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
     bodies = [dataclasses.replace(body, receivers=receivers) for body in scene.bodies]
-    scene = ws.Scene(bodies, scene.light, scene.camera, visibility)
+    scene = ws.Scene(bodies, scene.light, scene.camera, visibility, bounces=bounces)
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
     target = wp.clone(pose.draw(), requires_grad=False).flatten()
     evaluate = with_gradients(lambda: squared_difference(pose.draw(), target), [pose.turn, pose.translation])
@@ -146,15 +156,16 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(method, re
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("captures")
-@pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
-def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, scene, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "bounces"), [("directional", 0), ("directional", 2), ("log-sh", 0), ("log-sh", 2), ("none", 0)]
+)
+def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, bounces, scene, monkeypatch):
     """A graph would copy from memory that the host has long given to others."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
     ground = ws.Body(ws.plane(4, 8), texture=np.full((4, 4, 3), 0.5))
     visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
-    pose = warp_loop.FreePose(
-        ws.Renderer(ws.Scene((scene.bodies[0], ground), scene.light, scene.camera, visibility), device="cpu")
-    )
+    scene = ws.Scene((scene.bodies[0], ground), scene.light, scene.camera, visibility, bounces=bounces)
+    pose = warp_loop.FreePose(ws.Renderer(scene, device="cpu"))
     target = wp.zeros(24 * 24, dtype=wp.vec4, device="cpu")
     evaluate = with_gradients(lambda: squared_difference(pose.draw(), target), [pose.turn, pose.translation])
     copied = []
@@ -173,11 +184,13 @@ def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(method, sc
 
 
 @pytest.mark.usefixtures("captures")
+@pytest.mark.parametrize("bounces", [0, 2])
 @pytest.mark.parametrize("method", ["directional", "ray-traced"])
-def test_a_captured_fit_of_light_and_texture_has_the_gradients_of_a_plain_one(method, scene, device):
+def test_a_captured_fit_of_light_and_texture_has_the_gradients_of_a_plain_one(method, bounces, scene, device):
     visibility = ws.Visibility.of({"method": method, "directions": 32, "samples": 64})
     basis = CellBasis(fibonacci(32))
-    still = ws.Renderer(ws.Scene(scene.bodies, scene.light, scene.camera, visibility), basis=basis, device=device)
+    scene = ws.Scene(scene.bodies, scene.light, scene.camera, visibility, bounces=bounces)
+    still = ws.Renderer(scene, basis=basis, device=device)
     free = [
         wp.array(np.full((1, 32, 3), 0.7), dtype=wp.vec3, device=device, requires_grad=True),
         wp.array(np.full((1, 8, 8, 3), 0.5), dtype=wp.vec3, device=device, requires_grad=True),
