@@ -38,12 +38,60 @@ METHODS = ("directional", "log-sh")
 # body's spheres and its mesh block different light, and harmonics ring. The mean over receivers, and single ones:
 FURNACE = {"directional": (0.005, 0.1), "log-sh": (0.02, 0.12)}
 
+# Relative L2 of an image of balls, for which spheres stand in exactly, against paths: half of it is soft edges of
+# shadows and the noise of 1024 paths a pixel. Measured 0.041 and 0.054; without bounces 0.168 and 0.172.
+AGAINST_PATHS = {"directional": 0.055, "log-sh": 0.07}
+
 
 def bounced(method: str, camera: ws.Camera, bounces: int = 2, *, blockers: int = 0, **visibility) -> ws.Scene:
     """The blob and its ground, which casts a shadow if it has a blocker."""
     scene = scene_of(method, camera, **visibility)
     ground = dataclasses.replace(scene.bodies[1], blockers=blockers)
     return dataclasses.replace(scene, bounces=bounces, bodies=(scene.bodies[0], ground))
+
+
+def balls(centers: list[tuple[float, float, float]], radii: list[float], **options) -> ws.Body:
+    """Balls as one body, for which spheres stand in exactly."""
+    ball = ws.icosphere(1.0, 3)
+    positions = [radius * ball.positions + center for center, radius in zip(centers, radii, strict=True)]
+    faces = [ball.faces + number * ball.vertex_count for number in range(len(radii))]
+    mesh = ws.Mesh(np.concatenate(positions), np.concatenate(faces), name=f"{len(radii)} balls")
+    return ws.Body(mesh, blockers=ws.Spheres(centers, radii), **options)
+
+
+def balls_on_red(visibility: ws.Visibility, bounces: int, size: int = 32) -> ws.Scene:
+    """Two balls that light each other, a third one, and a red ground under a wide sun."""
+    pair = [(-0.42, 0, 0), (0.42, 0.1, 0)], [0.42, 0.4]
+    bodies = [
+        balls(*pair, albedo=(0.3, 0.5, 0.9), translation=(0, 0.44, 0)),
+        balls([(0, 0, 0)], [0.35], albedo=(0.9, 0.9, 0.9), translation=(0.2, 0.36, 0.85)),
+        ws.Body(ws.plane(6.0, 48), albedo=(0.9, 0.35, 0.2), blockers=1),
+    ]
+    sky = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
+    camera = ws.Camera.look_at((0.5, 2.0, 3.0), (0, 0.4, 0.2), size=(size, size))
+    return ws.Scene(bodies, sky, camera, visibility, bounces=bounces)
+
+
+PATHS = ws.Visibility("ray-traced", samples=1024)
+
+
+# ---------------------------------------------------------------------------------------------- against paths
+
+
+@pytest.fixture(scope="module")
+def all_light() -> np.ndarray:
+    """Traced along paths of up to 12 bounces."""
+    return ws.render(balls_on_red(PATHS, 12))[..., :3]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_bounces_by_spheres_are_those_of_paths(method, all_light):
+    direct, found = (ws.render(balls_on_red(ws.Visibility(method), bounces))[..., :3] for bounces in (0, 2))
+    assert relative_error(found, all_light) < AGAINST_PATHS[method]
+    assert relative_error(direct, all_light) > 2 * AGAINST_PATHS[method]
+    of_each_color = found.sum(axis=(0, 1)) / all_light.sum(axis=(0, 1))
+    np.testing.assert_allclose(of_each_color, 1, atol=0.02)  # measured 0.010; without bounces 0.13
 
 
 # ---------------------------------------------------------------------------------------------- energy
