@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warpshadow.spheres.cache import cache_path, remembered
+from warpshadow.assets.cache import cache_path, remembered
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.patches import Patches
 

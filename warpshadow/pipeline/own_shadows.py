@@ -4,7 +4,6 @@ What a rigid body blocks of its own light does not change in its own frame. So r
 beside the spheres that are fitted to the mesh. Other bodies' spheres block their shares of what it leaves.
 """
 
-import functools
 import hashlib
 import json
 import warnings
@@ -15,12 +14,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.cache import cache_path, remembered
 from warpshadow.device.batch import cut
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.assembly import Assembly, Geometry
 from warpshadow.pipeline.node import Source
-from warpshadow.spheres.cache import cache_path, remembered
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.own_shadows.lobes import Turned, find_turned, project_rows
@@ -32,9 +30,6 @@ from warpshadow.stages.receivers import Receivers, Span
 
 VERSION = 2
 """Part of the key of cached rows: raise it whenever they would come out differently."""
-
-_FLAT = 1.0e-5
-"""Thickness of a flat body, as a part of its size."""
 
 
 class Traced(NamedTuple):
@@ -110,10 +105,10 @@ class OwnShadows:
             return "geometry has no rotations, as placed() gives them"
         return ""
 
-    @functools.cached_property
+    @property
     def is_flat(self) -> np.ndarray:
         """Bodies that lie in a plane, which block none of their own light, bool of shape [body]."""
-        return np.array([_is_flat(body.mesh) for body in self._assembly.scene.bodies])
+        return self._assembly.is_flat
 
     # ------------------------------------------------------------------------------------------ where
 
@@ -238,9 +233,3 @@ class OwnShadows:
                 what="own shadow",
             )
         return self._rows[body]
-
-
-def _is_flat(mesh: Mesh) -> bool:
-    points = mesh.positions[np.unique(mesh.faces)].astype(np.float64)
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[-1] <= _FLAT * spread[0])

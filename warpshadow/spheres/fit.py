@@ -16,11 +16,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.assets.cache import cache_path, remembered
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import compact_order
-from warpshadow.spheres.cache import cache_path, remembered
 from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
