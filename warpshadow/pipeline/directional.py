@@ -16,7 +16,7 @@ from warpshadow.pipeline.own_shadows import OwnLookup, Traced
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
-from warpshadow.stages.own_shadows.gather import gather_own, multiply
+from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
@@ -70,7 +70,7 @@ class Directional(SphereMethod):
         passing = directional.transmittance(
             points, facing, centers, radii, light.directions, softness=softness, merging=merging
         )
-        return Seen(passing if own is None else multiply(own, passing), own)
+        return Seen(passing if own is None else multiply_transmittances(own, passing), own)
 
     def _see_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""

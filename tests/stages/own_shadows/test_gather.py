@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.own_shadows.gather import gather_own, multiply
+from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
 from warpshadow.stages.own_shadows.lookup import find_lookups, find_supports
 from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.own_shadows.trace import OwnRows
@@ -99,7 +99,7 @@ def test_a_product_has_the_gradients_of_a_product(device, verified_tape):
     values = rng.uniform(size=(3, BATCH, RECEIVERS, CELLS)).astype(np.float32)
     own, others = (wp.array(each, device=device, requires_grad=True) for each in values[:2])
     with recorded() as tape:
-        product = multiply(own, others)
+        product = multiply_transmittances(own, others)
     np.testing.assert_allclose(product.numpy(), values[0] * values[1], rtol=FLOAT32)
     tape.backward(grads={product: wp.array(values[2], device=device)})
     np.testing.assert_allclose(own.grad.numpy(), values[1] * values[2], rtol=FLOAT32)

@@ -40,7 +40,7 @@ def _gather(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     rows: wp.array2d(dtype=wp.vec3i),
-    places: wp.array2d(dtype=wp.vec3),
+    place_weights: wp.array2d(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     looks_at_rays: wp.array(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
@@ -57,7 +57,7 @@ def _gather(
     turn = instance_in(batch, counts.shape[0])
     place = instance_in(batch, rows.shape[0])
     row = rows[place, receiver]
-    share = places[instance_in(batch, places.shape[0]), receiver]
+    weight = place_weights[instance_in(batch, place_weights.shape[0]), receiver]
     is_vertex = row[0] == row[1] and row[0] == row[2]
     for q in range(directions.shape[0]):
         passing = float(1.0)
@@ -69,9 +69,9 @@ def _gather(
                 seen = _open_share(bits, cells, of_rays, row[0], index)
                 if not is_vertex:
                     seen = (
-                        share[0] * seen
-                        + share[1] * _open_share(bits, cells, of_rays, row[1], index)
-                        + share[2] * _open_share(bits, cells, of_rays, row[2], index)
+                        weight[0] * seen
+                        + weight[1] * _open_share(bits, cells, of_rays, row[1], index)
+                        + weight[2] * _open_share(bits, cells, of_rays, row[2], index)
                     )
                 passing += weights[turn, q, k] * seen
         own[batch, receiver, q] = passing
@@ -84,7 +84,7 @@ def _gather_adjoint(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     rows: wp.array2d(dtype=wp.vec3i),
-    places: wp.array2d(dtype=wp.vec3),
+    place_weights: wp.array2d(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     looks_at_rays: wp.array(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
@@ -94,7 +94,7 @@ def _gather_adjoint(
     cells: wp.array2d(dtype=wp.uint8),
     adj_own: wp.array3d(dtype=wp.float32),
     # out
-    adj_places: wp.array2d(dtype=wp.vec3),
+    adj_place_weights: wp.array2d(dtype=wp.vec3),
     adj_weights: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk."""
@@ -103,9 +103,9 @@ def _gather_adjoint(
     turn = instance_in(batch, counts.shape[0])
     place = instance_in(batch, rows.shape[0])
     row = rows[place, receiver]
-    share = places[instance_in(batch, places.shape[0]), receiver]
+    weight = place_weights[instance_in(batch, place_weights.shape[0]), receiver]
     is_vertex = row[0] == row[1] and row[0] == row[2]
-    adj_share = wp.vec3()
+    adj_weight = wp.vec3()
     for q in range(directions.shape[0]):
         adj = adj_own[batch, receiver, q]
         if adj != 0.0 and wp.dot(normal, directions[q]) > 0.0:
@@ -119,12 +119,12 @@ def _gather_adjoint(
                         _open_share(bits, cells, of_rays, row[1], index),
                         _open_share(bits, cells, of_rays, row[2], index),
                     )
-                    adj_share += adj * weights[turn, q, k] * others
-                    seen = wp.dot(share, others)
+                    adj_weight += adj * weights[turn, q, k] * others
+                    seen = wp.dot(weight, others)
                 if adj_weights:
                     wp.atomic_add(adj_weights, turn, q, k, adj * seen)
-    if adj_places:
-        adj_places[batch, receiver] = adj_places[batch, receiver] + adj_share
+    if adj_place_weights:
+        adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + adj_weight
 
 
 def gather_own(normals: wp.array, places: Places, lookup: Lookup, supports: Supports, rows: OwnRows) -> wp.array:
@@ -165,7 +165,7 @@ def gather_own(normals: wp.array, places: Places, lookup: Lookup, supports: Supp
 
 
 @wp.kernel(enable_backward=False)
-def _multiply(
+def _add_products(
     # in
     factors: wp.array3d(dtype=Chunk),
     values: wp.array3d(dtype=Chunk),
@@ -180,13 +180,18 @@ def _multiply(
         )
 
 
-def multiply(own: wp.array, others: wp.array) -> wp.array:
+def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
     """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
     if own.device.is_cpu:
         use_vector_registers(__name__)
 
     def add_product(first: wp.array, second: wp.array, total: wp.array) -> None:
-        launch(_multiply, own.shape[:2], inputs=[as_chunks(first), as_chunks(second)], outputs=[as_chunks(total)])
+        launch(
+            _add_products,
+            own.shape[:2],
+            inputs=[as_chunks(first), as_chunks(second)],
+            outputs=[as_chunks(total)],
+        )
 
     def adjoint(adj: wp.array) -> None:
         for factor, other in ((own, others), (others, own)):
