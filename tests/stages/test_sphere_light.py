@@ -261,7 +261,7 @@ def test_light_and_gradients_of_hard_scenes_are_finite(case, device):
 def test_results_are_the_same_bits_for_any_number_of_threads(monkeypatch):
     values = [value[None] for value in scene(11, vertex_count=400, sphere_count=20)]
     weights = np.random.default_rng(0).normal(size=(1, 400, 3))
-    monkeypatch.setattr(stage, "_PAIR_COST", 10.0)  # or so little work is not shared
+    monkeypatch.setattr(stage, "PAIR_COST", 10.0)  # or so little work is not shared
     try:
         each = []
         for threads in (1, 3):

@@ -35,10 +35,10 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone_adjoint
+from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import Cells, make_cells, make_cull, make_reaches, make_rises, make_widen
-from warpshadow.stages.visibility.directional import SOFTNESS
-from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_adjoint
+from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
+from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres, merged_count
 from warpshadow.stages.visibility.walk import (
     make_load_receivers,
@@ -48,9 +48,6 @@ from warpshadow.stages.visibility.walk import (
     receivers_type,
     seen_type,
 )
-
-_PAIR_COST = 0.15
-"""Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
 
 _CORE = 0.25
 """Radii within which a sphere's weight hardly grows any more."""
@@ -271,13 +268,13 @@ def _make_light(lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_light_adjoint(lanes: int) -> wp.Kernel:
-    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, along, dot, scale = fn.sqrt, fn.is_any_above, fn.along, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
     begin, weigh = _make_begin(lanes), _make_weight(lanes)
-    falloff, falloff_adjoint, cone_adjoint = make_falloff(lanes), make_falloff_adjoint(lanes), make_cone_adjoint(lanes)
+    falloff, falloff_pull = make_falloff(lanes), make_falloff_pull(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
@@ -340,25 +337,24 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                 )
                                 wp.atomic_add(task.adj_exitance, seen.node, at * BUNDLE + i, adj_sent)
             if is_any_met:
-                adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
-                    cone,
+                adj_offset, adj_radius, adj_weight = falloff_pull(
+                    seen,
                     sine,
                     cap.cosine,
                     cells.cos_width,
                     cells.sin_width,
-                    wp.cw_mul(slope, sum_t - sum_),
-                    -wp.cw_mul(slope, sum_t),
+                    slope,
                     adj_opacity,
+                    sum_,
+                    sum_t,
+                    Vectors(sum_x, sum_y, sum_z),
                 )
-                adj_axis = scale(slope, Vectors(sum_x, sum_y, sum_z))
-                adj_cone = Cone(adj_axis, adj_cosine, adj_sine2, wp.cw_mul(adj_weight, seen.share))
-                adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
                 # w̄ w = Σ a v w = Ā A
                 nearer = (-2.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), weight)
                 pull.is_any = True
+                pull.weight = adj_weight
                 pull.offset = add(adj_offset, scale(nearer, scale(Lane(task.inverse_size), seen.offset)))
                 pull.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
-                pull.weight = adj_weight
         return pull
 
     walk = make_walk(make_cull(True, Task, lanes), visit, Task, True, lanes)
@@ -531,7 +527,7 @@ def sphere_light(
     kept = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if is_kept else []
     inputs = [points, normals, spheres, cells, exitance, transmittance, unblocked]
     inputs += [4 / len(directions), span_count, is_kept]
-    cost = _PAIR_COST * lanes * radii.shape[1] * own_count
+    cost = PAIR_COST * lanes * radii.shape[1] * own_count
     is_shared = unblocked is not None and len(unblocked) < batch_count
 
     def adjoint(adj_light: wp.array) -> None:

@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
-from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
+from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import (
     Cells,
     cap_type,
@@ -37,7 +37,7 @@ from warpshadow.stages.visibility.culling import (
     make_rises,
     make_widen,
 )
-from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_adjoint
+from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres
 from warpshadow.stages.visibility.walk import (
     make_load_receivers,
@@ -53,7 +53,7 @@ SOFTNESS = 0.35
 
 _OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
-_PAIR_COST = 0.15
+PAIR_COST = 0.15
 """Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
 
 
@@ -188,21 +188,18 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    load_products, sqrt, along, scale, add_vectors = fn.load_products, fn.sqrt, fn.along, fn.scale, fn.add_vectors
-    begin, falloff, falloff_adjoint = _make_begin(has_horizon, lanes), make_falloff(lanes), make_falloff_adjoint(lanes)
+    load_products, sqrt, along, add_vectors = fn.load_products, fn.sqrt, fn.along, fn.add_vectors
+    begin, falloff, falloff_pull = _make_begin(has_horizon, lanes), make_falloff(lanes), make_falloff_pull(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
-    cone_adjoint = make_cone_adjoint(lanes)
 
     @wp.func(inline=True)
     def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
         """The adjoint of the sphere's cone.
 
-        With a = A·step(t) the share that a sphere blocks and t = (u·ω − lo) slope:
-        ā_i = −T̄ T / (1 − a_i),  Ā = Σ ā step,  t̄ = ā A 6t(1−t),
-        ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
+        With a the share of a cell that it blocks, ā_i = −T̄ T / (1 − a_i).
         """
         pull = Pull()
         cone = seen.cone
@@ -239,19 +236,18 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                         sum_y += omega[1] * adj_t
                         sum_z += omega[2] * adj_t
             if is_any_met:
-                adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
-                    cone,
+                adj_offset, adj_radius, adj_weight = falloff_pull(
+                    seen,
                     sine,
                     cap.cosine,
                     cells.cos_width,
                     cells.sin_width,
-                    wp.cw_mul(slope, sum_t - sum_),
-                    -wp.cw_mul(slope, sum_t),
+                    slope,
                     adj_opacity,
+                    sum_,
+                    sum_t,
+                    Vectors(sum_x, sum_y, sum_z),
                 )
-                adj_axis = scale(slope, Vectors(sum_x, sum_y, sum_z))
-                adj_cone = Cone(adj_axis, adj_cosine, adj_sine2, wp.cw_mul(adj_weight, seen.share))
-                adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, cone, adj_cone)
                 pull.is_any = True
                 pull.offset = adj_offset
                 pull.radius = adj_radius
@@ -352,7 +348,7 @@ def transmittance(
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
     result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
-    cost = _PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
+    cost = PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
     return differentiable(
         lambda result: launch(
             _make_transmit(normals is not None, lanes),
