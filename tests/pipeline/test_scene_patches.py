@@ -10,6 +10,7 @@ from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Clock
 from warpshadow.pipeline.patches import ScenePatches
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.exitance import sphere_exitance
 
 RANDOM = np.random.default_rng(0)
 
@@ -88,3 +89,26 @@ def test_one_color_is_that_of_all_patches(assembly):
     given = wp.array([[(0.2, 0.3, 0.4)]], dtype=wp.vec3)
     albedo = patches.albedo(materials.replaced([given, given, None], None), (0, 1)).value(Call(Clock()))
     np.testing.assert_allclose(albedo.numpy()[0], np.tile([0.2, 0.3, 0.4], (albedo.shape[1], 1)), rtol=1e-6)
+
+
+def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene():
+    """Where a quad has spheres of two bodies, what it sends is a mean over the patches of both."""
+    big, small = ws.icosphere(1.0, 2), ws.icosphere(100.0, 2)  # as meshes; in the scene the first is 3 times as large
+    bodies = ws.Body(big, scale=3.0, name="big"), ws.Body(small, scale=0.01, translation=(9, 0, 0), name="small")
+    flat = ws.Body(ws.plane(2.0, 4), scale=2.5, translation=(0, -9, 0), name="ground")
+    light, camera = ws.EnvironmentMap.constant(1.0, height=8), ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))
+    assembly = Assembly(ws.Scene((*bodies, flat), light, camera))
+    senders = ScenePatches(assembly).senders(Materials.of_scene(assembly))
+    areas = [senders.areas[first:end].sum() for first, end in zip(senders.first[:-1], senders.first[1:], strict=True)]
+    expected = []
+    for body in assembly.scene.bodies:
+        a, b, c = np.moveaxis(body.world_mesh().positions[body.mesh.faces].astype(np.float64), 1, 0)
+        expected.append(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    np.testing.assert_allclose(areas, expected, rtol=1e-5)
+
+    # a quad of two spheres of each body, whose patches all show the same, is as bright as areas say
+    starts, numbers = np.int32([0, senders.first[2]]), np.arange(senders.first[2], dtype=np.int32)
+    radiosity = np.repeat([1.0, 0.0, 0.0], np.diff(senders.first))[None, :, None].repeat(3, axis=2)
+    shown = wp.full((1, len(senders.areas), 4), 0.25, wp.float32)
+    sent = sphere_exitance(wp.array(radiosity, dtype=wp.vec3), shown, senders.areas, starts, numbers).numpy()[0, 0]
+    np.testing.assert_allclose(sent[:, 0] / sent[:, 3], expected[0] / (expected[0] + expected[1]), rtol=1e-5)

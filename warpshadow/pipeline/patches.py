@@ -139,7 +139,7 @@ class Senders:
     Attributes:
         bodies, patches: As given.
         first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].
-        areas: Of all patches, in units of their bodies, float32 of shape [patch].
+        areas: Of all patches where the scene has their bodies [scene units²], float32 of shape [patch].
         sides: Side of a face that each source lies on, int32 of shape [source].
         barycentrics: And where on it, float32 of shape [source, 3].
         patch_of_source: The patch that it belongs to, int32 of shape [source].
@@ -157,7 +157,9 @@ class Senders:
         owners = [each.sources.patches + first for each, first in zip(patches, self.first[:-1], strict=True)]
         self.sides = _joined(sides, np.int32)
         self.barycentrics = _joined([each.sources.barycentrics for each in patches], np.float32).reshape(-1, 3)
-        self.areas = _joined([each.areas for each in patches], np.float32)
+        scales = [assembly.scene.bodies[number].scale for number in bodies]
+        areas = [scale**2 * each.areas for scale, each in zip(scales, patches, strict=True)]
+        self.areas = _joined(areas, np.float32)
         self.patch_of_source = _joined(owners, np.int32)
         weights = _joined([each.sources.weights for each in patches], np.float32)
         self._bodies = np.repeat(bodies, [len(each) for each in sides])

@@ -54,7 +54,7 @@ def patches_of_nodes(
 
 
 @wp.struct
-class Patches:
+class PatchesOfNodes:
     """Patches of nodes, as kernels see them."""
 
     shown: wp.array3d(dtype=wp.float32)
@@ -64,7 +64,7 @@ class Patches:
 
 
 @wp.func
-def _sum_up(batch: int, node: int, direction: int, radiosity: wp.array2d(dtype=wp.vec3), patches: Patches):
+def _sum_up(batch: int, node: int, direction: int, radiosity: wp.array2d(dtype=wp.vec3), patches: PatchesOfNodes):
     """Σ A (g + 0.01) B and Σ A (g + 0.01), both over Σ A, and Σ A."""
     light = wp.vec3()
     shown = float(0.0)
@@ -88,7 +88,7 @@ def _sum_up(batch: int, node: int, direction: int, radiosity: wp.array2d(dtype=w
 def _tabulate(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
-    patches: Patches,
+    patches: PatchesOfNodes,
     # out
     exitance: wp.array3d(dtype=wp.vec4),
 ):
@@ -102,7 +102,7 @@ def _tabulate(
 def _tabulate_adjoint(
     # in
     radiosity: wp.array2d(dtype=wp.vec3),
-    patches: Patches,
+    patches: PatchesOfNodes,
     adj_exitance: wp.array3d(dtype=wp.vec4),
     # out
     adj_radiosity: wp.array2d(dtype=wp.vec3),
@@ -142,7 +142,7 @@ def sphere_exitance(
         radiosity: Of patches: what white under a radiance of 1 sends is 1, vec3 of shape [batch, patch].
         shown: g, part of its area that each patch shows towards each cell, float32 of shape [batch, patch, direction],
             from :func:`.openness.shown_areas`.
-        areas: Of patches [scene units², or any other, the same for all], not negative, float32 of shape [patch].
+        areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_nodes`.
 
     Returns:
@@ -160,7 +160,7 @@ def sphere_exitance(
     if len(numbers) and not 0 <= min(numbers) <= max(numbers) < patch_count:
         raise ValueError(f"numbers: got {min(numbers)} to {max(numbers)}, expected patches, 0 to {patch_count - 1}")
     device = radiosity.device
-    patches = Patches()
+    patches = PatchesOfNodes()
     patches.shown = shown
     patches.areas = constant(np.asarray(areas, np.float32), wp.float32, device)
     patches.starts = constant(np.asarray(starts, np.int32), wp.int32, device)
