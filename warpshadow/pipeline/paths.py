@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import warp as wp
 
-from warpshadow.device.batch import accumulate, common_batch
+from warpshadow.device.batch import common_batch
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_words
 from warpshadow.pipeline.node import Node, Source
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.path_tracing import Surfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
@@ -51,28 +52,27 @@ def path_traced(
         texels = None if textures is None else textures.texels
         count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels})
         drawn = sample_map(map_of(radiance), _LIGHT_SAMPLES, seed=1)
-        lit = wp.empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
+        bounced = wp.empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
-        def own(array: wp.array) -> wp.array:
+        def of_instance(array: wp.array) -> wp.array:
             return array[min(instance, len(array) - 1)]
 
         for instance in range(count):
             surfaces = Surfaces(
-                _whole_mesh(assembly, own(casting), own(positions)),
-                own(casting),
+                _whole_mesh(assembly, of_instance(casting), of_instance(positions)),
+                of_instance(casting),
                 assembly.faces,
-                own(normals),
-                own(vertex_albedo),
-                None if textures is None else replace(textures, texels=own(texels).reshape((1, -1))),
+                of_instance(normals),
+                of_instance(vertex_albedo),
+                None if textures is None else replace(textures, texels=of_instance(texels).reshape((1, -1))),
                 materials.texture_of_face,
                 assembly.uvs[0],
                 assembly.uv_faces,
             )
-            places = own(receivers.points), own(receivers.normals)
-            bounced = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
-            wp.copy(lit[instance], own(shading))
-            accumulate(bounced, lit[instance])
-        return lit
+            places = of_instance(receivers.points), of_instance(receivers.normals)
+            light = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
+            wp.copy(bounced[instance], light)
+        return total_light([shading, bounced])
 
     return Node(
         "bounces",
