@@ -8,6 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import warpshadow as ws
 from warpshadow.assets.camera import Camera
 from warpshadow.stages.project import compose_clip_matrices, to_clip
 
@@ -60,6 +61,64 @@ def test_look_at_sees_the_target_in_the_middle_up_above_and_right_to_the_right()
 def test_points_behind_the_eye_have_no_pixel():
     camera = Camera.look_at((0, 0, 5), (0, 0, 0))
     assert np.isnan(camera.project([[0, 0, 6], [0, 0, 5]])).all()
+
+
+DIRECTIONS = [(0.3, 0.4, 0.9), (1, 0, 0), (-2, -1, 0.5), (0.01, 5, 0), (0, 0, -1e-3)]
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize(("size", "fov_y"), [((64, 64), 40.0), ((200, 50), 100.0), ((50, 200), 12.0)])
+def test_a_framing_camera_touches_all_that_it_shows_from_the_direction(direction, scale, size, fov_y):
+    rng = np.random.default_rng(1)
+    mesh = ws.Mesh(scale * (rng.normal(size=(30, 3)) * (1, 3, 0.5) + (20, -7, 3)), rng.integers(0, 30, (20, 3)))
+    camera = Camera.framing(mesh, direction=direction, size=size, fov_y=fov_y, margin=0.1)
+    seen = camera.project(mesh.world_points()) / size * 2 - 1
+    assert np.abs(seen).max() == pytest.approx(0.9, abs=1e-6)  # as near as it may be
+    touched = [np.isclose(seen[:, axis].min(), -0.9) and np.isclose(seen[:, axis].max(), 0.9) for axis in (0, 1)]
+    assert any(touched)  # on both sides: in the middle
+    np.testing.assert_allclose(camera.rotation[2], -np.array(direction) / np.linalg.norm(direction), atol=1e-12)
+    assert (camera.rotation @ (0, 1, 0))[1] < 0  # up is up
+    depths = mesh.world_points() @ camera.rotation[2] + camera.translation[2]
+    assert camera.near == pytest.approx(0.01 * depths.min(), rel=1e-6)
+
+
+def test_a_framing_camera_leaves_out_a_ground_unless_it_is_all_there_is():
+    ball = ws.Body(ws.icosphere(0.5, 2), translation=(3, 1, 0))
+    ground = ws.Body(ws.plane(90.0, 2))
+    alone = Camera.framing(ball)
+    for shown in ([ball, ground], ws.Scene([ground, ball], np.ones((4, 3))), (body for body in (ball, ground))):
+        np.testing.assert_array_equal(Camera.framing(shown).clip_matrix(), alone.clip_matrix())
+    wide = Camera.framing(ground, margin=0.0)
+    assert np.abs(wide.project(ground.world_points()) / 256 * 2 - 1).max() == pytest.approx(1.0)
+    np.testing.assert_array_equal(Camera.framing(ground.mesh, margin=0.0).clip_matrix(), wide.clip_matrix())
+
+
+def test_a_scene_without_a_camera_shows_all_its_bodies():
+    ball = ws.Body(ws.icosphere(0.5, 2), translation=(3, 1, 0))
+    np.testing.assert_array_equal(
+        ws.Scene([ball], np.ones((4, 3))).camera.clip_matrix(), Camera.framing(ball).clip_matrix()
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "options"),
+    [
+        ("shown: got 7", 7, {}),
+        ("shown: got nothing", [], {}),
+        ("shown[1]: got 'bunny.obj'", [ws.icosphere(), "bunny.obj"], {}),
+        ("shown: got what is a point or a line along", ws.Mesh([[1, 2, 3]], [[0, 0, 0]]), {}),
+        ("shown: got what is a point", ws.Mesh([[0, 0, 0], [0, 0, 1]], [[0, 1, 1]]), {"direction": (0, 0, 2)}),
+        ("direction: got [0.0, 0.0, 0.0]", ws.icosphere(), {"direction": (0, 0, 0)}),
+        ("up: got [0.0, 1.0, 0.0]", ws.icosphere(), {"direction": (0, 1, 0)}),
+        ("margin: got 1", ws.icosphere(), {"margin": 1}),
+        ("fov_y: got 180", ws.icosphere(), {"fov_y": 180}),
+        ("near: got 0", ws.icosphere(), {"near": 0}),
+    ],
+)
+def test_framing_names_the_argument_it_refuses(name, shown, options):
+    with pytest.raises(ValueError, match=f"^{re.escape(name)}"):
+        Camera.framing(shown, **options)
 
 
 def test_look_at_and_from_opengl_agree():

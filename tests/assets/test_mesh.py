@@ -648,3 +648,18 @@ def test_faces_without_area_give_zero_normals_and_zero_gradients(device, verifie
     tape.backward(grads={normals: wp.ones_like(normals)})
     np.testing.assert_array_equal(normals.numpy(), np.zeros((1, 4, 3)))
     np.testing.assert_array_equal(positions.grad.numpy(), np.zeros((1, 4, 3)))
+
+
+@pytest.mark.parametrize("size", [1.0, 0.03])
+def test_a_normalized_mesh_is_in_the_middle_and_of_a_size(size):
+    mesh = icosphere(7.0, 1).transformed(scale=(1, 0.2, 3), translation=(100, 7, 0))
+    low, high = mesh.normalized(size).bounds
+    np.testing.assert_allclose(low + high, 0, atol=1e-6 * size)
+    assert (high - low).max() == pytest.approx(size, rel=1e-5)
+    np.testing.assert_allclose((high - low) / size, np.ptp(mesh.positions, axis=0) / 42, rtol=1e-4)  # not stretched
+    np.testing.assert_array_equal(mesh.normalized(size).faces, mesh.faces)
+
+
+def test_normalizing_names_the_size_it_refuses():
+    with pytest.raises(ValueError, match="^size: got -1"):
+        icosphere().normalized(-1)

@@ -452,7 +452,7 @@ def test_an_array_given_to_a_body_is_copied():
         ({"light": 1.0}, r"light: got shape \(\), .*EnvironmentMap.constant"),
         ({"light": np.ones((4, 8, 3))}, r"light: got shape \(4, 8, 3\), .*EnvironmentMap\(pixels\)"),
         ({"light": np.ones((100, 3))}, "light: order: got 10, expected a number of bands from 2 to 8"),
-        ({"camera": None}, "camera: got None, expected a Camera"),
+        ({"camera": "front"}, "camera: got 'front', expected a Camera"),
         ({"camera": [ws.Camera.look_at((0, 0, 3), (0, 0, 0))] * 2}, r"camera: got list .*Renderer\(scene, cameras="),
         ({"visibility": "log-sh"}, "visibility: got 'log-sh', expected a Visibility"),
         ({"supersampling": 2.0}, "supersampling: got 2.0"),

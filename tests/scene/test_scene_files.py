@@ -255,6 +255,50 @@ def test_an_unknown_key_of_a_camera_names_the_nearest(refused):
 # ---------------------------------------------------------------------------------------------- spheres and colors
 
 
+FRAMED = TABLES.replace("eye = [0, 1, 4]\ntarget = [0, 0, 0]", 'framing = "auto"')
+
+
+def test_a_camera_can_be_left_to_frame_the_bodies(load):
+    scene = load(FRAMED)
+    expected = ws.Camera.framing(scene, size=(8, 6))
+    np.testing.assert_array_equal(scene.camera.clip_matrix(), expected.clip_matrix())
+    scene = load(
+        FRAMED.replace("framing", "direction = [1, 1, 0]\nmargin = 0.5\nfov_y = 30\nsupersampling = 1\nframing")
+    )
+    expected = ws.Camera.framing(scene, direction=(1, 1, 0), margin=0.5, fov_y=30, size=(8, 6))
+    np.testing.assert_array_equal(scene.camera.clip_matrix(), expected.clip_matrix())
+
+
+@pytest.mark.parametrize(
+    ("key", "parts"),
+    [
+        ("eye = [0, 1, 4]", ("[camera]: eye", "beside framing")),
+        ("translation = [0, 1, 4]", ("[camera]: translation", "beside framing")),
+        ("margin = 2", ("[camera]: margin: got 2",)),
+    ],
+)
+def test_a_camera_that_frames_takes_no_place(refused, key, parts):
+    refused(FRAMED.replace("framing", f"{key}\nframing"), *parts)
+
+
+def test_framing_is_auto_or_left_out(refused):
+    refused(FRAMED.replace('"auto"', '"fit"'), "[camera]: framing: got 'fit', expected one of 'auto'")
+    refused(TABLES.replace("eye =", "margin = 0.1\neye ="), "[camera]", "unknown key 'margin'")
+
+
+def test_a_body_in_a_file_stands_on_the_ground_where_its_translation_says(load):
+    lines = "rotation = [0, 0, 30]\ntranslation = [1, 2, 3]\nscale = 2.0\n"
+    (body,) = load(TABLES + lines + "on_ground = true").bodies
+    (plain,) = load(TABLES + lines + "on_ground = false").bodies
+    np.testing.assert_array_equal(plain.translation, (1, 2, 3))
+    np.testing.assert_array_equal(body.translation, plain.on_ground((1, 2, 3)).translation)
+    assert body.world_points()[:, 1].min() == pytest.approx(2) and body.scale == 2
+
+
+def test_on_ground_is_true_or_false(refused):
+    refused(TABLES + "on_ground = 1", "on_ground: got 1, expected true or false")
+
+
 def test_the_spheres_that_the_command_line_writes_can_be_named(load, tmp_path):
     np.savez(tmp_path / "ball.npz", centers=BALL.centers, radii=BALL.radii)
     (body,) = load(TABLES + 'spheres = "ball.npz"\n').bodies

@@ -14,18 +14,39 @@ Conventions (OpenCV, with pixel centers at +0.5):
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
+from warpshadow.maths.plane import is_flat
 
 # Rotations read from a file are often rounded to six digits.
 _ROTATION_TOLERANCE = 1e-4
 
 # Fields of view below this [degrees] are rather π/2 radians or less.
 _NARROW = 1.6
+
+# Near plane of a framing camera, as a part of the depth of what is nearest.
+_NEAR = 0.01
+
+
+class Placed(Protocol):
+    """What has a place in the world: a :class:`Mesh` as it is, a Body where it stands."""
+
+    def world_points(self) -> np.ndarray:
+        """Points that cover it [scene units], shape [point, 3]."""
+
+
+class HasBodies(Protocol):
+    """What holds bodies: a Scene."""
+
+    @property
+    def bodies(self) -> Iterable[Placed]:
+        """The bodies."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -95,22 +116,62 @@ class Camera:
         Raises:
             ValueError: when eye and target coincide or up is parallel to the view.
         """
-        origin, goal, top = (check.array(n, a, (3,)) for n, a in (("eye", eye), ("target", target), ("up", up)))
+        origin, goal = check.array("eye", eye, (3,)), check.array("target", target, (3,))
         view = goal - origin
-        distance = np.linalg.norm(view)
-        if distance <= 1e-9 * max(np.abs(origin).max(), np.abs(goal).max()):
+        if np.linalg.norm(view) <= 1e-9 * max(np.abs(origin).max(), np.abs(goal).max()):
             raise ValueError(f"target: got {goal.tolist()}, expected a point away from eye {origin.tolist()}")
-        forward = view / distance
-        right = np.cross(forward, top)
-        if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
-            raise ValueError(
-                f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}"
-            )
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        rotation = _looking_along(view, up)
         width, height = check.image_size(size)
         intrinsics = _centered_intrinsics(fov_y, width, height)
         return cls(intrinsics, rotation, -rotation @ origin, width, height, near)
+
+    @classmethod
+    def framing(
+        cls,
+        shown: Placed | Iterable[Placed] | HasBodies,
+        *,
+        direction: npt.ArrayLike = (0.3, 0.4, 0.9),
+        up: npt.ArrayLike = (0.0, 1.0, 0.0),
+        fov_y: float = 40.0,
+        size: tuple[int, int] = (256, 256),
+        margin: float = 0.2,
+        near: float | None = None,
+    ) -> Camera:
+        """Place a camera with square pixels as near as it sees all of something.
+
+        Args:
+            shown: A mesh, a body, several, or a scene. Flat ones, grounds and walls, count where all are flat.
+            direction: From what is shown to the camera, shape [3], any length; the default looks down from the front.
+            up: Direction that points up in the image, shape [3], any length.
+            fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
+            size: Width and height [pixels].
+            margin: Part of the image that stays free around what is shown, 0 or more and below 1; shadows want some.
+            near: Distance of the near plane [scene units]; by default 1% of the way to what is shown.
+
+        Raises:
+            ValueError: when up is parallel to the direction, or all that is shown is one point.
+        """
+        points = _framed_points(shown)
+        away = check.array("direction", direction, (3,))
+        if not away.any():
+            raise ValueError(f"direction: got {away.tolist()}, expected a direction, of any length but 0")
+        if not (check.is_number(margin) and 0.0 <= margin < 1.0):
+            raise ValueError(f"margin: got {check.described(margin)}, expected 0 or more and below 1")
+        rotation = _looking_along(-away, up)
+        width, height = check.image_size(size)
+        intrinsics = _centered_intrinsics(fov_y, width, height)
+        # The eye (e, f) of an axis x and depth z sees a point if |x − e| ≤ t (z − f), t the tangent of half the view:
+        # max(x − t z) + t f ≤ e ≤ min(x + t z) − t f. The largest f for which there is an e is nearest.
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        x, z = (points - middle) @ rotation[:2].T, (points - middle) @ rotation[2]
+        tangents = (1.0 - margin) * np.array([width, height]) / (2.0 * intrinsics[0, 0])
+        least, most = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
+        depth = ((most - least) / (2.0 * tangents)).min()
+        if not depth < z.min() - 1e-9 * np.ptp(points, axis=0).max():
+            raise ValueError(f"shown: got what is a point or a line along {away.tolist()}, expected a surface")
+        eye = np.array([*(least + most) / 2, depth])
+        near = _NEAR * (z.min() - depth) if near is None else near
+        return cls(intrinsics, rotation, -eye - rotation @ middle, width, height, near)
 
     @classmethod
     def from_opengl(
@@ -213,6 +274,31 @@ class Camera:
         pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
         directions = pixels @ np.linalg.inv(self.intrinsics).T @ self.rotation
         return self.eye, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def _framed_points(shown: Any) -> np.ndarray:
+    """Points of what a camera is to show, float64: of what is not flat, if there is any."""
+    placed = getattr(shown, "bodies", shown)
+    placed = (placed,) if hasattr(placed, "world_points") else placed
+    check.instance("shown", placed, Iterable, "a mesh, a body, several, or a scene")
+    parts = []
+    for number, item in enumerate(placed):
+        if not hasattr(item, "world_points"):
+            raise ValueError(f"shown[{number}]: got {check.described(item)}, expected a mesh or a body")
+        parts.append(item.world_points().astype(np.float64))
+    if not parts:
+        raise ValueError("shown: got nothing, expected a mesh, a body, several, or a scene")
+    return np.concatenate([points for points in parts if not is_flat(points)] or parts)
+
+
+def _looking_along(view: np.ndarray, up: npt.ArrayLike) -> np.ndarray:
+    """Rotation from the world to a camera that looks along a direction of any length."""
+    forward, top = view / np.linalg.norm(view), check.array("up", up, (3,))
+    right = np.cross(forward, top)
+    if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
+        raise ValueError(f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:

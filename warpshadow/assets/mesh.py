@@ -84,8 +84,12 @@ class Mesh:
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around the vertices that faces refer to, each shape [3]."""
-        used = self.positions[np.unique(self.faces)]
+        used = self.world_points()
         return used.min(axis=0), used.max(axis=0)
+
+    def world_points(self) -> np.ndarray:
+        """The vertices that faces refer to [scene units], float32 of shape [point, 3]."""
+        return self.positions[np.unique(self.faces)]
 
     @property
     def content_hash(self) -> str:
@@ -124,6 +128,12 @@ class Mesh:
         part = MeshPart(self.positions, self.faces, self.uvs, self.uv_faces)
         moved = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
         return replace(self, positions=moved.positions, faces=moved.faces, uv_faces=moved.uv_faces)
+
+    def normalized(self, size: float = 1.0) -> Mesh:
+        """Move the middle of its bounds to the origin, and scale their longest edge to a size [scene units]."""
+        low, high = (corner.astype(np.float64) for corner in self.bounds)
+        scale = check.positive("size", size) / (high - low).max() if (high > low).any() else 1.0
+        return self.transformed(scale=scale, translation=-scale * (low + high) / 2)
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""

@@ -1,4 +1,4 @@
-"""Planes: whether triangles lie in one."""
+"""Planes: whether triangles or points lie in one."""
 
 import numpy as np
 
@@ -20,7 +20,16 @@ def plane_normal(corners: np.ndarray) -> np.ndarray | None:
         return None
     normal = normal / np.linalg.norm(normal)
     points = corners.reshape(-1, 3)
-    points = points - points.mean(axis=0)
-    *_, axes = np.linalg.svd(points, full_matrices=False)
-    size = np.ptp(points @ axes[0])
-    return normal if np.ptp(points @ normal) < _FLATNESS * size else None
+    return normal if np.ptp(points @ normal) < _FLATNESS * np.ptp(points @ _axes(points)[0]) else None
+
+
+def is_flat(points: np.ndarray) -> bool:
+    """Whether points of float64, shape [point, 3], lie in one plane."""
+    axes = _axes(points)
+    return bool(np.ptp(points @ axes[2]) < _FLATNESS * np.ptp(points @ axes[0]))
+
+
+def _axes(points: np.ndarray) -> np.ndarray:
+    """Unit vectors along which points extend most, second most and least, shape [3, 3]."""
+    away = points - points.mean(axis=0)
+    return np.linalg.eigh(away.T @ away)[1].T[::-1]

@@ -38,6 +38,7 @@ from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
 from warpshadow.pipeline.view import View
+from warpshadow.scene.placement import misplacements
 from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
@@ -257,7 +258,10 @@ class Renderer:
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
         if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
-            self._has_warned = view.warn_if_empty(stacklevel=3)
+            remarks = [view.emptiness(), *(misplacements(self.scene) if is_scenes else [])]
+            if found := [remark for remark in remarks if remark]:
+                warnings.warn("; ".join(found), stacklevel=3)
+                self._has_warned = True
         self._last_cameras = view.cameras
         if view.static is not None:
             self._statics[view.static.moving] = view.static

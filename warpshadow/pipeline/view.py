@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import warnings
 
 import numpy as np
 import warp as wp
@@ -184,12 +183,12 @@ class View(LitPoints):
         view.surfaces = copy.copy(self.surfaces)
         return view
 
-    def warn_if_empty(self, *, stacklevel: int) -> bool:
-        """Warn of the first image that shows nothing of the scene, and say why."""
+    def emptiness(self) -> str | None:
+        """Say of the first image that shows nothing of the scene why; None if there is none."""
         face_ids = self.fragments.face_ids.numpy()
         empty = np.flatnonzero(face_ids.max(axis=(1, 2), initial=-1) < 0)
         if not len(empty):
-            return False
+            return None
         number, near = int(empty[0]), self._camera.near
         depths = self.clip_positions.value(self.call).numpy()
         depths = depths[min(number, len(depths) - 1), :, 3]
@@ -201,8 +200,8 @@ class View(LitPoints):
         else:
             reason = f"it is outside of the frame, at depths from {nearest:g} to {farthest:g}"
         which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
-        warnings.warn(f"camera: {which} shows nothing of the scene: {reason}", stacklevel=stacklevel + 1)
-        return True
+        remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
+        return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
 
 
 def _same(value: object) -> object:

@@ -1,7 +1,8 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
+import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -23,9 +24,10 @@ from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
 
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")
+_FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
-_PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres")
+_PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {"plane": plane, "icosphere": icosphere}
 
 
@@ -71,17 +73,26 @@ def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> 
             check_bounces(bounces)
     with check.located("[camera]"):
         toml_tables.check_table(scene["camera"])
-        check.known_keys("key", scene["camera"], (*_CAMERA_KEYS, "supersampling"))
+        check.known_keys("key", scene["camera"], (*_CAMERA_KEYS, *_FRAMING_KEYS, "supersampling"))
         placed = dict(scene["camera"])
         supersampling = placed.pop("supersampling", Scene.supersampling)
         check_supersampling(supersampling)
-        camera = parse_camera(placed)
+        camera = _framing(placed, bodies) if "framing" in placed else parse_camera(placed)
     with check.located("[visibility]"):
         given = scene.get("visibility", {})
         toml_tables.check_table(given)
         visibility = Visibility.of(given | settings)  # a file may hold settings for what --method chooses
     with check.located("the scene"):
         return Scene(tuple(bodies), light, camera, visibility, supersampling, bounces)
+
+
+def _framing(table: Table, bodies: Sequence[Body]) -> Camera:
+    """A camera from a table that leaves it to show all bodies."""
+    check.choice("framing", table.pop("framing"), ("auto",))
+    placed = next((key for key in ("eye", "target", *_PINHOLE_KEYS) if key in table), None)
+    if placed is not None:
+        raise ValueError(f"{placed}: got it beside framing, which finds the place of the camera; expected one of them")
+    return toml_tables.make(functools.partial(Camera.framing, bodies), table)
 
 
 def parse_camera(table: Table) -> Camera:
@@ -150,7 +161,9 @@ def _body(table: Table, folder: Path) -> Body:
         with check.located("spheres"):
             place["blockers"] = Spheres.read(path)
         del place["spheres"]
-    return Body(**place)
+    stands = check.flag("on_ground", place.pop("on_ground", False))
+    body = Body(**place)
+    return body.on_ground(body.translation) if stands else body
 
 
 # ---------------------------------------------------------------------------------------------- writing

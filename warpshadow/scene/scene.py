@@ -1,7 +1,7 @@
 """Scenes: bodies, light, camera and how visibility is computed."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -276,6 +276,25 @@ class Body:
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
+    def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> "Body":
+        """Stand the body on a ground, as it is turned; its spheres are not fitted again.
+
+        Args:
+            foot: Where the middle of its bottom goes [scene units], shape [3].
+            size: Longest edge of its bounds in the world [scene units]; by default its scale stays.
+        """
+        foot = check.array("foot", foot, (3,))
+        points = self.world_points() - self.translation
+        low, high = points.min(axis=0), points.max(axis=0)
+        factor = 1.0 if size is None else check.positive("size", size) / (high - low).max()
+        bottom = np.array([low[0] + high[0], 2 * low[1], low[2] + high[2]]) / 2
+        return replace(self, scale=float(self.scale * factor), translation=foot - factor * bottom)
+
+    def world_points(self) -> np.ndarray:
+        """The vertices that faces refer to, where they are in the world [scene units], float64 of shape [point, 3]."""
+        points = self.mesh.world_points().astype(np.float64)
+        return self.scale * points @ self.rotation_matrix().T + self.translation
+
     def world_mesh(self) -> Mesh:
         """The mesh in world space."""
         return self.mesh.transformed(
@@ -323,7 +342,7 @@ class Scene:
     Args:
         bodies: One or more bodies; they cast shadows on each other and on themselves.
         light: Environment map, or SH coefficients [order², 3], or the path of a map, relative to the current folder.
-        camera: The camera.
+        camera: The camera; None for one that shows all bodies, :meth:`Camera.framing`.
         visibility: How visibility is computed.
         supersampling: Each pixel averages this many samples across and down, which smooths silhouettes.
         bounces: How often light bounces between surfaces before it reaches what the camera sees, 0 to 16; 0 is direct
@@ -341,7 +360,7 @@ class Scene:
         self,
         bodies: Iterable[Body],
         light: EnvironmentMap | npt.ArrayLike | AnyPath,
-        camera: Camera,
+        camera: Camera | None = None,
         visibility: Visibility = _DIRECTIONAL,
         supersampling: int = supersampling,
         bounces: int = bounces,
@@ -355,6 +374,8 @@ class Scene:
             check.instance(f"bodies[{number}]", body, Body, "a Body, as Body(mesh) makes it of a mesh")
             if body.name is not None and body.name in [other.name for other in self.bodies[:number]]:
                 raise ValueError(f"bodies[{number}]: name: got {body.name!r}, as another has, expected one of its own")
+        if camera is None:
+            object.__setattr__(self, "camera", Camera.framing(self.bodies))
         check.instance("camera", self.camera, Camera, "a Camera; several go to Renderer(scene, cameras=[…])")
         check.instance("visibility", self.visibility, Visibility, "a Visibility, such as Visibility('directional')")
         given: Any = self.light

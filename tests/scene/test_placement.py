@@ -1,0 +1,93 @@
+"""Where bodies stand: on a ground, and what is remarked on where they do not."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from warpshadow.scene.placement import misplacements
+
+LIGHT = np.ones((4, 3))
+GROUND = ws.Body(ws.plane(20.0, 2), name="ground", translation=(0, -1, 0))
+
+
+def test_a_body_stands_on_the_ground_as_it_is_turned():
+    body = ws.Body(
+        ws.icosphere(0.7, 2), rotation=(10, 200, 40), translation=(5, 6, 7), scale=2.0, albedo=(0.1, 0.2, 0.3)
+    )
+    for foot in ((0.0, 0.0, 0.0), (3.0, -1.0, 2.0)):
+        standing = body.on_ground(foot)
+        points = standing.world_mesh().positions
+        low, high = points.min(axis=0), points.max(axis=0)
+        np.testing.assert_allclose([(low + high)[0] / 2, low[1], (low + high)[2] / 2], foot, atol=1e-6)
+        assert standing.mesh is body.mesh and standing.scale == body.scale  # so its spheres stay
+        np.testing.assert_array_equal(standing.rotation, body.rotation)
+        np.testing.assert_array_equal(standing.albedo, body.albedo)
+
+
+def test_a_body_is_scaled_to_a_size_as_it_is_put_on_the_ground():
+    mesh = ws.icosphere(0.7, 2).transformed(scale=(1, 3, 2), translation=(9, 9, 9))
+    points = ws.Body(mesh, scale=5.0, rotation=(30, 0, 0)).on_ground(size=2.5).world_points()
+    assert np.ptp(points, axis=0).max() == pytest.approx(2.5)
+    assert points[:, 1].min() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("name", "options"), [("size", {"size": 0}), ("foot", {"foot": (0, 1)})])
+def test_standing_names_the_argument_it_refuses(name, options):
+    with pytest.raises(ValueError, match=f"^{name}: got"):
+        ws.Body(ws.icosphere()).on_ground(**options)
+
+
+def test_the_world_points_of_a_body_are_those_of_its_mesh_in_the_world():
+    body = ws.Body(ws.icosphere(0.7, 2), rotation=(10, 200, 40), translation=(5, 6, 7), scale=2.0)
+    np.testing.assert_allclose(body.world_points(), body.world_mesh().positions, rtol=1e-6)
+
+
+def ball(height, **options):
+    return ws.Body(ws.icosphere(0.5, 1), translation=(0, height, 0), name="ball", **options)
+
+
+@pytest.mark.parametrize(
+    ("height", "said"),
+    [(-0.5, None), (0.4, None), (0.6, "floats 1.1 above"), (-1.4, None), (-1.6, "lies 1.1 below")],
+)
+def test_a_body_that_floats_or_lies_below_by_more_than_its_size_is_remarked_on(height, said):
+    remarks = misplacements(ws.Scene([GROUND, ball(height)], LIGHT))
+    assert len(remarks) == (said is not None)
+    if said:
+        assert re.match(f"body 1 .*'ball'.*, which is 1 large, {said} body 0 .*'ground'", remarks[0])
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        [],
+        [ws.Body(ws.plane(4.0, 2), rotation=(90, 0, 0))],  # a wall
+        [ws.Body(ws.plane(4.0, 2), translation=(50, -9, 0))],  # a ground beside it
+        [GROUND, ws.Body(ws.icosphere(2.0, 1), translation=(0, 1, 0))],  # on what stands on the ground
+    ],
+)
+def test_a_body_without_a_ground_below_or_on_another_does_not_float(others):
+    assert not misplacements(ws.Scene([ball(3.6), *others], LIGHT))
+
+
+def test_a_renderer_warns_once_of_all_that_is_out_of_place():
+    camera = ws.Camera.look_at((0, 0, 5), (0, 5, 20), size=(8, 8))
+    scene = ws.Scene([GROUND, ball(30.0, blockers=0)], LIGHT, camera, ws.Visibility("none"))
+    renderer = ws.Renderer(scene)
+    with pytest.warns(UserWarning, match="shows nothing of the scene: .*Camera.framing.*; body 1 .* floats") as caught:
+        renderer.render()
+        renderer.render()
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize("kind", ["ground", "no ground"])
+def test_a_body_that_was_put_on_the_ground_and_framed_gives_no_warning(kind):
+    body = ws.Body(ws.icosphere(70.0, 1), blockers=0, translation=(900, 900, 900))
+    bodies = [body] if kind == "no ground" else [body.on_ground(size=1), ws.Body(ws.plane(4.0, 4), blockers=0)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        image = ws.render(ws.Scene(bodies, LIGHT, visibility=ws.Visibility("none")))
+    assert image[128, 128, 3] == 1
