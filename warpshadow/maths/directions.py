@@ -15,6 +15,10 @@ BUNDLE = 4
 """Directions that are culled together."""
 
 
+LEAST_WIDTH = 2e-3
+"""Half-width of a falloff [rad] below which float32 has no digits left for it."""
+
+
 def check_count(name: str, count: int) -> None:
     """Raise ValueError unless ``count`` is a positive multiple of 16."""
     if not check.is_integer(count) or count <= 0 or count % CHUNK:
@@ -60,14 +64,13 @@ def falloff_width(softness: float, count: int) -> float:
     """Half-width w = κ·ρ of the falloff of a blocked cone towards ``count`` cells [rad].
 
     Raises:
-        ValueError: for a width of π/4 or more, where the falloff is as wide as cones, and below 0.002, where float32
-            has no digits left for it.
+        ValueError: for a width of π/4 or more, where the falloff is as wide as cones, and below :data:`LEAST_WIDTH`.
     """
     width = softness * cell_radius(count) if check.is_number(softness) else -1.0
-    if not 2e-3 <= width < np.pi / 4:
+    if not LEAST_WIDTH <= width < np.pi / 4:
         raise ValueError(
-            f"softness: got {softness!r} for {count} directions, expected {2e-3 / cell_radius(count):.3g} to "
-            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from 0.002 to π/4)"
+            f"softness: got {softness!r} for {count} directions, expected {LEAST_WIDTH / cell_radius(count):.3g} to "
+            f"{np.pi / 4 / cell_radius(count):.3g} (a half-width softness·2/√directions from {LEAST_WIDTH} to π/4)"
         )
     return width
 

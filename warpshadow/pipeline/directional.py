@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
@@ -21,6 +22,7 @@ from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
+from warpshadow.stages.visibility.narrow import Narrow, find_narrow, put_narrow
 
 
 class Cells(NamedTuple):
@@ -29,6 +31,7 @@ class Cells(NamedTuple):
     directions: np.ndarray  # [direction, 3]
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
+    narrow: Narrow | None = None  # cells that a sun is in
 
 
 class Directional(SphereMethod):
@@ -43,11 +46,15 @@ class Directional(SphereMethod):
 
     def in_known(self, light: KnownLight) -> Cells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
-        if isinstance(light, EnvironmentMap):
-            coefficients, directions, spreads = light.cells(self._directions)
-        else:
-            coefficients, directions, spreads = self.own_basis.coefficients(light), self._directions, None
-        return Cells(directions, wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device), spreads)
+        if not isinstance(light, EnvironmentMap):
+            return Cells(self._directions, self._on_device(self.own_basis.coefficients(light)))
+        cells = light.cells(self._directions)
+        power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
+        narrow = find_narrow(power, cells.directions, cells.spreads, softness)
+        return Cells(cells.directions, self._on_device(cells.radiance), cells.spreads, narrow)
+
+    def _on_device(self, coefficients: np.ndarray) -> wp.array:
+        return wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device)
 
     def coefficient_count(self, light: Source | None) -> int:
         """Number of coefficients that take part: all."""
@@ -64,13 +71,18 @@ class Directional(SphereMethod):
         if not (radii.shape[1] and points.size):
             shape = *points.shape, len(light.directions)
             return Seen(wp.full(shape, 1.0, dtype=wp.float32, device=points.device) if own is None else own, own)
-        softness, merging = self.visibility.softness, self.visibility.merging
         # kept cells have light although their middles are below the horizon
         facing = normals if kept is None else None
-        passing = directional.transmittance(
-            points, facing, centers, radii, light.directions, softness=softness, merging=merging
-        )
+        block, scales = functools.partial(directional.transmittance, points, facing, centers, radii), self._scales
+        passing = block(light.directions, **scales(1.0))
+        if light.narrow is not None:
+            directions, places, scale = light.narrow
+            passing = put_narrow(passing, block(directions, **scales(scale)), places)
         return Seen(passing if own is None else multiply_transmittances(own, passing), own)
+
+    def _scales(self, scale: float) -> dict[str, float]:
+        """Settings in radii of cells, of radii that are so much smaller."""
+        return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
 
     def _see_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""
