@@ -114,7 +114,30 @@ def test_render_also_writes_a_picture_at_a_given_exposure(scene, tmp_path):
     assert result.exit_code == 0 and "exposure -1.00 stops" in result.stdout
     image, picture = ws.read_image(output), ws.read_image(png)
     assert np.abs(picture[..., 3] - image[..., 3]).max() < EIGHT_BITS
-    assert np.abs(picture[..., :3] - np.clip(image[..., :3] / 2, 0, 1)).max() < EIGHT_BITS
+    straight = image[..., :3] / np.maximum(image[..., 3:], 1e-9)
+    assert np.abs(picture[..., :3] - np.clip(straight / 2, 0, 1)).max() < EIGHT_BITS
+
+
+def test_the_picture_is_what_python_writes(scene, tmp_path):
+    assert run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / "out.png").exit_code == 0
+    ws.write_image(tmp_path / "python.png", ws.render(ws.load_scene(scene)))
+    assert (tmp_path / "python.png").read_bytes() == (tmp_path / "out.png").read_bytes()
+
+
+@pytest.mark.parametrize("background", ["environment", "#ff8800"])
+def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
+    options = "--png", tmp_path / "out.png", "--background", background, "--tone", "filmic"
+    assert run("render", scene, "-o", tmp_path / "out.exr", *options).exit_code == 0
+    loaded = ws.load_scene(scene)
+    behind = loaded.background() if background == "environment" else background
+    ws.Picture(ws.render(loaded), background=behind, tone="filmic").write(tmp_path / "python.png")
+    assert (tmp_path / "python.png").read_bytes() == (tmp_path / "out.png").read_bytes()
+
+
+def test_a_background_that_is_none_is_refused_before_the_work(scene, tmp_path):
+    options = "--png", tmp_path / "out.png", "--background", "sky"
+    fails("render", scene, "-o", tmp_path / "out.exr", *options, parts=("--background: got 'sky'", "such as 'white'"))
+    assert not (tmp_path / "out.exr").exists()
 
 
 @pytest.mark.parametrize("name", ["out.jpg", "out.JPEG"])
@@ -124,7 +147,9 @@ def test_a_jpeg_has_no_alpha_and_is_on_black(scene, tmp_path, name):
     assert result.exit_code == 0, result.output
     image, picture = ws.read_image(tmp_path / "out.exr"), ws.read_image(tmp_path / name)
     assert picture.shape == (48, 64, 3) and (image[..., 3] == 0).any()
-    assert np.abs(picture - np.clip(image[..., :3], 0, 1)).mean() < EIGHT_BITS  # JPEG: in the mean
+    alpha = image[..., 3:]
+    expected = alpha * np.clip(image[..., :3] / np.maximum(alpha, 1e-9), 0, 1)
+    assert np.abs(picture - expected).mean() < EIGHT_BITS  # JPEG: in the mean
 
 
 def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
@@ -133,7 +158,8 @@ def test_without_an_exposure_the_brightest_hundredth_saturates(scene, tmp_path):
     image, picture = ws.read_image(output), ws.read_image(png)
     stops = auto_exposure(image)
     assert f"exposure {stops:+.2f} stops" in result.stdout
-    assert np.abs(picture[..., :3] - np.clip(image[..., :3] * 2**stops, 0, 1)).max() < EIGHT_BITS
+    straight = image[..., :3] / np.maximum(image[..., 3:], 1e-9)
+    assert np.abs(picture[..., :3] - np.clip(straight * 2**stops, 0, 1)).max() < EIGHT_BITS
     brightest = (image * 2**stops)[image[..., 3] > 0][:, :3].max(axis=1)
     assert 0 < (brightest > 1).mean() <= 0.011
 
@@ -173,7 +199,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(scene, tmp_
         fails("render", scene, "-o", folder, parts=(f"{folder}: got a folder, expected a file",))
     fails(*good, "--png", tmp_path, parts=(f"{tmp_path}: got a folder",))
     for stops in ("nan", "1e4", "-inf"):
-        fails(*good, "--exposure", stops, parts=(f"--exposure: got {float(stops):g}, expected -100 to 100 stops",))
+        fails(*good, "--exposure", stops, parts=(f"--exposure: got {float(stops)!r}, expected -100 to 100 stops",))
 
 
 @pytest.mark.parametrize("command", ["render", "fit", "spheres", "envmap"])

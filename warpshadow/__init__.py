@@ -9,6 +9,7 @@ from warpshadow.assets.image import ImageError, read_image, write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.assets.picture import Picture
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.assets.unwrap import unwrap
@@ -33,6 +34,7 @@ __all__ = [
     "ImageError",
     "Mesh",
     "MeshError",
+    "Picture",
     "Renderer",
     "Scene",
     "SceneError",

@@ -14,6 +14,7 @@ import warp as wp
 
 from warpshadow import Tuning, __version__, quiet
 from warpshadow.assets import files
+from warpshadow.assets.picture import SUFFIXES, Picture
 
 app = typer.Typer(
     add_completion=False,
@@ -29,10 +30,6 @@ INTERRUPTED = 130
 # Files in the folder of a fit, beside its results.
 _CHECKPOINT = "checkpoint"
 _PREVIEW = "preview.png"
-
-_PICTURES = (".png", ".jpg", ".jpeg")
-
-_MOST_STOPS = 100  # 2 to it is a float32
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
@@ -86,6 +83,12 @@ def render(
         Optional[float],
         typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
     ] = None,
+    tone: Annotated[
+        Literal["clip", "filmic"], typer.Option(help="What becomes of bright color in the picture: cut off, or bent.")
+    ] = "clip",
+    background: Annotated[
+        str, typer.Option(help="Background of the picture: transparent, environment, or a color: white, #ffcc00.")
+    ] = "transparent",
     method: Annotated[
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
@@ -98,7 +101,6 @@ def render(
     device: Device = "cpu",
 ) -> None:
     """Render a scene file to an image with soft shadows."""
-    from warpshadow.assets.color import auto_exposure, exposed
     from warpshadow.assets.image import write_image
     from warpshadow.pipeline.renderer import Renderer
     from warpshadow.scene.files import load_scene
@@ -106,12 +108,15 @@ def render(
     from warpshadow.tuning.tune import describe, resolved
 
     with _clear_errors():
-        is_picture = output.suffix.lower() in _PICTURES
+        is_picture = output.suffix.lower() in SUFFIXES
         _check_output(output, ".exr", instead=f"; pictures are written by --png {output}" if is_picture else "")
         if png is not None:
-            _check_output(png, *_PICTURES)
-        if exposure is not None and not abs(exposure) <= _MOST_STOPS:
-            raise ValueError(f"--exposure: got {exposure:g}, expected {-_MOST_STOPS} to {_MOST_STOPS} stops")
+            _check_output(png, *SUFFIXES)
+        plain = None if background in ("transparent", "environment") else background
+        try:
+            Picture(np.zeros((1, 1, 4)), exposure=exposure, background=plain)  # refused before the work
+        except ValueError as error:
+            raise ValueError(f"--{error}") from error
         given: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         parsed = load_scene(scene, **{name: value for name, value in given.items() if value is not None})
         where = _device(device)
@@ -124,10 +129,10 @@ def render(
         write_image(output, image)
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
         if png is not None:
-            stops = auto_exposure(image) if exposure is None else exposure
-            picture = exposed(image, stops)
-            write_image(png, picture if png.suffix.lower() == ".png" else picture[..., :3])  # color is premultiplied
-            typer.echo(f"{png}: exposure {stops:+.2f} stops")
+            behind = loaded.background() if background == "environment" else plain
+            picture = Picture(image, exposure=exposure, tone=tone, background=behind)
+            write_image(png, picture)
+            typer.echo(f"{png}: exposure {picture.exposure:+.2f} stops")
 
 
 @app.command()

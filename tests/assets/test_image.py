@@ -8,6 +8,7 @@ import pytest
 
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.image import ImageError, read_image, write_image
+from warpshadow.assets.picture import Picture
 
 RANDOM = np.random.default_rng(0)
 PIXELS = RANDOM.random((6, 8, 3), dtype=np.float32)
@@ -210,14 +211,24 @@ def test_palettes_become_colors(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "palette.png"), srgb_to_linear(codes / 255).astype(np.float32))
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("channels", [1, 3])
 def test_a_written_png_is_rounded_and_clipped_in_srgb(tmp_path, channels):
     codes = RANDOM.integers(0, 256, (5, 7, channels)) / 255
     pixels = np.vectorize(srgb_twin)(codes)
-    pixels[..., 3:] = codes[..., 3:]
     pixels[0, 0], pixels[0, 1], pixels[0, 2] = -1, 7, np.inf
     write_image(tmp_path / "a.png", pixels)
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), np.clip(pixels, 0, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_an_image_with_coverage_is_written_as_a_picture(tmp_path, name):
+    image = RANDOM.random((5, 7, 4))
+    for number, pixels in enumerate((image, Picture(image))):
+        write_image(tmp_path / f"{number}{name}", pixels)
+    Picture(image).write(tmp_path / name)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+    with pytest.raises(ImageError, match="got extension '.exr', expected one of .png"):
+        write_image(tmp_path / "a.exr", Picture(image))
 
 
 ORIENTATIONS = {
@@ -313,7 +324,6 @@ def test_unknown_extensions_missing_files_and_needless_parts_are_named(tmp_path)
         ("a.exr", np.zeros((4, 4, 2)), r"got pixels of shape \(4, 4, 2\)"),
         ("a.exr", np.zeros((0, 4, 3)), r"got pixels of shape \(0, 4, 3\)"),
         ("a.png", np.zeros(4), r"got pixels of shape \(4,\)"),
-        ("a.jpg", np.zeros((4, 4, 4)), "JPEG has no alpha"),
         ("a.png", np.full((4, 4, 3), np.nan), "got 48 NaN values"),
         ("a.png", np.full((4, 4, 3), 200, np.uint8), "pixels: got values of uint8"),
         ("a.exr", "pixels", "pixels: got .pixels., expected linear values"),

@@ -6,16 +6,20 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 
 
 def auto_exposure(image: np.ndarray) -> float:
-    """Exposure [stops] at which the brightest 1% of covered pixels saturate, for RGBA [height, width, 4]."""
-    covered = image[image[..., 3] > 0]
+    """Exposure [stops] at which the brightest 1% of pixels saturate, of those that are covered if it has coverage.
+
+    Args:
+        image: Linear, shape [..., 4] with coverage, or [..., 3] or [..., 1] without.
+    """
+    covered = image[image[..., 3] > 0] if image.shape[-1] == 4 else image.reshape(-1, image.shape[-1])
     bright = np.percentile(covered[:, :3].max(axis=1), 99) if len(covered) else 0.0
-    return float(-np.log2(bright)) if bright > 0 else 0.0
+    return float(-np.log2(bright)) if 0 < bright < np.inf else 0.0
 
 
-def exposed(image: np.ndarray, stops: float) -> np.ndarray:
-    """Multiply color by 2^stops, and cut off what saturates and the negative lobes of SH, as a picture must."""
-    color = np.clip(image[..., :3] * 2.0**stops, 0, 1)
-    return np.concatenate([color, image[..., 3:]], axis=-1).astype(np.float32)
+def filmic(color: np.ndarray) -> np.ndarray:
+    """Bend linear values of 0 or more towards 1 as film does (Narkowicz 2016, a fit of the ACES curve)."""
+    color = np.minimum(color, 1e6)  # of which the square is a float32, and which gives 1 as any larger one does
+    return np.clip(color * (2.51 * color + 0.03) / (color * (2.43 * color + 0.59) + 0.14), 0, 1)
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.radiance import read_radiance
 from warpshadow.check import AnyPath
 
@@ -62,34 +63,40 @@ def read_rgb(path: AnyPath, *, part: str | int | None = None) -> np.ndarray:
     return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
 
 
-def write_image(path: AnyPath, pixels: np.ndarray) -> None:
-    """Write a picture of linear values; the file appears complete or not at all.
+def write_image(path: AnyPath, pixels: np.ndarray | Picture) -> None:
+    """Write an image of linear values; the file appears complete or not at all.
 
     Args:
-        path: A .exr file (float32, ZIP compressed, any values), or a .png, .jpg or .jpeg file (8-bit sRGB;
-            values are clipped to [0, 1], alpha is not sRGB encoded).
-        pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 (RGB, alpha)
-            channels; JPEG has no alpha.
+        path: A .exr file (float32, ZIP compressed, any values), or a .png, .jpg or .jpeg file (8-bit sRGB).
+        pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 channels: RGB and
+            coverage, premultiplied, as :func:`warpshadow.render` returns them. A .png or .jpg file of four channels is
+            a :class:`Picture` at its automatic exposure; others keep their values, clipped to [0, 1]. Or a Picture.
 
     Raises:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
         OSError: where the file cannot be written.
     """
     path = check.path("path", path)
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_WRITERS)}")
+    suffixes = SUFFIXES if isinstance(pixels, Picture) else (".exr", *SUFFIXES)
+    if path.suffix.lower() not in suffixes:
+        raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(suffixes)}")
+    if isinstance(pixels, Picture):
+        pixels.write(path)
+        return
     pixels = check.pixels("pixels", pixels, expected="linear values [height, width, channel]", error=ImageError)
     shape = pixels.shape
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
         raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
+    if path.suffix.lower() != ".exr":
+        with check.located(str(path), ImageError):
+            picture = Picture(pixels, exposure=None if pixels.shape[2] == 4 else 0.0)
+        picture.write(path)
+        return
     try:
         with files.whole(path) as unfinished:
-            writer(unfinished, pixels)
-    except ImageError as error:
-        raise ImageError(f"{path}: {error}") from error
+            _write_exr(unfinished, pixels)
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
 
@@ -208,24 +215,6 @@ def _load(picture) -> None:
         raise ImageError(f"truncated or damaged ({error})") from error
 
 
-def _write_pillow(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    is_jpeg = path.suffix.lower() != ".png"
-    if is_jpeg and pixels.shape[2] == 4:
-        raise ImageError("got 4 channels, expected 1 or 3 because JPEG has no alpha")
-    if np.isnan(pixels).any():
-        raise ImageError(f"got {int(np.isnan(pixels).sum())} NaN values, expected numbers")
-    encoded = np.clip(pixels, 0, 1).astype(np.float64)
-    encoded[..., :3] = linear_to_srgb(encoded[..., :3])
-    codes = np.floor(encoded * 255 + 0.5).astype(np.uint8)
-    picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
-    if is_jpeg:
-        picture.save(path, quality=95, subsampling=0)
-    else:
-        picture.save(path)
-
-
 def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
     return read_radiance(path, functools.partial(_check_size, max_pixels=max_pixels))
 
@@ -233,9 +222,5 @@ def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.nd
 _READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {
     ".exr": _read_exr,
     **dict.fromkeys([".hdr", ".pic"], _read_radiance),
-    **dict.fromkeys([".png", ".jpg", ".jpeg"], _read_pillow),
-}
-_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
-    ".exr": _write_exr,
-    **dict.fromkeys([".png", ".jpg", ".jpeg"], _write_pillow),
+    **dict.fromkeys(SUFFIXES, _read_pillow),
 }

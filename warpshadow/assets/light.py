@@ -20,11 +20,15 @@ from warpshadow import check
 from warpshadow.assets.cells import CellLight, gather_cells
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.image import ImageError, read_rgb, write_image
+from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 
 # Degrees about +y that turn a map of the convention into ours, and so what its center shows.
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
+
+
+_DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -125,6 +129,35 @@ class EnvironmentMap:
     def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
         return EnvironmentMap(self.radiance * _color("factor", factor))
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks draw: the map, of at most some 512 columns, at its automatic exposure."""
+        height, width, _ = self.radiance.shape
+        step = max(1, height // _DRAWN_ROWS)
+        kept = self.radiance[: height // step * step, : width // step * step].astype(np.float64)
+        blocks = kept.reshape(height // step, step, width // step, step, 3)
+        return Picture(blocks.mean(axis=(1, 3)))._repr_png_()
+
+    def towards(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance from directions, interpolated between pixels.
+
+        Args:
+            directions: Unit vectors, shape [..., 3].
+
+        Returns:
+            Linear RGB, float64 of shape [..., 3].
+        """
+        height, width, _ = self.radiance.shape
+        x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+        row = np.arccos(np.clip(y, -1, 1)) / np.pi * height - 0.5
+        column = np.arctan2(x, -z) / (2 * np.pi) * width - 0.5
+        up, left = np.floor(row).astype(int), np.floor(column).astype(int)
+        radiance = np.zeros((*row.shape, 3))
+        for down, right in np.ndindex(2, 2):
+            weight = np.abs(1 - down - (row - up)) * np.abs(1 - right - (column - left))
+            rows, columns = np.clip(up + down, 0, height - 1), (left + right) % width
+            radiance += weight[..., None] * self.radiance[rows, columns]
+        return radiance
 
     def directions(self) -> np.ndarray:
         """Unit vectors to the pixel centers, float32, shape [height, width, 3]."""

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 
 from warpshadow.assets import files
+from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.preview import white_of
 from warpshadow.inverse.schedule import Stage
 from warpshadow.maths.sh import reconstruct_map
 from warpshadow.scene import toml_tables
@@ -96,10 +97,10 @@ class Report:
         """Targets, and images before and after, the views side by side, at one exposure."""
         targets = np.stack([target.image[..., :3] for target in self.result.problem.targets])
         pictures = {"target": targets, "before": self.before, "after": self.after}
-        white = white_of(targets)
+        exposure = auto_exposure(targets)
         for name, images in pictures.items():
             side_by_side = np.concatenate(list(images[..., :3]), axis=1)
-            write_image(folder / f"{name}.png", side_by_side / white)
+            Picture(side_by_side, exposure=exposure).write(folder / f"{name}.png")
         return [folder / f"{name}.png" for name in pictures]
 
 

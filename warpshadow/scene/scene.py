@@ -403,6 +403,19 @@ class Scene:
                 f"method = one of {finders}"
             )
 
+    def background(self) -> np.ndarray:
+        """The light as the camera sees it where no body is, linear RGB, float32 of shape [height, width, 3]."""
+        across = self.supersampling
+        _, directions = self.camera.resized(across).rays()
+        if isinstance(self.light, EnvironmentMap):
+            radiance = self.light.towards(directions)
+        else:
+            harmonics = sh.evaluate(sh.order_of("light", self.light), directions.reshape(-1, 3))
+            radiance = np.maximum(harmonics @ self.light, 0).reshape(directions.shape)
+        height, width, _ = directions.shape
+        samples = radiance.reshape(height // across, across, width // across, across, 3)
+        return samples.mean(axis=(1, 3)).astype(np.float32)
+
     def body_number(self, body: BodyLike, argument: str = "body") -> int:
         """Number of a body, from 0, given that or its name.
 

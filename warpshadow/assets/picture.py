@@ -1,0 +1,154 @@
+"""Pictures: linear images as they are shown, exposed, on a background, in 8 bits of sRGB."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warpshadow import check
+from warpshadow.assets import files
+from warpshadow.assets.color import auto_exposure, filmic, linear_to_srgb, srgb_to_linear
+from warpshadow.check import AnyPath
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+"""What files of pictures are called."""
+
+MOST_STOPS = 100  # 2 to it is a float32
+
+TONES: dict[str, Callable[[np.ndarray], np.ndarray]] = {"clip": lambda color: color, "filmic": filmic}
+"""What becomes of exposed color before it is cut off at 1."""
+
+
+class Picture:
+    """An image as it is shown; notebooks draw it.
+
+    Args:
+        image: Linear values: RGB and coverage, premultiplied, as :func:`warpshadow.render` returns them, shape
+            [height, width, 4]; RGB [height, width, 3]; or gray [height, width] or [height, width, 1].
+        exposure: Factor of the image, in stops; by default the brightest 1% of what is covered just saturate.
+        tone: What becomes of bright color: "clip" cuts it off at 1, "filmic" bends it towards 1 (Narkowicz's fit of
+            the ACES curve, 2016).
+        background: What shows where the image covers nothing: None for transparent; a color of the picture, linear RGB
+            [3] or as CSS names it, "white" or "#ffcc00"; or an image of radiance, [height, width, 3], which is exposed
+            like the rest: ``scene.background()`` is the light itself.
+
+    Attributes:
+        pixels: uint8 of shape [height, width, 3], [height, width, 4] with straight alpha where it is transparent, or
+            [height, width, 1] of gray; ``PIL.Image.fromarray`` takes them.
+        exposure: In stops.
+
+    Raises:
+        ValueError: for NaN, and for a background behind an image that has no coverage.
+    """
+
+    pixels: np.ndarray
+    exposure: float
+
+    def __init__(
+        self,
+        image: npt.ArrayLike,
+        *,
+        exposure: float | None = None,
+        tone: str = "clip",
+        background: npt.ArrayLike | None = None,
+    ):
+        linear = _checked("image", image)
+        check.choice("tone", tone, TONES)
+        if exposure is not None and not (check.is_number(exposure) and abs(exposure) <= MOST_STOPS):
+            raise ValueError(
+                f"exposure: got {check.described(exposure)}, expected {-MOST_STOPS} to {MOST_STOPS} stops, or None"
+            )
+        self.exposure = auto_exposure(linear) if exposure is None else float(exposure)
+        has_alpha = linear.shape[2] == 4
+        if background is not None and not has_alpha:
+            raise ValueError(f"background: got one behind an image of shape {linear.shape}, which covers all of it")
+        color, alpha = (linear[..., :3], np.clip(linear[..., 3:], 0, 1)) if has_alpha else (linear, None)
+        behind = None if background is None else _behind(background, color.shape)
+        if alpha is not None and behind is not None and behind.ndim == 3:
+            color, alpha = color + (1 - alpha) * behind, None
+        if alpha is not None:
+            color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+        color = np.clip(TONES[tone](np.maximum(color * 2.0**self.exposure, 0)), 0, 1)
+        if alpha is not None and behind is not None:
+            color, alpha = alpha * color + (1 - alpha) * behind, None
+        encoded = linear_to_srgb(color)
+        self.pixels = _codes(encoded if alpha is None else np.concatenate([encoded, alpha], axis=2))
+        self.pixels.setflags(write=False)
+
+    def __repr__(self) -> str:
+        height, width, _ = self.pixels.shape
+        return f"Picture({width} × {height}, {self.exposure:+.2f} stops)"
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks draw."""
+        file = io.BytesIO()
+        _pillow(self.pixels).save(file, format="PNG")
+        return file.getvalue()
+
+    def opaque(self) -> np.ndarray:
+        """uint8 of shape [height, width, 3], on black where the picture is transparent."""
+        if self.pixels.shape[2] < 4:
+            return np.broadcast_to(self.pixels, (*self.pixels.shape[:2], 3))
+        straight = self.pixels / 255
+        return _codes(linear_to_srgb(straight[..., 3:] * srgb_to_linear(straight[..., :3])))
+
+    def write(self, path: AnyPath) -> None:
+        """Write a .png file, or a .jpg or .jpeg file, on black where the picture is transparent.
+
+        Raises:
+            OSError: where the file cannot be written.
+        """
+        path = check.path("path", path)
+        if path.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
+        with files.whole(path) as unfinished:
+            if path.suffix.lower() == ".png":
+                _pillow(self.pixels).save(unfinished)
+            else:
+                shown = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
+                _pillow(shown).save(unfinished, quality=95, subsampling=0)
+
+
+def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:
+    """An image [height, width, channel], float64, without NaN and Inf."""
+    expected = "linear values [height, width, channel]"
+    pixels = check.pixels(name, image, expected=expected)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
+        raise ValueError(f"{name}: got shape {pixels.shape}, expected [height, width] or [height, width, 1, 3 or 4]")
+    if np.isnan(pixels).any():
+        raise ValueError(f"{name}: got {int(np.isnan(pixels).sum())} NaN values, expected numbers")
+    return np.clip(pixels.astype(np.float64), -check.LARGEST, check.LARGEST)
+
+
+def _behind(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """A color [3] or an image [height, width, 3], linear."""
+    if isinstance(background, str):
+        from PIL import ImageColor
+
+        try:
+            return srgb_to_linear(np.array(ImageColor.getrgb(background)[:3]) / 255)
+        except ValueError as error:
+            raise ValueError(
+                f"background: got {background!r}, expected a color such as 'white' or '#ffcc00'"
+            ) from error
+    expected = f"a color [3], or an image {list(shape)}"
+    behind = check.numbers("background", background, expected=expected, dtype=np.float64)
+    if behind.shape not in ((3,), shape):
+        raise ValueError(f"background: got shape {behind.shape}, expected {expected}")
+    check.finite("background", behind, least=0.0, most=1.0 if behind.ndim == 1 else check.LARGEST)
+    return behind
+
+
+def _pillow(pixels: np.ndarray) -> Any:
+    from PIL import Image
+
+    return Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
+
+
+def _codes(encoded: np.ndarray) -> np.ndarray:
+    return np.floor(encoded * 255 + 0.5).astype(np.uint8)
