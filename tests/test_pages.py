@@ -244,9 +244,8 @@ def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
         exec(snippet, names)
     image = ws.read_image("out.exr")
     assert image[..., :3].max() > 0.1
-    assert (
-        np.abs(names["image"].detach().numpy() - image).mean() < 0.05 * image.mean()
-    )  # its fit has found light and texture
+    error = np.abs(names["image"].detach().numpy() - image).mean()
+    assert error < 0.1 * image.mean()  # its fit, which begins in the dark, has found light and texture
     ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
     for page in ("pipeline", "inverse"):
         for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
