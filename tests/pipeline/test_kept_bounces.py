@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
+from warpshadow.pipeline import kept_bounces, rays
 from warpshadow.pipeline.patches import ScenePatches
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
 from warpshadow.torch import TorchRenderer
@@ -132,12 +133,24 @@ def test_black_bodies_send_nothing(renderer, direct):
     torch.testing.assert_close(bounced[..., :3][at_ground], without[..., :3][at_ground], rtol=1e-4, atol=1e-5)
 
 
-def test_iterations_are_those_of_a_twin_in_float64(renderer):
-    """B = a M (S + F B) and I = W F B, of the matrices that are kept."""
-    engine = renderer.warp
+@pytest.mark.parametrize("given", ["light", "light and colors"])
+def test_iterations_are_those_of_a_twin_in_float64(given, renderer, monkeypatch):
+    """B = a M (S + F B) and I = W F B, of the form factors F that rays find."""
+    traced, trace = [], kept_bounces.trace_factors
+
+    def listed(*arguments, **options):
+        traced.append(trace(*arguments, **options))
+        return traced[-1]
+
+    monkeypatch.setattr(kept_bounces, "trace_factors", listed)
+    engine = ws.Renderer(renderer.scene)
     view = engine.view()
     light = wp.array(np.random.default_rng(SEED).normal(size=(1, 9, 3)), dtype=wp.vec3)
-    engine.draw(light)
+    materials = view.materials
+    if given == "light and colors":  # those that it has
+        color = wp.array(np.atleast_2d(renderer.scene.bodies[2].albedo)[None], dtype=wp.vec3)
+        materials = materials.replaced([None, None, color], None)
+    shading = view.shading(light, materials).value(view.call).numpy()[0]
     (factors,) = (node for name, (_, node) in view._kept.items() if name == "form factors")
     factors = factors.value(view.call)
     patches = ScenePatches(engine.assembly)
@@ -151,13 +164,12 @@ def test_iterations_are_those_of_a_twin_in_float64(renderer):
         result[np.repeat(np.arange(matrix.shape[0]), np.diff(starts)), columns] = weights
         return result
 
-    mean, between = dense(senders.mean), dense(factors.between)
+    mean, (between, of_nodes) = dense(senders.mean), [each.toarray().astype(np.float64) for each in traced]
     at_sources = transfer @ light.numpy()[0].astype(np.float64)
     radiosity = albedo * (mean @ at_sources)
     radiosity = albedo * (mean @ (at_sources + between @ radiosity))
-    expected = dense(factors.of_receivers) @ (dense(factors.of_nodes) @ radiosity)
+    expected = dense(factors.of_receivers) @ (of_nodes @ radiosity)
     direct = view.transfers.value(view.call)[0].numpy()[0].astype(np.float64) @ light.numpy()[0]
-    shading = engine.shade(light).numpy()[0]
     scale = np.abs(shading).max()
     assert np.abs(expected).max() > 0.05 * scale
     np.testing.assert_allclose(shading, direct + expected, atol=2e-5 * scale)
@@ -203,8 +215,6 @@ def test_colors_of_a_wall_are_seen_in_what_it_lights(renderer):
 
 def test_no_ray_is_traced_in_an_iteration(renderer, monkeypatch):
     """What rays find is kept, whatever the light and the colors are."""
-    from warpshadow.pipeline import kept_bounces, rays
-
     wall = torch.full((1, 3), 0.5)
     light = torch.rand(9, 3)
     with torch.no_grad():

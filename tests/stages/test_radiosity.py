@@ -1,10 +1,11 @@
-"""Sparse products and radiosity of patches against NumPy, and their gradients."""
+"""Sparse products, colored transfer and radiosity of patches against NumPy, and their gradients."""
 
 import numpy as np
 import pytest
 import warp as wp
 
 from warpshadow.device.tape import recorded
+from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
 
@@ -39,6 +40,33 @@ def test_a_sparse_product_and_its_adjoint_are_those_of_the_matrix(shape, device,
     weights = uniform(2, shape[0], 3, seed=3)
     (gradient,) = gradients(tape, product, weights, given)
     np.testing.assert_allclose(gradient, matrix.T @ weights, rtol=FLOAT32, atol=FLOAT32)
+
+
+@pytest.mark.parametrize("given", [(1, 2), (2, 1), (2, 2)])
+def test_what_is_added_to_a_product_has_the_gradient_of_the_sum(given, device, verified_tape):
+    matrix, values, more = uniform(7, 5), uniform(given[0], 5, 3, seed=1), uniform(given[1], 7, 3, seed=2)
+    on_device = colors(values, device), colors(more, device)
+    sparse = SparseMatrix.of(matrix, device=device)
+    assert np.array_equal(sparse.on_host().toarray(), matrix)
+    with recorded() as tape:
+        total = multiply(sparse, on_device[0], plus=on_device[1])
+    np.testing.assert_allclose(total.numpy(), matrix @ values + more, rtol=FLOAT32)
+    weights = uniform(2, 7, 3, seed=3)
+    adj_values, adj_more = gradients(tape, total, weights, *on_device)
+    for found, passed, count in ((adj_values, matrix.T @ weights, given[0]), (adj_more, weights, given[1])):
+        expected = passed if count == 2 else passed.sum(axis=0, keepdims=True)
+        np.testing.assert_allclose(found, expected, rtol=FLOAT32)
+
+
+def test_colored_transfer_lights_each_color_by_itself(device, verified_tape):
+    lit, light = uniform(6, 50, 3), uniform(2, 6, 3, seed=1)
+    given = colors(light, device)
+    with recorded() as tape:
+        found = colored_light(ColoredTransfer.of(lit, device=device), given)
+    np.testing.assert_allclose(found.numpy(), np.einsum("kxc,bkc->bxc", lit, light), rtol=FLOAT32)
+    weights = uniform(2, 50, 3, seed=2)
+    (gradient,) = gradients(tape, found, weights, given)
+    np.testing.assert_allclose(gradient, np.einsum("kxc,bxc->bkc", lit, weights), rtol=FLOAT32)
 
 
 def test_a_matrix_of_zeros_gives_zeros(device):

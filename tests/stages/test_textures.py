@@ -12,7 +12,7 @@ from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
-from warpshadow.stages.textures.pyramid import mip_pyramids
+from warpshadow.stages.textures.pyramid import level_matrices, mip_pyramids
 from warpshadow.stages.textures.sample import expose_albedo, sample_albedo
 from warpshadow.stages.textures.seen import fill_unseen, seen_texels
 
@@ -267,6 +267,13 @@ def test_mip_levels_equal_their_twin(device, poisoned_outputs, shape):
     pyramids = mip_pyramids([wp.array(images, dtype=wp.vec3, device=device)])
     expected = [np.concatenate([level.reshape(-1, 3) for level in pyramid(image)]) for image in images]
     np.testing.assert_allclose(pyramids.texels.numpy(), expected, atol=MEAN)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (13, 6), (16, 16)])
+def test_matrices_take_an_image_to_its_levels(shape):
+    image = np.random.default_rng(0).uniform(size=(*shape, 3))
+    for matrix, level in zip(level_matrices(*shape), pyramid(image), strict=True):
+        np.testing.assert_allclose(matrix @ image.reshape(-1, 3), level.reshape(-1, 3), rtol=1e-12)
 
 
 def test_levels_lie_where_the_layout_says(device):

@@ -349,12 +349,11 @@ class SphereBounces:
         if isinstance(light.value(), wp.array):
             direct = Node("shading", _shade, points.transfers, light)
             transfers = points.kept("transfer", sources, lambda: self.method.transfers(at_sources, where))
-            lit = Node(f"shading{where}", _shade, transfers, light)
-        else:
-            direct = points.kept("direct", light, lambda: self.direct(points, own, light, joined))
-            make = functools.partial(self.direct, at_sources, own, light, joined, where=where)
-            lit = points.kept("direct at sources", (light, sources), make)
-        return self._still.shading(direct, lit, points, materials)
+            return self._still.in_free_light(direct, transfers, light, points, materials)
+        direct = points.kept("direct", light, lambda: self.direct(points, own, light, joined))
+        make = functools.partial(self.direct, at_sources, own, light, joined, where=where)
+        lit = points.kept("direct at sources", (light, sources), make)
+        return self._still.in_known_light(direct, lit, points, materials)
 
     def direct(
         self, points: LitPoints, own: Any, light: Source | None, finish: Callable, **options: Any

@@ -3,28 +3,31 @@
 Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
 With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces,
 
-    B = a M (S + F B),  M the mean over sources,        starting from B = a M S,
+    B = a (M S + M F B),  M the mean over sources,        starting from B = a M S,
 
 and what receivers get of it, F B. Receivers of an image are many: F is found at some of them, and interpolated.
-It is linear in light, and differentiable in light and albedo.
+It is linear in light: of free light among bodies whose colors are known all of it is one matrix, which is kept.
+Differentiable in light and albedo.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.pipeline.lighting import LitPoints, receiver_words
-from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.node import Node, Source
 from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.factors import loose_mesh, trace_factors
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
-from warpshadow.stages.bounces.radiosity import patch_radiosity
+from warpshadow.stages.bounces.radiosity import reflect
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
-from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
 
 if TYPE_CHECKING:
@@ -37,10 +40,22 @@ _RAYS = 1024
 class _Factors(NamedTuple):
     """What is kept of a geometry."""
 
-    between: SparseMatrix  # [source, patch]
+    between: SparseMatrix  # [patch, patch], means over the sources of the first
     of_nodes: SparseMatrix  # [node, patch], nodes of each view after one another
     of_receivers: SparseMatrix  # [receiver, node]
     shape: tuple[int, int]  # views, receivers of each
+
+    def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
+        """Add what nodes get to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
+        if self.shape[0] == 1:
+            return multiply(self.of_receivers, bounced, plus=direct)
+        if len(bounced) > 1:
+            raise ValueError(
+                f"light, albedo, textures: got a batch of {len(bounced)} for {self.shape[0]} views by "
+                'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
+                "batches"
+            )
+        return multiply(self.of_receivers, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
 
 
 class KeptBounces:
@@ -60,7 +75,7 @@ class KeptBounces:
         senders = self._patches.senders(materials)
         return points.kept("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
 
-    def shading(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+    def in_known_light(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
         """Shading with bounces.
 
         Args:
@@ -72,32 +87,64 @@ class KeptBounces:
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return direct
+        make = functools.partial(Node, "", functools.partial(multiply, senders.mean), at_sources)
+        return self._shading(direct, points.kept("light of patches", at_sources, make), points, materials)
 
-        def bounce(direct: wp.array, at_sources: wp.array, albedo: wp.array, factors: _Factors) -> wp.array:
-            radiosity = patch_radiosity(albedo, at_sources, senders.mean)
-            for _ in range(self._bounces - 1):
-                lit = total_light([at_sources, multiply(factors.between, radiosity)])
-                radiosity = patch_radiosity(albedo, lit, senders.mean)
-            bounced = multiply(factors.of_receivers, multiply(factors.of_nodes, radiosity))
-            if factors.shape[0] > 1:
-                if len(bounced) > 1:
-                    raise ValueError(
-                        f"light, albedo, textures: got a batch of {len(bounced)} for {factors.shape[0]} views by "
-                        'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
-                        "batches"
-                    )
-                bounced = bounced.reshape(factors.shape)
-            return total_light([direct, bounced])
+    def in_free_light(
+        self, direct: Node, transfers: Node, light: Source, points: LitPoints, materials: Materials
+    ) -> Node:
+        """The same in free light; what becomes of it among the colors of the scene is kept.
 
-        return Node(
-            "bounces",
-            bounce,
-            direct,
-            at_sources,
-            self._patches.albedo(materials, senders.bodies),
-            self._factors(points, materials, senders),
-            items=lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces",
-        )
+        Args:
+            direct: As above.
+            transfers: Node of the transfer vectors of the sources, [1, source, coefficient], in parts.
+            light: The coefficients.
+            points: The receivers.
+            materials: What the bodies reflect.
+        """
+        senders = self._patches.senders(materials)
+        if not senders.bodies:
+            return direct
+
+        def spread(parts: list[wp.array]) -> wp.array:
+            """What patches get of each coefficient of white light, vec3 of shape [coefficient, patch]."""
+            grey = np.concatenate([part.numpy()[0] for part in parts]).T[..., None]
+            return multiply(senders.mean, wp.array(np.repeat(grey, 3, axis=2), dtype=wp.vec3, device=parts[0].device))
+
+        lit = points.kept("patches in each coefficient", transfers, lambda: Node("", spread, transfers))
+        if materials is not points.materials:
+            transfer = points.kept("transfer of patches", lit, lambda: Node("", _as_transfer, lit))
+            return self._shading(direct, Node("", colored_light, transfer, light), points, materials)
+
+        def bounced() -> Node:
+            given = self._patches.albedo(materials, senders.bodies), lit, self._factors(points, materials, senders)
+            return Node("transfer of bounces", lambda *given: _as_transfer(self._at_nodes(*given)), *given)
+
+        def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: _Factors) -> wp.array:
+            return factors.to_receivers(direct, colored_light(transfer, light))
+
+        transfer, factors = points.kept("bounces", lit, bounced), self._factors(points, materials, senders)
+        return Node("bounces", shade, direct, transfer, light, factors, items=self._words(points, senders))
+
+    def _shading(self, direct: Node, at_patches: Node, points: LitPoints, materials: Materials) -> Node:
+        """Shading with bounces, given what falls on patches directly, vec3 of shape [batch, patch]."""
+        senders = self._patches.senders(materials)
+
+        def bounce(direct: wp.array, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
+            return factors.to_receivers(direct, self._at_nodes(albedo, at_patches, factors))
+
+        albedo, factors = self._patches.albedo(materials, senders.bodies), self._factors(points, materials, senders)
+        return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._words(points, senders))
+
+    def _at_nodes(self, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
+        """What nodes get of light that has bounced, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
+        radiosity = reflect(albedo, at_patches)
+        for _ in range(self._bounces - 1):
+            radiosity = reflect(albedo, multiply(factors.between, radiosity, plus=at_patches))
+        return multiply(factors.of_nodes, radiosity)
+
+    def _words(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
+        return lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(positions: wp.array, sources: Receivers, receivers: Receivers) -> _Factors:
@@ -120,8 +167,9 @@ class KeptBounces:
                 np.concatenate([each[nodes] for each, nodes in zip(places, chosen, strict=True)])
                 for places in (at, facing)
             )
+            of_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0])
             return _Factors(
-                SparseMatrix.of(trace(sources.points.numpy()[0], sources.normals.numpy()[0]), device=device),
+                SparseMatrix.of(senders.mean.on_host() @ of_sources, device=device),
                 SparseMatrix.of(trace(at_nodes, of_nodes), device=device),
                 SparseMatrix.of(block_diag(list(map(interpolation, at, facing, chosen))), device=device),
                 at.shape[:2],
@@ -157,3 +205,8 @@ class KeptBounces:
                 corners.append(own[faces])
                 owners.append(np.full((2, len(faces)), -1))
         return loose_mesh(np.concatenate(corners), device=assembly.device), np.concatenate(owners, axis=1)
+
+
+def _as_transfer(lit: wp.array) -> ColoredTransfer:
+    """The matrix of receivers that are lit by each coefficient alone, vec3 of shape [coefficient, receiver]."""
+    return ColoredTransfer.of(lit.numpy(), device=lit.device)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate
+from warpshadow.device.batch import concatenate, rows
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Node
@@ -18,7 +18,6 @@ from warpshadow.stages.bounces.patches import Patches, find_flat_patches, find_p
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
-from warpshadow.stages.textures.pyramid import Textures
 
 
 class ScenePatches:
@@ -84,21 +83,20 @@ class ScenePatches:
     def albedo(self, materials: Materials, bodies: Sequence[int]) -> Node:
         """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch]."""
         counts = [self.of_body(number).count for number in bodies]
-        pyramids = materials.pyramids if any(materials.sizes[number] for number in bodies) else None
 
-        def means(colors: Sequence[wp.array], textures: Textures | None) -> wp.array:
+        def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:
             parts = []
             for number in bodies:
-                if materials.sizes[number] is not None:
-                    assert textures is not None
-                    parts.append(multiply(self._mean_of_texels(number, materials, textures), textures.texels))
+                image = images[number]
+                if image is not None:
+                    parts.append(multiply(self._mean_of_texels(number, image.shape[1:]), rows(image)))
                 elif colors[number].shape[1] == 1:
                     parts.append(colors[number])
                 else:
                     parts.append(multiply(self._mean_of_vertices(number), colors[number]))
             return concatenate(parts, counts)
 
-        return Node("patch albedo", means, materials.albedo, pyramids, items=f"{sum(counts):,} patches")
+        return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
 
     def _mean_of_vertices(self, number: int) -> SparseMatrix:
         key = (number,)
@@ -108,22 +106,13 @@ class ScenePatches:
             self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
         return self._means[key]
 
-    def _mean_of_texels(self, number: int, materials: Materials, textures: Textures) -> SparseMatrix:
-        key = (number, materials.sizes)
+    def _mean_of_texels(self, number: int, size: tuple[int, int]) -> SparseMatrix:
+        key = (number, size)
         if key not in self._means:
-            texture = sum(size is not None for size in materials.sizes[:number])
-            count = int(textures.level_counts.numpy()[texture])
             mesh = self._assembly.scene.bodies[number].mesh
             assert mesh.uvs is not None and mesh.surface.uv_faces is not None
-            matrix = mean_over_texels(
-                self.of_body(number),
-                mesh.positions,
-                mesh.surface.faces,
-                mesh.uvs,
-                mesh.surface.uv_faces,
-                textures.levels.numpy()[texture, :count],
-                textures.texels.shape[1],
-            )
+            given = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
+            matrix = mean_over_texels(self.of_body(number), *given, size)
             self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
         return self._means[key]
 

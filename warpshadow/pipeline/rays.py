@@ -13,7 +13,6 @@ from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.shading import shade
 
 if TYPE_CHECKING:  # it is imported where light bounces
     from warpshadow.pipeline.kept_bounces import KeptBounces
@@ -63,7 +62,7 @@ class Rays(Method):
             return Node("", self._shade, self._meshes_for(points, sources), sources, light)
 
         at_sources = points.kept("direct at sources", (light, sources), shaded_sources)
-        return self._bounces.shading(direct, at_sources, points, materials)
+        return self._bounces.in_known_light(direct, at_sources, points, materials)
 
     def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in free light."""
@@ -76,8 +75,7 @@ class Rays(Method):
             return Node("", self._transfer, self._meshes_for(points, sources), sources)
 
         at_sources = points.kept("transfer of sources", sources, transfers)
-        shaded = Node("", lambda transfers, light: shade(transfers[0], light), at_sources, light)
-        return self._bounces.shading(direct, shaded, points, materials)
+        return self._bounces.in_free_light(direct, at_sources, light, points, materials)
 
     @functools.cached_property
     def _bounces(self) -> "KeptBounces":

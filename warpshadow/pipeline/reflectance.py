@@ -92,6 +92,8 @@ class Materials:
                 check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
                 if bodies[number].mesh.uvs is None:
                     raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None")
+                if not image.is_contiguous:
+                    raise ValueError(f"textures[{number}]: got a strided array, expected a contiguous one")
                 if albedo is not None and albedo[number] is not None:
                     raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
                 check.finite_arrays({f"textures[{number}]": image})
@@ -176,7 +178,7 @@ class SeenSurfaces:
             samples = Node("reflectance", interpolate, *seen, items=items, beside=tuple(none))
             return Reflection(samples, vertex_albedo, *none)
         pyramids = materials.pyramids
-        if materials.textures is not self._materials.textures and not materials.assembly.scene.bounces:
+        if materials.textures is not self._materials.textures:
             pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
         if self._footprints[0] != materials.sizes:
             assembly = materials.assembly

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.textures.pyramid import level_matrices, level_sizes
 
 if TYPE_CHECKING:  # it is imported where a matrix is made
     from scipy.sparse import csr_matrix
@@ -34,12 +36,11 @@ def mean_over_texels(
     faces: np.ndarray,
     uvs: np.ndarray,
     uv_faces: np.ndarray,
-    levels: np.ndarray,
-    texel_count: int,
+    size: tuple[int, int],
 ) -> csr_matrix:
-    """The matrix of means over patches of a texture, from the texels of its mip levels.
+    """The matrix of means over patches of a texture, from its texels.
 
-    A piece of a patch takes the level whose texels are about as large as it, in its middle, bilinearly.
+    A piece of a patch takes the mip level whose texels are about as large as it, in its middle, bilinearly.
 
     Args:
         patches: Of a body.
@@ -47,18 +48,18 @@ def mean_over_texels(
         faces: Its faces, shape [face, 3].
         uvs: Texture coordinates, shape [uv, 2].
         uv_faces: Indices of them, shape [face, 3].
-        levels: First texel, width and height of each level, the finest first, shape [level, 3]: as in
-            :class:`warpshadow.stages.textures.pyramid.Textures`.
-        texel_count: Number of columns.
+        size: Height and width of the texture.
 
     Returns:
         Shape [patch, texel]; rows sum to 1, those of patches without an area are empty.
     """
     corners = patches.pieces.corners.astype(np.float64) @ uvs.astype(np.float64)[uv_faces[patches.pieces.faces]]
     along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    texels = np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2 * levels[0, 1] * levels[0, 2]
-    level = np.rint(np.log2(np.maximum(texels, 1)) / 2).astype(int)
-    first, width, height = levels[np.minimum(level, len(levels) - 1)].T
+    texels = np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2 * size[0] * size[1]
+    sizes = np.array(level_sizes(*size))
+    firsts = np.cumsum([0, *sizes.prod(axis=1)])
+    level = np.minimum(np.rint(np.log2(np.maximum(texels, 1)) / 2).astype(int), len(sizes) - 1)
+    first, (height, width) = firsts[level], sizes[level].T
     u, v = np.moveaxis(corners.mean(axis=1) % 1, -1, 0)
     x, y = u * width - 0.5, (1 - v) * height - 0.5
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -68,7 +69,9 @@ def mean_over_texels(
             columns.append(first + (top + down) % height * width + (left + right) % width)
             weights.append(below * beside)
     areas = _piece_areas(patches, positions, faces)
-    return _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), texel_count)
+    means = _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), firsts[-1])
+    parts = (means[:, start:end] for start, end in itertools.pairwise(firsts))
+    return sum(part @ matrix for part, matrix in zip(parts, level_matrices(*size), strict=True))
 
 
 def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

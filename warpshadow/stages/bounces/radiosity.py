@@ -56,8 +56,16 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp
     Differentiable: albedo, light.
     """
     check.shape("albedo", albedo.shape, ("batch", mean.shape[0]))
-    means = multiply(mean, light)
+    return reflect(albedo, multiply(mean, light))
+
+
+def reflect(albedo: wp.array, light: wp.array) -> wp.array:
+    """Radiosity of patches: albedo times mean light, vec3 of shape [batch, patch]; a batch of 1 serves every instance.
+
+    Differentiable: albedo, light.
+    """
+    check.shape("albedo", albedo.shape, ("batch", light.shape[1]))
     instances = common_batch({"albedo": albedo, "light": light})
-    radiosity = wp.empty((instances, mean.shape[0]), dtype=wp.vec3, device=light.device)
-    launch(_reflect, radiosity.shape, inputs=[albedo, means], outputs=[radiosity])
+    radiosity = wp.empty((instances, light.shape[1]), dtype=wp.vec3, device=light.device)
+    launch(_reflect, radiosity.shape, inputs=[albedo, light], outputs=[radiosity])
     return radiosity

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import instance_in
+from warpshadow.device.batch import accumulate, common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
 
@@ -50,6 +50,13 @@ class SparseMatrix:
         by_rows = csr_matrix(matrix)
         return SparseMatrix(by_rows.shape, _entries(by_rows, device), _entries(by_rows.T.tocsr(), device))
 
+    def on_host(self) -> csr_matrix:
+        """The matrix of SciPy."""
+        from scipy.sparse import csr_matrix
+
+        starts, columns, weights = (array.numpy() for array in self.rows)
+        return csr_matrix((weights, columns, starts), self.shape)
+
 
 def _entries(matrix: csr_matrix, device: wp.DeviceLike) -> Entries:
     matrix.eliminate_zeros()
@@ -69,43 +76,54 @@ def _multiply(
     columns: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float32),
     values: wp.array2d(dtype=wp.vec3),
-    adds: int,
+    plus: wp.array2d(dtype=wp.vec3),
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a row of an instance; it writes its product, or adds it."""
+    """A thread owns a row of an instance: its product, and what is added to that, which may be what it was."""
     batch, row = split_row(first_row + wp.tid(), starts.shape[0] - 1)
     total = wp.vec3()
-    if adds != 0:
-        total = products[batch, row]
+    if plus:
+        total = plus[batch, row]
     of_instance = instance_in(batch, values.shape[0])
     for entry in range(starts[row], starts[row + 1]):
         total += weights[entry] * values[of_instance, columns[entry]]
     products[batch, row] = total
 
 
-def multiply(matrix: SparseMatrix, values: wp.array) -> wp.array:
+def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = None) -> wp.array:
     """Multiply a sparse matrix with colors.
 
     Args:
         matrix: Of shape [row, column].
         values: vec3 of shape [batch, column].
+        plus: Added to the product, vec3 of shape [batch, row].
+            Either batch may be 1 and then serves every instance of the other.
 
     Returns:
         vec3 of shape [batch, row].
 
-    Differentiable: values. Exact, being linear. Not: the matrix.
+    Differentiable: values, plus. Exact, being linear. Not: the matrix.
     """
     check.shape("values", values.shape, ("batch", matrix.shape[1]))
+    if plus is not None:
+        check.shape("plus", plus.shape, ("batch", matrix.shape[0]))
+        count = common_batch({"values": values, "plus": plus})
+        values, plus = expand(values, count), expand(plus, count)
 
-    def times(entries: Entries, factors: wp.array, products: wp.array, *, adds: bool) -> None:
+    def times(entries: Entries, factors: wp.array, plus: wp.array | None, products: wp.array) -> None:
         cost = _ITEM_COST * (entries.columns.size / max(products.shape[1], 1) + 1)
-        inputs = [*entries, factors, int(adds)]
-        launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
+        launch(_multiply, products.size, inputs=[*entries, factors, plus], outputs=[products], cost=cost)
+
+    def adjoint(adj_products: wp.array) -> None:
+        if values.requires_grad:
+            times(matrix.columns, adj_products, values.grad, values.grad)
+        if plus is not None and plus.requires_grad:
+            accumulate(adj_products, plus.grad)
 
     return differentiable(
-        lambda products: times(matrix.rows, values, products, adds=False),
-        lambda adj_products: times(matrix.columns, adj_products, values.grad, adds=True),
+        lambda products: times(matrix.rows, values, plus, products),
+        adjoint,
         result=wp.empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
-        variables=[values],
+        variables=[values, plus],
     )

@@ -5,9 +5,12 @@ their centers at +0.5. Each mip level is half as large as the one before, and a 
 it covers.
 """
 
+from __future__ import annotations
+
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -17,6 +20,9 @@ from warpshadow.device.batch import accumulate, common_batch, rows
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import unrecorded
+
+if TYPE_CHECKING:  # it is imported where a matrix is made
+    from scipy.sparse import csr_matrix
 
 Sizes = tuple[tuple[int, int], ...]
 
@@ -38,7 +44,7 @@ class Textures:
     sizes: Sizes
 
 
-def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
+def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
     """Height and width of each level, rounded down, to a single texel."""
     sizes = [(height, width)]
     while max(sizes[-1]) > 1:
@@ -47,15 +53,43 @@ def _level_sizes(height: int, width: int) -> list[tuple[int, int]]:
     return sizes
 
 
+def level_matrices(height: int, width: int) -> Iterator[csr_matrix]:
+    """The matrices that take the texels of an image to those of each level, [texel of the level, texel], one by one."""
+    from scipy.sparse import identity, kron
+
+    down, across = identity(height, format="csr"), identity(width, format="csr")
+    yield kron(down, across, format="csr")
+    for rows_left, columns_left in level_sizes(height, width)[1:]:
+        down = _halving(down.shape[0], rows_left) @ down
+        across = _halving(across.shape[0], columns_left) @ across
+        yield kron(down, across, format="csr")
+
+
+def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
+    """What part of each coarse texel the fine ones along a side are: :func:`_shares`."""
+    from scipy.sparse import csr_matrix
+
+    coarse = np.arange(coarse_count)
+    if fine_count == 1:
+        shares = np.ones((1, 1))
+    elif fine_count == 2 * coarse_count:
+        shares = np.full((coarse_count, 2), 0.5)
+    else:
+        shares = np.stack([coarse_count - coarse, np.full(coarse_count, coarse_count), coarse + 1], axis=1) / fine_count
+    columns = 2 * coarse[:, None] + np.arange(shares.shape[1])
+    starts = np.arange(coarse_count + 1) * shares.shape[1]
+    return csr_matrix((shares.ravel(), columns.ravel(), starts), (coarse_count, fine_count))
+
+
 class _Layout:
     """Where the levels of textures lie in an array of texels."""
 
     def __init__(self, sizes: Sizes, device: str):
-        level_sizes = [_level_sizes(*size) for size in sizes]
-        self.level_counts = [len(part) for part in level_sizes]
+        of_textures = [level_sizes(*size) for size in sizes]
+        self.level_counts = [len(part) for part in of_textures]
         self.levels = np.zeros((len(sizes), max(self.level_counts), 3), np.int32)
         self.texel_count = 0
-        for texture, part in enumerate(level_sizes):
+        for texture, part in enumerate(of_textures):
             for level, (height, width) in enumerate(part):
                 self.levels[texture, level] = self.texel_count, width, height
                 self.texel_count += width * height

@@ -1,0 +1,86 @@
+"""Colored transfer: what receivers get of free light once it has bounced, by a matrix for each color.
+
+    I_x = Σ_k T_xk ∘ L_k      for red, green and blue
+
+since bodies reflect colors, T has three of them where transfer vectors of direct light have one number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import split_row
+
+_COEFFICIENT_COST = 1.0
+"""Nanoseconds that a coefficient of a receiver takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColoredTransfer:
+    """Transfer of each color, and its transpose for the adjoint, which so needs no sums across threads.
+
+    Args:
+        rows: vec3 of shape [receiver, coefficient].
+        columns: vec3 of shape [coefficient, receiver].
+    """
+
+    rows: wp.array
+    columns: wp.array
+
+    @staticmethod
+    def of(lit: np.ndarray, *, device: wp.DeviceLike) -> ColoredTransfer:
+        """That of receivers that are lit by each coefficient alone, float32 of shape [coefficient, receiver, 3]."""
+        columns = wp.array(lit, dtype=wp.vec3, device=device)
+        return ColoredTransfer(wp.array(lit.swapaxes(0, 1), dtype=wp.vec3, device=device), columns)
+
+
+@wp.kernel(enable_backward=False)
+def _multiply(
+    first_row: int,
+    worker: int,
+    # in
+    matrix: wp.array2d(dtype=wp.vec3),
+    values: wp.array2d(dtype=wp.vec3),
+    plus: wp.array2d(dtype=wp.vec3),
+    # out
+    products: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a row of an instance: its product, and what is added to that, which may be what it was."""
+    batch, row = split_row(first_row + wp.tid(), matrix.shape[0])
+    total = wp.vec3()
+    if plus:
+        total = plus[batch, row]
+    for column in range(matrix.shape[1]):
+        total += wp.cw_mul(matrix[row, column], values[batch, column])
+    products[batch, row] = total
+
+
+def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
+    """Light receivers by coefficients.
+
+    Args:
+        transfer: Of the receivers.
+        light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
+
+    Returns:
+        vec3 of shape [batch, receiver].
+
+    Differentiable: light. Exact, being linear. Not: transfer.
+    """
+    check.shape("light", light.shape, ("batch", transfer.columns.shape[0]))
+
+    def times(matrix: wp.array, values: wp.array, plus: wp.array | None, products: wp.array) -> None:
+        cost = _COEFFICIENT_COST * (matrix.shape[1] + 1)
+        launch(_multiply, products.size, inputs=[matrix, values, plus], outputs=[products], cost=cost)
+
+    return differentiable(
+        lambda lit: times(transfer.rows, light, None, lit),
+        lambda adj_lit: times(transfer.columns, adj_lit, light.grad, light.grad),
+        result=wp.empty((len(light), transfer.rows.shape[0]), dtype=wp.vec3, device=light.device),
+        variables=[light],
+    )
