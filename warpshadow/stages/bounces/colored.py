@@ -16,8 +16,8 @@ from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
 
-_COEFFICIENT_COST = 1.0
-"""Nanoseconds that a coefficient of a receiver takes."""
+_COEFFICIENT_COST, _ROW_COST = 1.0, 8.0
+"""Nanoseconds that a coefficient of a receiver takes, and a receiver beside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +39,46 @@ class ColoredTransfer:
         return ColoredTransfer(wp.array(lit.swapaxes(0, 1), dtype=wp.vec3, device=device), columns)
 
 
+Quad = wp.types.vector(length=12, dtype=wp.float32)
+"""Four colors after one another, which take a third of the time of four by themselves."""
+
+
+def _as_quads(colors: wp.array) -> wp.array:
+    """View vec3 of shape [row, column] as rows of whole quads; what is left over is not in it."""
+    rows, columns = colors.shape
+    shape, strides = (rows, columns // 4), (colors.strides[0], 4 * colors.strides[1])
+    quads = wp.array(ptr=colors.ptr, dtype=Quad, shape=shape, strides=strides, device=colors.device)
+    quads.viewed = colors  # the memory stays while the view does
+    return quads
+
+
 @wp.kernel(enable_backward=False)
 def _multiply(
     first_row: int,
     worker: int,
     # in
     matrix: wp.array2d(dtype=wp.vec3),
+    matrix_quads: wp.array2d(dtype=Quad),
     values: wp.array2d(dtype=wp.vec3),
+    value_quads: wp.array2d(dtype=Quad),
     plus: wp.array2d(dtype=wp.vec3),
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a row of an instance: its product, and what is added to that, which may be what it was."""
     batch, row = split_row(first_row + wp.tid(), matrix.shape[0])
-    total = wp.vec3()
-    if plus:
-        total = plus[batch, row]
-    for column in range(matrix.shape[1]):
+    quads = Quad(0.0)
+    for quad in range(matrix_quads.shape[1]):
+        quads += wp.cw_mul(matrix_quads[row, quad], value_quads[batch, quad])
+    total = wp.vec3(
+        (quads[0] + quads[3]) + (quads[6] + quads[9]),
+        (quads[1] + quads[4]) + (quads[7] + quads[10]),
+        (quads[2] + quads[5]) + (quads[8] + quads[11]),
+    )
+    for column in range(4 * matrix_quads.shape[1], matrix.shape[1]):
         total += wp.cw_mul(matrix[row, column], values[batch, column])
+    if plus:
+        total += plus[batch, row]
     products[batch, row] = total
 
 
@@ -75,8 +97,9 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     check.shape("light", light.shape, ("batch", transfer.columns.shape[0]))
 
     def times(matrix: wp.array, values: wp.array, plus: wp.array | None, products: wp.array) -> None:
-        cost = _COEFFICIENT_COST * (matrix.shape[1] + 1)
-        launch(_multiply, products.size, inputs=[matrix, values, plus], outputs=[products], cost=cost)
+        cost = _COEFFICIENT_COST * matrix.shape[1] + _ROW_COST
+        inputs = [matrix, _as_quads(matrix), values, _as_quads(values), plus]
+        launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
 
     return differentiable(
         lambda lit: times(transfer.rows, light, None, lit),

@@ -9,15 +9,18 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import accumulate, common_batch, expand, instance_in
+from warpshadow.device.batch import accumulate, common_batch, expand
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix, sparray, spmatrix
 
-_ITEM_COST = 2.0
-"""Nanoseconds that an entry takes."""
+_ENTRY_COST, _ROW_COST = 2.5, 4.0
+"""Nanoseconds that an entry takes, and a row beside."""
+
+_RUN = 32
+"""Rows that a thread owns on a CPU, where starting one takes longer than a row of a few entries."""
 
 
 class Entries(NamedTuple):
@@ -77,18 +80,21 @@ def _multiply(
     weights: wp.array(dtype=wp.float32),
     values: wp.array2d(dtype=wp.vec3),
     plus: wp.array2d(dtype=wp.vec3),
+    run: int,
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a row of an instance: its product, and what is added to that, which may be what it was."""
-    batch, row = split_row(first_row + wp.tid(), starts.shape[0] - 1)
-    total = wp.vec3()
-    if plus:
-        total = plus[batch, row]
-    of_instance = instance_in(batch, values.shape[0])
-    for entry in range(starts[row], starts[row + 1]):
-        total += weights[entry] * values[of_instance, columns[entry]]
-    products[batch, row] = total
+    """A thread owns a run of rows of an instance: their products, and what is added, which may be what they were."""
+    row_count = starts.shape[0] - 1
+    batch, thread = split_row(first_row + wp.tid(), (row_count + run - 1) // run)
+    of_instance = values[batch]
+    for row in range(thread * run, wp.min((thread + 1) * run, row_count)):
+        total = wp.vec3()
+        if plus:
+            total = plus[batch, row]
+        for entry in range(starts[row], starts[row + 1]):
+            total += weights[entry] * of_instance[columns[entry]]
+        products[batch, row] = total
 
 
 def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = None) -> wp.array:
@@ -112,8 +118,11 @@ def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = 
         values, plus = expand(values, count), expand(plus, count)
 
     def times(entries: Entries, factors: wp.array, plus: wp.array | None, products: wp.array) -> None:
-        cost = _ITEM_COST * (entries.columns.size / max(products.shape[1], 1) + 1)
-        launch(_multiply, products.size, inputs=[*entries, factors, plus], outputs=[products], cost=cost)
+        batch_count, row_count = products.shape
+        run = 1 if products.device.is_cuda else _RUN
+        cost = run * (_ENTRY_COST * entries.columns.size / max(row_count, 1) + _ROW_COST)
+        inputs = [*entries, factors, plus, run]
+        launch(_multiply, batch_count * -(-row_count // run), inputs=inputs, outputs=[products], cost=cost)
 
     def adjoint(adj_products: wp.array) -> None:
         if values.requires_grad:
