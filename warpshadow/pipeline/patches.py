@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import concatenate, rows
+from warpshadow.device.batch import rows
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Node
@@ -85,34 +85,33 @@ class ScenePatches:
         counts = [self.of_body(number).count for number in bodies]
 
         def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:
-            parts = []
-            for number in bodies:
+            given = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
+            total = None
+            for number in sorted(bodies, key=lambda n: given[n].requires_grad):  # so only what varies has an adjoint
                 image = images[number]
-                if image is not None:
-                    parts.append(multiply(self._mean_of_texels(number, image.shape[1:]), rows(image)))
-                elif colors[number].shape[1] == 1:
-                    parts.append(colors[number])
-                else:
-                    parts.append(multiply(self._mean_of_vertices(number), colors[number]))
-            return concatenate(parts, counts)
+                mean = self._mean(number, bodies, given[number].shape[1], None if image is None else image.shape[1:])
+                total = multiply(mean, given[number], plus=total)
+            return total
 
         return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
 
-    def _mean_of_vertices(self, number: int) -> SparseMatrix:
-        key = (number,)
+    def _mean(self, number: int, bodies: Sequence[int], color_count: int, size: tuple[int, int] | None) -> SparseMatrix:
+        """What patches of some bodies take of the colors of one, [patch, color]; of its texels if it has a size."""
+        key = number, tuple(bodies), color_count, size
         if key not in self._means:
-            mesh = self._assembly.scene.bodies[number].mesh
-            matrix = mean_over_vertices(self.of_body(number), mesh.positions, mesh.surface.faces)
-            self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
-        return self._means[key]
+            from scipy.sparse import csr_matrix, vstack
 
-    def _mean_of_texels(self, number: int, size: tuple[int, int]) -> SparseMatrix:
-        key = (number, size)
-        if key not in self._means:
-            mesh = self._assembly.scene.bodies[number].mesh
-            assert mesh.uvs is not None and mesh.surface.uv_faces is not None
-            given = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
-            matrix = mean_over_texels(self.of_body(number), *given, size)
+            mesh, patches = self._assembly.scene.bodies[number].mesh, self.of_body(number)
+            shape = mesh.positions, mesh.surface.faces
+            if size is not None:
+                assert mesh.uvs is not None and mesh.surface.uv_faces is not None
+                own = mean_over_texels(patches, *shape, mesh.uvs, mesh.surface.uv_faces, size)
+            elif color_count == 1:
+                own = csr_matrix(np.ones((patches.count, 1)))
+            else:
+                own = mean_over_vertices(patches, *shape)
+            others = {other: csr_matrix((self.of_body(other).count, color_count)) for other in bodies}
+            matrix = vstack([*(others | {number: own}).values()])
             self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
         return self._means[key]
 
