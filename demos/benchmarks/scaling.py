@@ -37,7 +37,6 @@ import warp as wp
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import bunny_scene, on_ground, shipped_mesh
-from warpshadow.stages import vertex_normals
 from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import median_times
 
@@ -90,22 +89,24 @@ def bunny_with(spheres: ws.Spheres, size: int = 256) -> ws.Scene:
 def shading(scene: ws.Scene) -> Timed:
     """Visibility and shading of all vertices, by themselves and with all gradients."""
     renderer = ws.Renderer(scene)
-    order = renderer.assembly.vertex_order  # in which renderers light them
-    own = renderer.geometry()
-    normals = vertex_normals(own.positions, renderer.assembly.faces)
-    points, normals = (wp.array(array.numpy()[:, order], dtype=wp.vec3) for array in (own.positions, normals))
-    free = [wp.clone(array, requires_grad=True) for array in (points, normals, own.centers, own.radii)]
+    own, assembly = renderer.geometry(), renderer.assembly
+    vertices, places = np.unique(assembly.faces.numpy(), return_index=True)
+    order = assembly.vertex_order[np.isin(assembly.vertex_order, vertices)]  # in which renderers light them, …
+    order = order[np.argsort(assembly.body_of_vertex[order], kind="stable")]  # … a body after another
+    places = places[np.searchsorted(vertices, order)]
+    given = places // 3, np.eye(3, dtype=np.float32)[places % 3]
+    free = [wp.clone(array, requires_grad=True) for array in (own.positions, own.centers, own.radii)]
 
     def forward_and_backward() -> None:
-        geometry = ws.Geometry(own.positions, *free[2:])
         with wp.Tape() as tape:
-            result = renderer.shade(view=renderer.at_points(*free[:2], geometry))
+            geometry = ws.Geometry(*free, rotations=own.rotations)
+            result = renderer.shade(view=renderer.on_faces(*given, geometry))
         result.grad.fill_(1.0)
         tape.backward()
         tape.zero()
 
     return {
-        "visibility and shading": lambda: renderer.shade(view=renderer.at_points(points, normals)),
+        "visibility and shading": lambda: renderer.shade(view=renderer.on_faces(*given)),
         "… and back": forward_and_backward,
     }
 

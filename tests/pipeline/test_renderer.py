@@ -395,6 +395,19 @@ def test_albedo_of_vertices_is_interpolated(device):
     assert np.abs(points - expected).max() < FLOAT32
 
 
+@pytest.mark.parametrize("method", ["directional", "log-sh"])
+def test_points_on_faces_are_lit_where_a_geometry_has_them(device, method):
+    """As those of a scene whose ball has that place."""
+    moved = ws.Renderer(scene_of(method, ball(translation=(0.3, 1.2, 0)), ground(8)), device=device)
+    renderer = ws.Renderer(scene_of(method, ball(), ground(8)), device=device)
+    sides = np.arange(0, len(renderer.assembly.body_of_face), 7)
+    places = sides, np.full((len(sides), 3), 1 / 3, np.float32)
+    expected = moved.shade(view=moved.on_faces(*places)).numpy()
+    found = renderer.shade(view=renderer.on_faces(*places, moved.geometry())).numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert not np.allclose(renderer.shade(view=renderer.on_faces(*places)).numpy(), expected, atol=1e-2)
+
+
 def test_two_bodies_are_the_same_as_one_mesh_of_both(device):
     first, second = ball(), ball(translation=(1.2, 0.6, 0.5), scale=0.5)
     meshes = [body.world_mesh() for body in (first, second)]

@@ -8,6 +8,7 @@ import pytest
 from test_point_sample import make_scene
 
 import warpshadow as ws
+from warpshadow.pipeline import directional
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.tuning import timing
@@ -81,3 +82,19 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
         timing, "median_times", lambda functions, runs, **_: [(function(), clock[-1])[1] for function in functions]
     )
     assert image_times([scene, unshadowed]) == pytest.approx([1000 + 3 * count, 1000])
+
+
+def test_bodies_shadows_on_themselves_are_timed(monkeypatch):
+    gather_own, bodies = directional.gather_own, []
+    monkeypatch.setattr(directional, "gather_own", lambda *given: bodies.append(1) or gather_own(*given))
+    monkeypatch.setattr(
+        timing, "median_times", lambda functions, runs, **_: [function() and 1.0 for function in functions]
+    )
+    scene = make_scene()
+    image_times([scene])
+    assert len(bodies) == 1
+    receivers = dataclasses.replace(
+        scene, bodies=[dataclasses.replace(body, receivers="pixel") for body in scene.bodies]
+    )
+    image_times([receivers])
+    assert len(bodies) == 2

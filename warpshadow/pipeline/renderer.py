@@ -341,21 +341,27 @@ class Renderer:
         node = Node("", lambda given: given, receivers)
         return LitPoints(self._method, self._materials, vertices, spheres, node, self._call())
 
-    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray) -> LitPoints:
-        """Points on faces of the scene's bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
+    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
+        """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
 
         Args:
             sides: Face of each, after the last of which their backs are numbered, int of shape [receiver]; those of a
                 body after one another.
             barycentrics: Where on it, shape [receiver, 3].
+            geometry: Where the bodies are, by default where the scene has them.
+
+        Differentiable: geometry.
         """
-        traced, assembly, vertices = self._traced(None), self.assembly, self._vertices
+        traced, assembly, vertices, spheres = self._traced(geometry), self.assembly, self._vertices, self._spheres
+        if geometry is not None:
+            vertices = Source("vertices", geometry.positions)
+            spheres = Source("spheres", (geometry.centers, geometry.radii))
         apart = self._method.apart(traced)
         bodies = None if apart is None else apart[assembly.body_of_face[sides % len(assembly.body_of_face)]]
         normals = Node("", vertex_normals, vertices, assembly.faces)
         given = assembly.faces, sides, barycentrics, bodies
         node = Node("", receivers_on_faces, vertices, normals, *given)
-        points = self._method, self._materials, vertices, self._spheres, node, self._call()
+        points = self._method, self._materials, vertices, spheres, node, self._call()
         return LitPoints(*points, normals=normals, traced=traced)
 
     @functools.cached_property

@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import AUTO, Scene, Visibility
 from warpshadow.stages.normals import vertex_normals
 
@@ -75,18 +76,12 @@ class PointSample:
         chosen = _spread(face_ids >= 0, count, seed)
         if not len(chosen):
             raise ValueError("scene: the camera sees no body, expected one in the image")
-        face_ids = face_ids.ravel()
-        faces = stage.assembly.faces
-        self._positions = stage.geometry().positions.numpy()[0]
-        self._normals = vertex_normals(stage.geometry().positions, faces).numpy()[0]
-        self._vertices, self._sides = faces.numpy()[face_ids[chosen]], face_ids[chosen]
-        if self._view.fragments.sides is not None:  # the backs of vertices are numbered after them
-            self._sides = self._view.fragments.sides.numpy().ravel()[chosen]
-            self._vertices = self._vertices + len(self._positions) * (self._sides != face_ids[chosen])[:, None]
-            self._positions = np.tile(self._positions, (2, 1))
-            self._normals = np.concatenate([self._normals, -self._normals])
-        self._weights = self._view.fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
-        self.bodies = stage.assembly.body_of_face[face_ids[chosen]]
+        positions = stage.geometry().positions.numpy()[0]
+        normals = vertex_normals(stage.geometry().positions, stage.assembly.faces).numpy()[0]
+        # the backs of vertices are numbered after them
+        self._positions, self._normals = np.tile(positions, (2, 1)), np.concatenate([normals, -normals])
+        self._sides, self._vertices, self._weights = seen_on_faces(self._view, chosen)
+        self.bodies = stage.assembly.body_of_face[face_ids.ravel()[chosen]]
         self._scene = scene
         self._chosen = [body.receivers for body in stage.scene.bodies]
         if not self.truth.any():
@@ -141,20 +136,14 @@ class PointSample:
             of_bodies: "vertex" or "pixel" for each body: whether its points are interpolated or receivers themselves.
         """
         is_own = np.array([receivers == "pixel" for receivers in of_bodies])[self.bodies]
-        vertices, places, corners = np.unique(self._vertices[~is_own], return_index=True, return_inverse=True)
-        # a vertex lies on the face of a point of which it is a corner
-        at_vertices = np.flatnonzero(~is_own)[places // 3]
-        of_receivers = np.concatenate([at_vertices, np.flatnonzero(is_own)])
-        weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], self._weights[is_own]])
+        of_receivers, weights, corners = places_of_receivers(self._vertices, self._weights, is_own)
         points, normals = (
             np.einsum("pk,pkc->pc", weights, values[self._vertices[of_receivers]])
             for values in (self._positions, self._normals)
         )
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        receivers = np.repeat(len(vertices) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
-        receivers[~is_own] = corners.reshape(-1, 3)
         shares = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
-        return PointReceivers(points, normals, self._sides[of_receivers], weights, receivers, shares)
+        return PointReceivers(points, normals, self._sides[of_receivers], weights, corners, shares)
 
     def error(self, shading: np.ndarray) -> float:
         """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""
@@ -165,6 +154,47 @@ class PointSample:
         squares = ((self.interpolated_truth - self.truth) ** 2).sum(axis=1)
         sums = np.bincount(self.bodies, squares, minlength=len(self._scene.bodies))
         return np.sqrt(sums) / np.linalg.norm(self.truth)
+
+
+def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where samples of the first image of a view lie on faces.
+
+    Args:
+        view: The view.
+        chosen: Flat indices of samples that see a face, shape [point].
+
+    Returns:
+        Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered
+        likewise, [point, 3]; and barycentric coordinates, [point, 3].
+    """
+    fragments, assembly = view.fragments, view.assembly
+    face_ids = fragments.face_ids.numpy()[0].ravel()[chosen]
+    sides = face_ids if fragments.sides is None else fragments.sides.numpy()[0].ravel()[chosen]
+    vertices = assembly.faces.numpy()[face_ids] + assembly.first_vertex[-1] * (sides != face_ids)[:, None]
+    return sides, vertices, fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
+
+
+def places_of_receivers(
+    vertices: np.ndarray, barycentrics: np.ndarray, is_own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the receivers of points: vertices of the faces that they lie on, or the points themselves.
+
+    Args:
+        vertices, barycentrics: Of the points, from :func:`seen_on_faces`.
+        is_own: Points that are receivers themselves, bool of shape [point].
+
+    Returns:
+        A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
+        of each point, shape [point, 3].
+    """
+    own = np.flatnonzero(is_own)
+    unique, places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
+    # a vertex lies on the face of a point of which it is a corner
+    points = np.concatenate([np.flatnonzero(~is_own)[places // 3], own])
+    weights = np.concatenate([np.eye(3, dtype=np.float32)[places % 3], barycentrics[own]])
+    receivers = np.repeat(len(unique) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
+    receivers[~is_own] = corners.reshape(-1, 3)
+    return points, weights, receivers
 
 
 def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import warp as wp
 
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene
+from warpshadow.tuning.point_sample import places_of_receivers, seen_on_faces
 
 TIMED_RECEIVERS = 2048
 """Receivers on which visibility and shading are timed, in neighborhoods, which are culled together."""
@@ -89,18 +90,23 @@ class _Stage:
         self._renderer = Renderer(self.scene, device=device)
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
-        points, normals, *_ = self._view.receivers
-        chosen = _neighborhoods(points.numpy()[0])
-        self._sample = [
-            wp.array(array.numpy()[:, chosen], dtype=wp.vec3, device=array.device) for array in (points, normals)
-        ]
-        self.extrapolation = points.shape[1] / len(chosen)
+        seen = np.flatnonzero(self._view.fragments.face_ids.numpy()[0] >= 0)
+        sides, vertices, barycentrics = seen_on_faces(self._view, seen[:: scene.supersampling**2])  # one a pixel
+        assembly = self._renderer.assembly
+        bodies = assembly.body_of_face[sides % len(assembly.body_of_face)]
+        samples_receive = np.array([body.receivers == "pixel" for body in self._renderer.scene.bodies])
+        at, weights, _ = places_of_receivers(vertices, barycentrics, samples_receive[bodies])
+        corners = self._renderer.geometry().positions.numpy()[0][vertices[at] % assembly.first_vertex[-1]]
+        chosen = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
+        chosen = chosen[np.argsort(bodies[at[chosen]], kind="stable")]  # as on_faces wants them
+        self._sample = sides[at[chosen]], weights[chosen]
+        self.extrapolation = self._view.receivers.points.shape[1] / len(chosen)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""
         glimpse = replace(scene.camera, width=1, height=1)  # no image is drawn
         renderer = Renderer(scene, cameras=[glimpse], device=self._renderer.device)
-        return lambda: renderer.shade(view=renderer.at_points(*self._sample))
+        return lambda: renderer.shade(view=renderer.on_faces(*self._sample))
 
 
 def _neighborhoods(points: np.ndarray) -> np.ndarray:
