@@ -264,6 +264,28 @@ def test_a_wrong_value_is_refused_with_its_table_its_key_and_what_is_accepted(lo
         refused(load, text, where, f" {key}", "got", "expected")
 
 
+@pytest.mark.parametrize(
+    ("table", "key", "others"),
+    [
+        ("[visibility]", "bounces", "[light]"),
+        ("[camera]", "bounces", "[light]"),
+        ("[visibility]", "receivers", "[[body]]"),
+        ("[visibility]", "blockers", "[[body]]"),
+        ("[visibility]", "supersampling", "[camera]"),
+        ("[light]", "size", "[camera] or [[body]]"),
+        ("the scene", "bounces", "[light]"),
+        ("the scene", "self_shadows", "[visibility] or [[body]]"),
+    ],
+)
+def test_a_key_of_another_table_is_refused_with_the_table_that_has_it(load, table, key, others):
+    line = f"{key} = 2\n"
+    if table == "the scene":
+        text = line + MINIMAL
+    else:
+        text = MINIMAL.replace(f"{table}\n", f"{table}\n{line}") if table in MINIMAL else MINIMAL + f"{table}\n{line}"
+    refused(load, text, table, f"got {key}, expected it in {others}")
+
+
 @pytest.mark.parametrize("value", ["-1", "17"])
 def test_too_many_bounces_are_refused(load, value):
     refused(load, MINIMAL.replace("[light]", f"[light]\nbounces = {value}"), f"bounces: got {value}, expected a whole")

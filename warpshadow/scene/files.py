@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.scene import COLORS, SCENE, Body, Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.scene import COLORS, READ_BY, SCENE, Body, Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
 
@@ -27,8 +27,17 @@ _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
+_LIGHT_KEYS = ("envmap", "sh", "rotation", "scale", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {"plane": plane, "icosphere": icosphere}
+_SHAPE_KEYS = {name: tuple(inspect.signature(make).parameters) for name, make in _PRIMITIVES.items()}
+_KEYS = {
+    "[camera]": (*_CAMERA_KEYS, *_FRAMING_KEYS, "supersampling"),
+    "[light]": _LIGHT_KEYS,
+    "[visibility]": ("method", *READ_BY),
+    "[[body]]": ("mesh", "primitive", *(key for keys in _SHAPE_KEYS.values() for key in keys), *_PLACE_KEYS),
+}
+"""Keys that each table of a scene file may have."""
 
 
 class SceneError(ValueError):
@@ -55,10 +64,7 @@ def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object)
 
 def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> Scene:
     with check.located("the scene"):
-        check.known_keys("table", scene, ("camera", "light", "visibility", "body"))
-        for table in ("visibility", "camera"):
-            if isinstance(scene.get(table), dict) and "bounces" in scene[table]:
-                raise ValueError(f"[{table}]: got bounces, expected it in [light]")
+        _check_keys("", scene, ("camera", "light", "visibility", "body"), what="table")
     for name in ("camera", "light", "body"):
         if name not in scene:
             raise ValueError(f"[{name}] is missing; a scene has [camera], [light] and at least one [[body]]")
@@ -73,7 +79,7 @@ def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> 
             check_bounces(bounces)
     with check.located("[camera]"):
         toml_tables.check_table(scene["camera"])
-        check.known_keys("key", scene["camera"], (*_CAMERA_KEYS, *_FRAMING_KEYS, "supersampling"))
+        _check_keys("[camera]", scene["camera"])
         placed = dict(scene["camera"])
         supersampling = placed.pop("supersampling", Scene.supersampling)
         check_supersampling(supersampling)
@@ -81,6 +87,7 @@ def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> 
     with check.located("[visibility]"):
         given = scene.get("visibility", {})
         toml_tables.check_table(given)
+        _check_keys("[visibility]", given)
         visibility = Visibility.of(given | settings)  # a file may hold settings for what --method chooses
     with check.located("the scene"):
         return Scene(tuple(bodies), light, camera, visibility, supersampling, bounces)
@@ -93,6 +100,16 @@ def _framing(table: Table, bodies: Sequence[Body]) -> Camera:
     if placed is not None:
         raise ValueError(f"{placed}: got it beside framing, which finds the place of the camera; expected one of them")
     return toml_tables.make(functools.partial(Camera.framing, bodies), table)
+
+
+def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str = "key") -> None:
+    """Raise ValueError for a key that is not known in a table; where others have it the message names them."""
+    known = tuple(known) or _KEYS[name]
+    for key in table:
+        others = [other for other, keys in _KEYS.items() if key in keys]
+        if key not in known and others and name not in others:
+            raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
+    check.known_keys(what, table, known)
 
 
 def parse_camera(table: Table) -> Camera:
@@ -115,7 +132,7 @@ def parse_camera(table: Table) -> Camera:
 
 def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     toml_tables.check_table(table)
-    check.known_keys("key", table, ("envmap", "sh", "rotation", "scale", "bounces"))
+    _check_keys("[light]", table)
     if ("envmap" in table) == ("sh" in table):
         raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
     rotation = check.number("rotation", table.get("rotation", 0.0))
@@ -144,12 +161,11 @@ def _body(table: Table, folder: Path) -> Body:
             raise ValueError(f"expected either {one} or {other}")
     if "primitive" in table:
         check.choice("primitive", table["primitive"], _PRIMITIVES)
-        make = _PRIMITIVES[table["primitive"]]
-        shape_keys = tuple(inspect.signature(make).parameters)
-        check.known_keys("key", table, ("primitive", *shape_keys, *_PLACE_KEYS))
+        make, shape_keys = _PRIMITIVES[table["primitive"]], _SHAPE_KEYS[table["primitive"]]
+        _check_keys("[[body]]", table, ("primitive", *shape_keys, *_PLACE_KEYS))
         mesh: object = make(**{key: table[key] for key in shape_keys if key in table})
     else:
-        check.known_keys("key", table, ("mesh", *_PLACE_KEYS))
+        _check_keys("[[body]]", table, ("mesh", *_PLACE_KEYS))
         mesh = toml_tables.file(table, "mesh", folder)
     place: Table = {"mesh": mesh} | {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
