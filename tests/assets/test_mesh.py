@@ -190,7 +190,7 @@ def test_the_bunny_keeps_every_vertex_and_warns_once_of_the_unused(shared_data):
 
 def test_an_obj_may_have_polygons_negative_indices_normals_comments_and_continued_lines(tmp_path):
     text = (
-        "# a comment\r\no thing\nv 0 0 0 1 0 0\nv 1 0 0\nv 1 1 0\nvn 0 0 1\nvt 0.25\nvt 1 0.5 0\n"
+        "# a comment\r\no thing\nv 0 0 0 1\nv 1 0 0\nv 1 1 0\nvn 0 0 1\nvt 0.25\nvt 1 0.5 0\n"
         "v 0 1 0\nf 1/1/1 2/2/1 \\\n 3/2/1 -1/-2/-1 # a quad\nf 1/1 2/1 3/1\nl 1 2\n"
     )
     with pytest.warns(UserWarning, match=": 1 duplicate faces$"):
@@ -265,10 +265,10 @@ def cylinder(normals=None):
     return vertices, faces, uvs
 
 
-def export(folder, name, *, uvs=None, normals=None, vertices, faces):
+def export(folder, name, *, uvs=None, normals=None, vertices, faces, colors=None):
     import trimesh
 
-    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
     if uvs is not None:
         mesh.visual = trimesh.visual.TextureVisuals(uv=uvs, material=trimesh.visual.material.PBRMaterial())
     options = (
@@ -305,6 +305,24 @@ def test_without_uvs_nothing_is_welded(tmp_path, name):
     mesh = load_mesh(export(tmp_path, name, vertices=vertices, faces=faces))
     np.testing.assert_array_equal(mesh.faces, faces)
     assert mesh.uvs is None and mesh.vertex_count == 10
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.glb"])
+def test_colors_of_vertices_are_dropped_with_a_warning(tmp_path, name):
+    vertices, faces, _ = cylinder()
+    colors = np.full((len(vertices), 4), 200, np.uint8)
+    colors[0] = 0
+    with pytest.warns(UserWarning, match=r"a\..*: colors of vertices dropped, which Body\(albedo=…\) takes"):
+        load_mesh(export(tmp_path, name, vertices=vertices, faces=faces, colors=colors))
+
+
+def test_colors_of_vertices_in_an_obj_are_dropped_with_a_warning_and_weights_are_not_colors(tmp_path):
+    lines = ("v 0 0 0{0}", "v 1 0 0{0}", "v 0 1 0{0}", "f 1 2 3")
+    with pytest.warns(UserWarning, match="colors of vertices dropped"):
+        load_mesh(write(tmp_path, "a.obj", "\n".join(lines).format(" 1 0.5 0")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_mesh(write(tmp_path, "b.obj", "\n".join(lines).format(" 1")))
 
 
 def test_an_stl_stays_flat_shaded(tmp_path):

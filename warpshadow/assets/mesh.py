@@ -188,7 +188,10 @@ def _indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarr
 
 
 class MeshPart(NamedTuple):
-    """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates."""
+    """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
+
+    ``has_colors`` says that there are colors of vertices, which are not read.
+    """
 
     positions: np.ndarray
     faces: np.ndarray
@@ -196,6 +199,7 @@ class MeshPart(NamedTuple):
     uv_faces: np.ndarray | None = None
     welded: int = 0
     remark: str = ""
+    has_colors: bool = False
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

@@ -22,7 +22,7 @@ def load_mesh(path: AnyPath) -> Mesh:
     to the first of the vertices that are duplicated only for their uvs (same position, and same normal where
     the file stores normals), so that a seam does not break the shading; without uvs they stay as they are.
     A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
-    uvs are kept only when every face has them.
+    uvs are kept only when every face has them. Colors, materials and textures are not read: they are a body's.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
@@ -36,7 +36,8 @@ def load_mesh(path: AnyPath) -> Mesh:
         ImportError: for USD without the package usd-core.
 
     Warns:
-        Once, with the counts of degenerate faces, duplicate faces, unreferenced vertices, and dropped uvs.
+        Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and what was dropped: uvs
+        that some faces lack, and the colors of vertices in OBJ, PLY and glTF files.
     """
     path = check.path("path", path)
     reader = _READERS.get(path.suffix.lower())
@@ -76,6 +77,8 @@ def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, list[str]]:
     remarks += [part.remark for part in parts if part.remark]
     if 0 < len(textured) < len(parts):
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
+    if any(part.has_colors for part in parts):
+        remarks.append("colors of vertices dropped, which Body(albedo=…) takes, linear, [vertex, 3]")
     return mesh, remarks
 
 
@@ -107,13 +110,14 @@ def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
 
 def _read_obj(path: Path) -> list[MeshPart]:
     """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
-    positions, uvs, corners, uv_corners, corner_counts = [], [], [], [], []
+    positions, uvs, corners, uv_corners, corner_counts, has_colors = [], [], [], [], [], False
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
         try:
             match line.partition("#")[0].split():
-                case ["v", x, y, z, *_]:
+                case ["v", x, y, z, *rest]:
                     positions.append((float(x), float(y), float(z)))
+                    has_colors |= len(rest) >= 3  # one number is a weight
                 case ["vt", u, *rest]:
                     uvs.append((float(u), float(rest[0]) if rest else 0.0))
                 case ["f", *tokens]:
@@ -128,7 +132,7 @@ def _read_obj(path: Path) -> list[MeshPart]:
         except ValueError as error:
             raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
     faces = _fan(np.array(corner_counts, dtype=np.int64))
-    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
+    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces], has_colors=has_colors)
     if not uv_corners:
         return [part]
     if len(uv_corners) < len(corners):
@@ -167,7 +171,7 @@ def _trimesh_part(shape) -> MeshPart:
         return MeshPart(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3))
     uvs = getattr(shape.visual, "uv", None)
     if uvs is None:
-        return MeshPart(positions, faces)
+        return MeshPart(positions, faces, has_colors=shape.visual.kind == "vertex")
     # Normals in the cache are the file's; shape.vertex_normals computes missing ones, which differ at seams.
     normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
     welded = _weld(faces, positions, *normals)
