@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -224,6 +225,26 @@ def test_receivers_at_pixels_and_backs_of_open_bodies_are_lit(receivers):
     assert np.isfinite(found).all()
     assert (found - direct).min() > -1e-5
     assert (found - direct)[..., :3].max() > 0.05
+
+
+@pytest.mark.parametrize("method", [*METHODS, "ray-traced"])
+def test_it_says_how_often_light_bounces(method):
+    scene = bounced(method, ON_BOTH)
+    for bounces, notes in ((0, []), (1, ["Light bounces 1 time."]), (2, ["Light bounces 2 times."])):
+        explained = ws.Renderer(dataclasses.replace(scene, bounces=bounces)).explain()
+        assert [note for note in explained.notes if "bounces" in note] == notes
+
+
+@pytest.mark.parametrize("name", ["albedo", "textures"])
+def test_reflectance_above_1_is_warned_of_where_light_bounces(name):
+    scene = bounced("directional", ON_BOTH, directions=32)
+    above = torch.full((4, 4, 3) if name == "textures" else (3,), 1.5)
+    with pytest.warns(UserWarning, match=rf"{name}\[1\]: got values above 1, with which light grows"):
+        TorchRenderer(scene)(**{name: {"plane": above}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        TorchRenderer(scene)(**{name: {"plane": above.clamp(max=1.0)}})
+        TorchRenderer(dataclasses.replace(scene, bounces=0))(**{name: {"plane": above}})
 
 
 # ---------------------------------------------------------------------------------------------- gradients

@@ -156,6 +156,8 @@ def test_a_plain_tuple_is_a_geometry(renderer):
     assert torch.equal(renderer(geometry=plain), renderer(geometry=unturned))
     with pytest.raises(ValueError, match="^geometry: got tuple of 2, expected a Geometry"):
         renderer(geometry=plain[:2])
+    with pytest.raises(ValueError, match=r"^geometry\.positions: got shape .*: placed\(…\) makes a geometry of poses$"):
+        renderer(geometry=renderer.scene_poses())
 
 
 # ---------------------------------------------------------------------------------------------- gradients

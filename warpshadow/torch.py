@@ -24,7 +24,7 @@ from warpshadow.device.batch import common_batch
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_at_a_time, one_call
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, Geometry, as_geometry
+from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages import rotations
@@ -407,7 +407,7 @@ class _Arguments:
         geometry, own = as_geometry(name, geometry), like.arrays()
         self._bodies[name] = {"moving": geometry.moving, "deformed": geometry.deformed}
         for part, tensor in geometry.arrays().items():
-            self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:])
+            self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:], PLACED)
         if geometry.rotations is not None:
             assert like.rotations is not None
             self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])

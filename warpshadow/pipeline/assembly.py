@@ -63,6 +63,9 @@ class Geometry(Generic[Array]):
         return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
 
 
+PLACED = "placed(…) makes a geometry of poses"
+"""What messages say of arrays that are none of a geometry."""
+
 GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32}
 """Dtypes of a geometry's arrays, by their names."""
 

@@ -102,7 +102,7 @@ class OwnShadows:
         if geometry is not None and body in geometry.deformed:
             return "its shape is free"
         if geometry is not None and geometry.rotations is None:
-            return "geometry has no rotations, as placed() gives them"
+            return "geometry has no rotations; placed(…) makes one that has them"
         return ""
 
     @property

@@ -3,6 +3,7 @@
 import copy
 import functools
 import operator
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
+from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.stages.interpolate import interpolate
@@ -86,6 +88,7 @@ class Materials:
                 vertex_count = bodies[number].mesh.vertex_count
                 check.shape(f"albedo[{number}]", color.shape, ("batch", 1 if color.shape[1:] == (1,) else vertex_count))
                 check.finite_arrays({f"albedo[{number}]": color})
+                self._warn_of_growth(f"albedo[{number}]", color)
                 colors[number], images[number] = color, None
         for number, image in enumerate(textures or ()):
             if image is not None:
@@ -97,6 +100,7 @@ class Materials:
                 if albedo is not None and albedo[number] is not None:
                     raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
                 check.finite_arrays({f"textures[{number}]": image})
+                self._warn_of_growth(f"textures[{number}]", image)
                 images[number] = image
         has_colors, has_images = (
             all(map(operator.is_, *each)) for each in ((colors, self.albedo.value()), (images, self.textures.value()))
@@ -109,6 +113,15 @@ class Materials:
         if not has_images:
             materials._take_textures(Source("textures", images, news="textures are given"))
         return materials
+
+    def _warn_of_growth(self, name: str, values: wp.array) -> None:
+        """Say, where the host need not wait for it, that more light is reflected than falls in; Python says it once."""
+        if self.assembly.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
+            warnings.warn(
+                f"{name}: got values above 1, with which light grows with each bounce, expected reflectances in "
+                "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
+                stacklevel=2,
+            )
 
     @property
     def texture_of_face(self) -> wp.array:

@@ -19,7 +19,7 @@ from warpshadow.device.batch import common_batch
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.assembly import Assembly, Geometry, as_geometry
+from warpshadow.pipeline.assembly import PLACED, Assembly, Geometry, as_geometry
 from warpshadow.pipeline.choice_of_receivers import (
     COARSE_FACE,
     Choice,
@@ -278,7 +278,7 @@ class Renderer:
         if geometry is not None:
             own = self.assembly.rest.arrays()
             for name, array in geometry.arrays().items():
-                check.shape(f"geometry.{name}", array.shape, ("batch", *own[name].shape[1:]))
+                check.shape(f"geometry.{name}", array.shape, ("batch", *own[name].shape[1:]), PLACED)
             poses = geometry.positions
             vertices = Source.renewed("vertices", poses, last.vertices if last else None)
             spheres = Source.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
@@ -565,6 +565,8 @@ class Renderer:
         image = view.preview().image(light, *self._per_body(albedo, textures))
         is_host = self.device.is_cpu or self.clock.waits
         notes = receiver_notes(self._given_scene, self._choices)
+        if self.scene.bounces:
+            notes.append(f"Light bounces {self.scene.bounces} time{'s' * (self.scene.bounces != 1)}.")
         return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes)
 
 
