@@ -7,6 +7,7 @@ Errors are those of shading at points that the camera sees, against rays through
 
 import contextlib
 import itertools
+import sys
 import warnings
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -98,12 +99,10 @@ class Tuning:
         """What was tried, a line each: "*" marks the Pareto front, ">" what was chosen."""
         front = pareto_front([(trial.milliseconds, trial.error) for trial in self.trials])
         fitted = fitted_counts(self.given)
-        lines = [f"  {'method':18}{'bounces':>8}{'spheres':>12}  {'receivers':16}{'error':>8}{'image':>12}"]
+        lines = [f"  {_HEAD}{'error':>8}{'image':>12}"]
         for number, (scene, error, milliseconds) in enumerate(self.trials):
             mark = (">" if scene is self.scene else " ") + ("*" if number in front else " ")
-            columns = f"{_method(scene.visibility):18}{scene.bounces:8}{_spheres(scene, fitted):>12}"
-            columns += f"  {_listed(_receivers(scene)):16}"
-            lines.append(f"{mark}{columns}{error:8.2%}{milliseconds:9.2f} ms")
+            lines.append(f"{mark}{_columns(scene, fitted)}{error:8.2%}{milliseconds:9.2f} ms")
         return "\n".join(lines)
 
     def toml(self) -> str:
@@ -120,6 +119,22 @@ class Tuning:
             if changes:
                 blocks.append(toml_tables.block(f"[[body]]  # body {number} ({before.called!r})", changes))
         return "\n".join(blocks)
+
+
+_HEAD = f"{'method':18}{'bounces':>8}{'spheres':>12}  {'receivers':16}"
+
+
+def _columns(scene: Scene, fitted: Iterable[int]) -> str:
+    """The settings of a scene, below the head of a table."""
+    columns = f"{_method(scene.visibility):18}{scene.bounces:8}{_spheres(scene, fitted):>12}"
+    return f"{columns}  {_listed(_receivers(scene)):16}"
+
+
+def _error_table(settings: Sequence[Scene], errors: Sequence[float], fitted: Iterable[int]) -> str:
+    """Errors of settings, a line each, the smallest first."""
+    order = np.argsort(errors, kind="stable")
+    lines = [f"{_columns(settings[number], fitted)}{errors[number]:8.2%}" for number in order]
+    return "\n".join([f"{_HEAD}{'error':>8}", *lines])
 
 
 def describe(scene: Scene) -> str:
@@ -183,7 +198,7 @@ def tune(
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
             number is, and others where fits are kept already.
         device: Where to render.
-        progress: Show progress.
+        progress: Show progress, and all errors before anything is timed.
 
     Returns:
         What was chosen, and all that was tried. Where none reaches what was wanted it is the nearest.
@@ -217,6 +232,8 @@ def tune(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
         errors = [sample.error(sample.shading(setting)) for setting in bar]
+        if progress:  # timing takes as long again, and may be interrupted
+            tqdm.write(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
         times = image_times(settings, device=device, progress=progress)
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
