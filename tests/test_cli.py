@@ -229,6 +229,12 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
         (("render", "scene.toml", "-o", "x.exr", "--method", "rays"), "rays"),
         (("render", "scene.toml", "-o", "x.exr", "--samples", "0"), "samples"),
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
+        (
+            ("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"),
+            "got '2.5', expected a whole number",
+        ),
+        (("render", "scene.toml", "-o", "x.exr", "--bounces", "-1"), "got -1, expected a whole number from 0"),
+        (("tune", "scene.toml", "--error", "0.1", "--bounces", "17"), "17, expected a whole number from 0 to 16"),
         (("envmap", "x.exr", "--order", "9"), "order"),
         (("rendre",), "rendre"),
     ],
@@ -236,7 +242,7 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
 def test_a_wrong_option_is_status_2_with_its_name(arguments, part):
     result = run(*arguments)
     assert result.exit_code == 2
-    assert part in re.sub(r"\x1b\[[0-9;]*m", "", result.output)
+    assert part in " ".join(re.sub(r"\x1b\[[0-9;]*m|│", "", result.output).split())
 
 
 # ---------------------------------------------------------------------------------------------- tune
@@ -389,6 +395,7 @@ def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_fil
     assert re.search(r"^(finished|converged) after \d+ iterations, [\d.]+ ms each$", result.stdout, re.M)
     assert re.search(r"^loss \d\S+ before, \d\S+ after$", result.stdout, re.M)
     assert "60/60" in result.stderr  # the progress bar
+    assert result.stderr.index("preparing: kernels, shadows") < result.stderr.index("fitting")
     (files,) = re.findall(rf"^{folder}: (.*)$", result.stdout, re.M)
     written = {path.name for path in folder.iterdir()}
     assert set(files.split(", ")) == written - {"checkpoint", "checkpoint.previous", "preview.png"}
@@ -705,6 +712,13 @@ def test_the_command_runs_as_a_program(tmp_path):
     assert result.returncode == 1
     assert result.stdout == "" and result.stderr.startswith("error: ") and "no.toml" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["warpshadow", "warpshadow.cli"])
+def test_the_package_is_the_command_too(module):
+    result = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout) == (0, f"warpshadow {ws.__version__}\n")
 
 
 def test_the_devices_that_a_message_names_exist():

@@ -34,6 +34,18 @@ _PREVIEW = "preview.png"
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
 
+def _count_of_bounces(text: str) -> int:
+    """A number of bounces; what is none is refused as everywhere else."""
+    from warpshadow.scene.scene import check_bounces
+
+    count = int(text) if text.lstrip("-").isdecimal() else text
+    try:
+        check_bounces(count)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    return int(count)
+
+
 def _print_version(is_asked: bool) -> None:
     if is_asked:
         typer.echo(f"warpshadow {__version__}")
@@ -91,12 +103,22 @@ def render(
     ] = "transparent",
     method: Annotated[
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
-        typer.Option(help="How visibility is computed, in place of the scene's; ray-traced is the reference."),
+        typer.Option(
+            help="How visibility is computed, in place of the scene's; ray-traced, the reference, is a path tracer "
+            "where light bounces."
+        ),
     ] = None,
-    samples: Annotated[Optional[int], typer.Option(help="Rays of a pixel, of the ray-traced method.", min=1)] = None,
+    samples: Annotated[
+        Optional[int],
+        typer.Option(help="Of the ray-traced method: rays of a pixel, and with bounces half as many paths.", min=1),
+    ] = None,
     bounces: Annotated[
         Optional[int],
-        typer.Option(help="How often light bounces, in place of the scene's; ray-traced: along paths.", min=0, max=16),
+        typer.Option(
+            help="How often light bounces, 0 to 16, in place of the scene's.",
+            parser=_count_of_bounces,
+            metavar="INTEGER",
+        ),
     ] = None,
     device: Device = "cpu",
 ) -> None:
@@ -145,7 +167,10 @@ def tune(
     bounces: Annotated[
         Optional[int],
         typer.Option(
-            help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried.", min=0, max=16
+            help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried, which takes some "
+            "five to ten minutes in place of one.",
+            parser=_count_of_bounces,
+            metavar="INTEGER",
         ),
     ] = None,
     fit: Annotated[
@@ -155,7 +180,8 @@ def tune(
 ) -> None:
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
-    Exit status 1: none reaches it; the one that comes nearest is named, and what to try next.
+    Errors are printed before times are measured. Exit status 1: none reaches it; the one that comes nearest is named,
+    and what to try next.
     """
     from warpshadow.scene.files import load_scene
     from warpshadow.tuning.timing import TIMED_RECEIVERS
@@ -381,3 +407,7 @@ def warmup(device: Device = "cpu") -> None:
                 Renderer(scene, device=where).render()
                 bar.update()
         typer.echo(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    app(prog_name="warpshadow")

@@ -381,7 +381,10 @@ def _descend(
     saved = previewed = time.perf_counter()
     durations: list[float] = []
     with tqdm(
-        total=sum(stage.candidates * stage.iterations for stage in descent.stages), unit="it", disable=not progress
+        desc="preparing: kernels, shadows, form factors",
+        total=sum(stage.candidates * stage.iterations for stage in descent.stages),
+        unit="it",
+        disable=not progress,
     ) as bar:
         bar.update(sum(map(len, descent.losses)))
         start = time.perf_counter()
@@ -395,6 +398,7 @@ def _descend(
                 with torch.no_grad():
                     write_preview(preview, descent.model.targets, descent.model.images(descent.values))
                 previewed = time.perf_counter()
+            bar.set_description_str("fitting", refresh=False)
             bar.set_postfix_str(f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}", refresh=False)
             bar.update()
             start = time.perf_counter()
