@@ -200,9 +200,10 @@ class OwnShadows:
             sites, faces = self.sites(body), mesh.surface.faces
             count = ray_count(self._row_count(body))
             if count < RAYS:
+                called = self._assembly.scene.bodies[body].called
                 warnings.warn(
-                    f"body {body} ({mesh.name!r}): {len(sites.positions):,} points have {count} rays each for the "
-                    f"body's shadow on itself, in place of {RAYS}, which would take too much memory",
+                    f"body {body} ({called!r}): {len(sites.positions):,} points have {count} rays each for the body's "
+                    f"shadow on itself, in place of {RAYS}, which would take too much memory",
                     stacklevel=2,
                 )
             numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]

@@ -375,12 +375,12 @@ def trace_cells(
     return light
 
 
-def parts(total: int, size: int, progress: bool) -> Iterator[slice]:
-    """Cut a range into slices of at most ``size``, with a progress bar over them."""
+def parts(total: int, size: int, progress: bool, what: str = "tracing rays") -> Iterator[slice]:
+    """Cut a range into slices of at most ``size``, with a progress bar over them that says what is done."""
     from tqdm import tqdm
 
     size = max(size, 1)
-    with tqdm(total=total, desc="tracing rays", unit="point", delay=1, disable=not progress) as bar:
+    with tqdm(total=total, desc=what, unit="point", delay=1, disable=not progress) as bar:
         for start in range(0, total, size):
             stop = min(start + size, total)
             yield slice(start, stop)

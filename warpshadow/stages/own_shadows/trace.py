@@ -198,7 +198,7 @@ def trace_rows(
         wp.empty((row_count, count // RUN), dtype=wp.uint8, device=device),
     )
     lowest = float(np.sin(min(_MIRRORED * cell_radius(count // RUN), np.pi / 2)))
-    for part in parts(row_count, 2**21 // count, progress):
+    for part in parts(row_count, 2**21 // count, progress, "tracing own shadows"):
         at, cost = (places[part], facing[part], directions, lowest), RAY_COST * count / 8
         for step in passes:
             launch(_trace_pass, len(at[0]), inputs=[mesh.id, *at, *step], outputs=[rows.bits[part]], cost=cost)
