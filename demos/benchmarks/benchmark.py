@@ -46,6 +46,9 @@ from warpshadow.stages import (
 from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import median_times, whole_image
 
+BOUNCED = ", two bounces"
+"""What the labels of rows with bounces end with, where those without have nothing."""
+
 
 def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     """The size of the scene in words, and functions that run its stages once, by what they do."""
@@ -96,24 +99,8 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         ws.Renderer(scene, device=device).render()
 
     torch_renderer = TorchRenderer(scene, device=device)
-    bounced = TorchRenderer(dataclasses.replace(scene, bounces=2), device=device)
     rotations, translations, scales = torch_renderer.scene_poses()
-    translations.requires_grad_()
-    batch = rotations.expand(8, *rotations.shape), translations.expand(8, *translations.shape)
-    ground_texture = torch.full((256, 256, 3), 0.5, device=torch_renderer.device, requires_grad=True)
-    light = torch.from_numpy(cells.coefficients(scene.light)).to(torch_renderer.device).requires_grad_()
-
-    def fit_light() -> None:
-        torch_renderer(light).square().sum().backward()
-
-    def fit_texture() -> None:
-        torch_renderer(textures=[None, ground_texture]).square().sum().backward()
-
-    def fit_pose(renderer: TorchRenderer = torch_renderer) -> None:
-        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
-
-    def fit_pose_with_bounces() -> None:
-        fit_pose(bounced)
+    batch = rotations.expand(8, *rotations.shape), translations.repeat(8, 1, 1).requires_grad_()
 
     def fit_poses() -> None:
         torch_renderer(geometry=torch_renderer.placed(*batch, scales)).square().sum().backward()
@@ -141,17 +128,43 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
         "project, rasterize and interpolate": draw,
         "project, rasterize, interpolate and smooth": draw_smoothly,
         "the same, forward and backward": draw_and_back,
-        "image of bodies that have moved, directional": whole_image(renderer),
-        "image of bodies that have moved, two bounces": whole_image(bounced.warp),
         "image from the scene, set-up included": from_scratch,
-        "iteration of a light fit in torch": fit_light,
-        "iteration of a texture fit in torch, 256 × 256 texels": fit_texture,
-        "iteration of a pose fit in torch": fit_pose,
-        "iteration of a pose fit in torch, two bounces": fit_pose_with_bounces,
         "iteration of 8 pose fits in a batch": fit_poses,
     }
+    traced = dataclasses.replace(scene, visibility=scene.visibility.by("ray-traced"))
+    still = ("iteration of a light fit in torch", "iteration of a texture fit in torch, 256² texels")
+    for bounces, words in ((0, ""), (2, BOUNCED)):
+        one = iterations(dataclasses.replace(scene, bounces=bounces), device)
+        rows |= {f"{label}{words}": function for label, function in one.items()}
+        one = iterations(dataclasses.replace(traced, bounces=bounces), device)
+        rows |= {f"{label}, ray traced{words}": one[label] for label in still}
     size = f"{points.shape[1]} vertices, {faces.shape[0]} faces, {radii.shape[1]} spheres"
     return size, rows
+
+
+def iterations(scene: ws.Scene, device: str) -> dict[str, Callable[[], object]]:
+    """Functions that draw an image, or run an iteration of a fit in torch, by what they do."""
+    renderer = TorchRenderer(scene, device=device)
+    rotations, translations, scales = renderer.scene_poses()
+    translations.requires_grad_()
+    ground_texture = torch.full((256, 256, 3), 0.5, device=renderer.device, requires_grad=True)
+    light = torch.from_numpy(renderer.basis.coefficients(scene.light)).to(renderer.device).requires_grad_()
+
+    def fit_light() -> None:
+        renderer(light).square().sum().backward()
+
+    def fit_texture() -> None:
+        renderer(textures=[None, ground_texture]).square().sum().backward()
+
+    def fit_pose() -> None:
+        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
+
+    return {
+        "image of bodies that have moved": whole_image(renderer.warp),
+        "iteration of a light fit in torch": fit_light,
+        "iteration of a texture fit in torch, 256² texels": fit_texture,
+        "iteration of a pose fit in torch": fit_pose,
+    }
 
 
 def measure(device: str, seconds: float) -> dict[str, float]:
@@ -177,17 +190,17 @@ def main(device: str, runs: int) -> None:
     flat = median_times(functions, runs)
     ws.set_thread_count(None)
     times = {label: flat[k * len(counts) : (k + 1) * len(counts)] for k, label in enumerate(rows)}
-    print(f"  {'threads':54}" + "".join(f"{count:8}" for count in counts))
+    print(f"  {'threads':84}" + "".join(f"{count:8}" for count in counts))
     for label, row in times.items():
-        print(f"  {label:54}" + "".join(f"{milliseconds:8.1f}" for milliseconds in row))
+        print(f"  {label:84}" + "".join(f"{milliseconds:8.1f}" for milliseconds in row))
     without, forward, both = (times[label] for label in rows if label.startswith(("project", "the same")))
     for label, base in (("forward and backward / forward", forward), ("the same / forward, not smoothed", without)):
         ratios = [longer / shorter for longer, shorter in zip(both, base, strict=True)]
-        print(f"  {label:54}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
-    for label in ("image of bodies that have moved, two bounces", "iteration of a pose fit in torch, two bounces"):
-        direct = times[label.replace("moved, two bounces", "moved, directional").replace(", two bounces", "")]
+        print(f"  {label:84}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
+    for label in (label for label in times if label.endswith(BOUNCED)):
+        direct = times[label.removesuffix(BOUNCED)]
         ratios = [longer / shorter for longer, shorter in zip(times[label], direct, strict=True)]
-        print(f"  {f'{label} / without':54}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
+        print(f"  {f'{label} / without':84}" + "".join(f"{ratio:8.2f}" for ratio in ratios))
 
 
 def time_fits(device: str) -> None:
