@@ -14,6 +14,7 @@ from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.assets.unwrap import unwrap
 from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.scene.files import SceneError, load_scene, write_scene
@@ -63,6 +64,10 @@ __all__ = [
 
 
 def quiet() -> None:
-    """Keep Warp's messages about devices and modules off the terminal; warnings and errors stay."""
+    """Start Warp without its messages about devices and modules, and without a word of a missing GPU.
+
+    Other warnings and errors stay.
+    """
     _wp.config.log_level = getattr(_wp, "LOG_WARNING", 30)
     _wp.config.quiet = True  # what releases before log_level read
+    _start_quietly()

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -59,7 +60,8 @@ def main(
     ] = False,
 ) -> None:
     """Keep Warp's own messages off the terminal."""
-    quiet()
+    if "--help" not in sys.argv:  # which needs no Warp, and its start takes half a second
+        quiet()
     warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
 
 
@@ -381,11 +383,10 @@ def envmap(
 @app.command()
 def warmup(device: Device = "cpu") -> None:
     """Compile every kernel that rendering needs, so that the first render need not."""
-    from tqdm import tqdm
-
     from warpshadow.assets.camera import Camera
     from warpshadow.assets.light import EnvironmentMap
     from warpshadow.assets.primitives import icosphere
+    from warpshadow.device.progress import progress_bar
     from warpshadow.pipeline.renderer import Renderer
     from warpshadow.scene.scene import METHODS, Body, Scene, Visibility
     from warpshadow.spheres import fit_spheres
@@ -394,7 +395,7 @@ def warmup(device: Device = "cpu") -> None:
         where = _device(device)
         mesh = icosphere(subdivisions=1)
         start = time.perf_counter()
-        with tqdm(total=len(METHODS) + 1, desc="compiling", unit="stage") as bar:
+        with progress_bar(len(METHODS) + 1, "compiling", "stage", stays=True) as bar:
             fit_spheres(mesh, 1, steps=100, device=where, cache=False, progress=False)
             bar.update()
             for method in METHODS:

@@ -70,7 +70,7 @@ class TorchRenderer(torch.nn.Module):
         cameras: Sequence[Camera] | None = None,
         device: str | torch.device = "cpu",
         basis: Basis | None = None,
-        progress: bool = False,
+        progress: bool = True,
     ):
         super().__init__()
         self.warp = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
@@ -79,6 +79,10 @@ class TorchRenderer(torch.nn.Module):
     def scene(self) -> Scene:
         """The scene; a method "auto" has been replaced by what was chosen."""
         return self.warp.scene
+
+    def extra_repr(self) -> str:
+        """What it renders, for its repr."""
+        return repr(self.warp)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:

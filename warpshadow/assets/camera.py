@@ -93,6 +93,11 @@ class Camera:
             raise ValueError(f"intrinsics: got a singular matrix {self.intrinsics.tolist()}, expected focal lengths")
         _check_rotation("rotation", self.rotation)
 
+    def __repr__(self) -> str:
+        x, y, z = self.eye
+        fov_y = 2 * np.degrees(np.arctan(0.5 * self.height / self.intrinsics[1, 1]))
+        return f"Camera({self.width} × {self.height}, eye ({x:.3g}, {y:.3g}, {z:.3g}), fov_y {fov_y:.3g})"
+
     @classmethod
     def look_at(
         cls,

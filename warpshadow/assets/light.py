@@ -59,6 +59,10 @@ class EnvironmentMap:
         pixels.setflags(write=False)
         object.__setattr__(self, "radiance", pixels)
 
+    def __repr__(self) -> str:
+        height, width, _ = self.radiance.shape
+        return f"EnvironmentMap({width} × {height})"
+
     @classmethod
     def read(
         cls,

@@ -71,6 +71,9 @@ class Mesh:
         if self.uv_faces is not None and len(self.uv_faces) != self.face_count:
             raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
 
+    def __repr__(self) -> str:
+        return f"Mesh({self.name!r}, {self.vertex_count} vertices, {self.face_count} faces)"
+
     @property
     def vertex_count(self) -> int:
         """Number of vertices, referenced by a face or not."""

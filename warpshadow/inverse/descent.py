@@ -19,6 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
+from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
@@ -303,7 +304,7 @@ def fit(
     checkpoint_seconds: float = 10.0,
     preview: AnyPath | None = None,
     preview_seconds: float = 2.0,
-    progress: bool = False,
+    progress: bool = True,
 ) -> Result:
     """Fit what a problem leaves free.
 
@@ -366,8 +367,6 @@ def _descend(
     progress: bool,
 ) -> list[float]:
     """Go on from a checkpoint, to the end; returns the times of the last iterations [s]."""
-    from tqdm import tqdm
-
     state = None if checkpoint is None else checkpoints.load(checkpoint)
     if state is None:
         descent.begin_stage()
@@ -380,12 +379,8 @@ def _descend(
 
     saved = previewed = time.perf_counter()
     durations: list[float] = []
-    with tqdm(
-        desc="preparing: kernels, shadows, form factors",
-        total=sum(stage.candidates * stage.iterations for stage in descent.stages),
-        unit="it",
-        disable=not progress,
-    ) as bar:
+    total = sum(stage.candidates * stage.iterations for stage in descent.stages)
+    with progress_bar(total, "preparing: kernels, shadows, form factors", "it", wanted=progress, stays=True) as bar:
         bar.update(sum(map(len, descent.losses)))
         start = time.perf_counter()
         for _ in descent.run():

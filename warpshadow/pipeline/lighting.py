@@ -13,6 +13,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import common_batch, concatenate, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
+from warpshadow.device.progress import progress_bar
 from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
@@ -462,8 +463,6 @@ class InParts(Node):
 
     def compute(self, call: Call) -> Any:
         """Find it for one part after another."""
-        from tqdm import tqdm
-
         receivers, spheres, own, kept, looked_up, *extra = self.values(call)
         groups = list(self._groups(receivers, spheres, looked_up))
         if self._static is not None and len(receivers.still):
@@ -471,7 +470,7 @@ class InParts(Node):
             group = Group(*on_static, *self._static.moving_spheres(spheres), kept)
             groups = [group, *groups] if receivers.points.shape[1] else [group]
         total, results = len(receivers.still) + receivers.points.shape[1], []
-        with tqdm(total=total, desc="shading", unit="receiver", delay=1, disable=not self._progress) as bar:
+        with progress_bar(total, "shading", "receiver", wanted=self._progress) as bar:
             for group in groups:
                 for part in group.parts():
                     results.append(self.find(call, part, own, spheres, *extra))

@@ -125,6 +125,9 @@ class Renderer:
         self._statics: dict[tuple[int, ...], Static] = {}  # by what moves
         self._has_warned = False
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.scene!r}, {self.device.alias})"
+
     def _choose_receivers(self) -> list[Choice]:
         if METHODS[self.assembly.scene.visibility.method].lights_samples:  # whatever the bodies say
             return [Choice(body.receivers, None) for body in self.assembly.scene.bodies]

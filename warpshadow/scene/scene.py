@@ -218,6 +218,12 @@ class Body:
         if self.name is not None and not (isinstance(self.name, str) and self.name):
             raise ValueError(f"name: got {check.described(self.name)}, expected a name, or None for the mesh's")
 
+    def __repr__(self) -> str:
+        count = len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers
+        texture = "" if self.texture is None else f", texture {self.texture.shape[1]} × {self.texture.shape[0]}"
+        mesh = f"{self.mesh.vertex_count} vertices, {self.mesh.face_count} faces"
+        return f"Body({self.called!r}, {mesh}, {count} spheres{texture})"
+
     @property
     def called(self) -> str:
         """Its name, or else its mesh's."""
@@ -402,6 +408,12 @@ class Scene:
                 f"bounces: got {self.bounces}, which {self.visibility.method!r} does not find, expected 0, or "
                 f"method = one of {finders}"
             )
+
+    def __repr__(self) -> str:
+        light = self.light if isinstance(self.light, EnvironmentMap) else f"{len(self.light)} SH coefficients"
+        bounces = f", {self.bounces} bounces" if self.bounces else ""
+        bodies = ", ".join(map(repr, self.bodies))
+        return f"Scene([{bodies}], {light}, {self.camera!r}, {self.visibility.method!r}{bounces})"
 
     def background(self) -> np.ndarray:
         """The light as the camera sees it where no body is, linear RGB, float32 of shape [height, width, 3]."""

@@ -18,6 +18,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.cache import cache_path, remembered
 from warpshadow.assets.mesh import Mesh
+from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import compact_order
@@ -163,7 +164,6 @@ class _Job:
 def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
     """Fit spheres [sphere, 4] to a normalized mesh."""
     from threadpoolctl import threadpool_limits
-    from tqdm import tqdm
 
     began = time.perf_counter()
     mesh = NormalizedMesh(job.positions, job.faces, job.device)
@@ -171,9 +171,11 @@ def _fit(job: _Job, progress: bool, count: int) -> tuple[np.ndarray, FitReport]:
     spheres = np.zeros((0, 4))
     cover_steps = COVER_STEPS_FIRST if job.steps else COVER_STEPS
     total = cover_steps + job.steps if count else 0
-    bar = tqdm(total=total, desc=f"fitting {count} spheres", delay=1.0, disable=not progress, leave=False)
     # threads for products of such small matrices wait for each other, for seconds where cores are busy
-    with bar, threadpool_limits(limits=1):
+    with (
+        progress_bar(total, f"fitting {count} spheres", "step", wanted=progress) as bar,
+        threadpool_limits(limits=1),
+    ):
         if count:
             spheres, balls = greedy_cover(mesh, count, rng)
             for covering in descend_cover(mesh, spheres, cover_steps, rng):

@@ -10,6 +10,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
+from warpshadow.device.progress import progress_bar
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.light_samples import CellSamples, LightSamples
 
@@ -377,10 +378,8 @@ def trace_cells(
 
 def parts(total: int, size: int, progress: bool, what: str = "tracing rays") -> Iterator[slice]:
     """Cut a range into slices of at most ``size``, with a progress bar over them that says what is done."""
-    from tqdm import tqdm
-
     size = max(size, 1)
-    with tqdm(total=total, desc=what, unit="point", delay=1, disable=not progress) as bar:
+    with progress_bar(total, what, "point", wanted=progress) as bar:
         for start in range(0, total, size):
             stop = min(start + size, total)
             yield slice(start, stop)

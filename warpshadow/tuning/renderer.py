@@ -28,7 +28,7 @@ class Renderer(renderer.Renderer):
         cameras: Sequence[Camera] | None = None,
         device: wp.DeviceLike = "cpu",
         basis: Basis | None = None,
-        progress: bool = False,
+        progress: bool = True,
     ):
         check.instance("scene", scene, Scene, SCENE)
         check_basis(basis)
@@ -37,7 +37,7 @@ class Renderer(renderer.Renderer):
         super().__init__(scene, cameras=cameras, device=device, basis=basis, progress=progress)
 
 
-def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> np.ndarray:
+def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True) -> np.ndarray:
     """Render a scene once; for several images of it, keep a :class:`Renderer`.
 
     Args:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.tuning.point_sample import places_of_receivers, seen_on_faces
@@ -60,19 +61,18 @@ def median_times(functions: Sequence[Callable[[], object]], runs: int, *, progre
 
     Each is called twice and timed the second time: the first pays for compilation and cold memory.
     """
-    from tqdm import tqdm
-
     times: list[list[float]] = [[] for _ in functions]
     turns = range(runs * len(functions))
-    bar = tqdm(turns, desc="timing", unit="call", delay=1, leave=False, disable=not progress)
-    for turn in bar:
-        function = functions[turn % len(functions)]
-        function()
-        wp.synchronize()
-        start = time.perf_counter()
-        function()
-        wp.synchronize()
-        times[turn % len(functions)].append(1e3 * (time.perf_counter() - start))
+    with progress_bar(len(turns), "timing", "call", wanted=progress) as bar:
+        for turn in turns:
+            function = functions[turn % len(functions)]
+            function()
+            wp.synchronize()
+            start = time.perf_counter()
+            function()
+            wp.synchronize()
+            times[turn % len(functions)].append(1e3 * (time.perf_counter() - start))
+            bar.update()
     return [statistics.median(each) for each in times]
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
@@ -182,7 +183,7 @@ def tune(
     bounces: int | None = None,
     fits: bool = False,
     device: wp.DeviceLike = "cpu",
-    progress: bool = False,
+    progress: bool = True,
 ) -> Tuning:
     """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
 
@@ -206,8 +207,6 @@ def tune(
     Raises:
         ValueError: where the camera sees nothing.
     """
-    from tqdm import tqdm
-
     check.instance("scene", scene, Scene, SCENE)
     device = check.device("device", device)
     given = {"error": error, "milliseconds": milliseconds}
@@ -228,12 +227,15 @@ def tune(
     counts = (scene.bounces,) if bounces is None else [count for count in BOUNCE_COUNTS if count <= bounces]
     bounced = [replace(scene, bounces=count) for count in counts]
     settings = [setting for each in bounced for setting in _settings(each, fine, fits, device)]
-    bar = tqdm(settings, desc="measuring errors", unit="setting", delay=1, leave=False, disable=not progress)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
-        errors = [sample.error(sample.shading(setting)) for setting in bar]
+        errors = []
+        with progress_bar(len(settings), "measuring errors", "setting", wanted=progress) as bar:
+            for setting in settings:
+                errors.append(sample.error(sample.shading(setting)))
+                bar.update()
         if progress:  # timing takes as long again, and may be interrupted
-            tqdm.write(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
+            print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
         times = image_times(settings, device=device, progress=progress)
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
