@@ -83,7 +83,7 @@ def test_a_target_names_what_is_wrong_with_it(options, message):
 def test_a_target_reads_files_as_fit_files_do(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     straight, alpha = np.full((2, 4, 3), 0.5, np.float32), np.full((2, 4, 1), 0.5, np.float32)
-    ws.write_image("photo.png", np.concatenate([straight, alpha], axis=2))
+    ws.write_image("photo.png", ws.Picture(np.concatenate([alpha * straight, alpha], axis=2), exposure=0))
     ws.write_image("mask.png", srgb_to_linear(np.full((2, 4), 0.25, np.float32)))
     target = Target("photo.png", Path("mask.png"))
     eight_bits = 0.006  # half a step of sRGB where it is steepest

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import tempfile
 
 import warp as wp
 
@@ -15,17 +14,17 @@ def start_quietly() -> None:
     What else it prints on stderr meanwhile is printed after.
     """
     sys.stderr.flush()
-    with tempfile.TemporaryFile() as caught:
-        terminal = os.dup(2)
-        try:
-            os.dup2(caught.fileno(), 2)
-            try:
-                wp.init()
-            finally:
-                os.dup2(terminal, 2)
-                caught.seek(0)
-                for line in caught:
-                    if _NO_DRIVER not in line:
-                        os.write(2, line)
-        finally:
-            os.close(terminal)
+    terminal = os.dup(2)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)  # should it be full, the rest is lost: nobody reads while Warp starts
+    try:
+        os.dup2(writer, 2)
+        wp.init()
+    finally:
+        os.dup2(terminal, 2)
+        for each in (terminal, writer):
+            os.close(each)
+        with open(reader, "rb") as caught:
+            for line in caught:
+                if _NO_DRIVER not in line:
+                    os.write(2, line)
