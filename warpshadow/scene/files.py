@@ -1,5 +1,6 @@
 """Scene files: TOML, checked key by key (README.md lists the keys), and written so that they read back the same."""
 
+import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Sequence
@@ -106,7 +107,8 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
     """Raise ValueError for a key that is not known in a table; where others have it the message names them."""
     known = tuple(known) or _KEYS[name]
     for key in table:
-        others = [other for other, keys in _KEYS.items() if key in keys]
+        is_typo = bool(difflib.get_close_matches(key, known, n=1, cutoff=0.9))  # "direction", of another table
+        others = [] if is_typo else [other for other, keys in _KEYS.items() if key in keys]
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
     check.known_keys(what, table, known)
