@@ -134,6 +134,26 @@ class Renderer:
         with unrecorded():
             return choose_receivers(self.assembly, self.cameras)
 
+    @one_at_a_time
+    def with_cameras(self: Own, cameras: Sequence[Camera]) -> Own:
+        """Make a renderer of the same scene for other cameras, which may be of another size; it computes little anew.
+
+        Both share what depends on no camera: spheres, own shadows, what is known of the light. Receivers "auto" stay
+        as they were chosen.
+
+        Args:
+            cameras: Any number of them, of one size and near plane, whose images are a batch.
+        """
+        other = object.__new__(type(self))
+        matrices = [camera.clip_matrix() for camera in _alike(cameras)]
+        vars(other).update({name: value for name, value in vars(self).items() if name != "_own_view"})
+        other._arguments = self._arguments | {"cameras": cameras}
+        other.cameras, other.has_camera_batch = tuple(cameras), True
+        other._cameras = Source("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=other.device))
+        other._scene_view = other._last_view = other._last_cameras = None
+        other._has_warned = False
+        return other
+
     def moved(self: Own, device: wp.DeviceLike) -> Own:
         """Make the same renderer on another device; it computes all anew there."""
         return type(self)(**self._arguments | {"device": device})

@@ -140,18 +140,24 @@ def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     rotation = check.number("rotation", table.get("rotation", 0.0))
     scale = check.nonnegative("scale", table.get("scale", 1.0))
     if "envmap" in table:
-        light = EnvironmentMap.read(toml_tables.file(table, "envmap", folder))
-        light = light.rotated(rotation) if rotation else light
-        return light.scaled(scale) if scale != 1 else light
+        return turned_light(EnvironmentMap.read(toml_tables.file(table, "envmap", folder)), rotation, scale)
     coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
     check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
     check.finite("sh", coefficients)
-    order = sh.order_of("sh", coefficients)
+    sh.order_of("sh", coefficients)
+    return turned_light(coefficients, rotation, scale)
+
+
+def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: float) -> EnvironmentMap | np.ndarray:
+    """Light as the keys ``rotation`` [degrees about +y] and ``scale`` make it of a map or of SH coefficients."""
+    if isinstance(light, EnvironmentMap):
+        light = light.rotated(rotation) if rotation else light
+        return light.scaled(scale) if scale != 1 else light
     if rotation:
         angle = np.radians(rotation)
         about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        coefficients = sh.rotation_matrix(order, about_y) @ coefficients
-    return scale * coefficients
+        light = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light
+    return scale * light
 
 
 def _body(table: Table, folder: Path) -> Body:

@@ -1,0 +1,72 @@
+"""How good an image is made: few pixels and cells while something moves, then better ones while it rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SECONDS = 1 / 24
+"""What an image may take while something moves; encoding and sending come on top."""
+
+LONGEST = 1.0
+"""What an image may take while all rests [s]: so long a page waits when it moves again."""
+
+FEWEST, MOST = 96**2, 512**2
+"""Pixels of an image while something moves."""
+
+FULL = 1 << 20
+"""Pixels of an image while all rests."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What an image may cost.
+
+    Args:
+        pixels: Of the image, about.
+        cells: At most so many direction cells.
+        rays: At most so many of a pixel.
+        supersampling: At most so many samples across a pixel.
+        is_moving: Whether it is made while something moves.
+    """
+
+    pixels: int
+    cells: int
+    rays: int
+    supersampling: int
+    is_moving: bool
+
+
+class Pace:
+    """Chooses qualities by what images took: the next one of a motion, and the next better one of what rests."""
+
+    def __init__(self) -> None:
+        self.pixels = 256**2
+
+    def moving(self) -> Quality:
+        """While something moves."""
+        return Quality(self.pixels, cells=64, rays=16, supersampling=1, is_moving=True)
+
+    def took(self, seconds: float) -> None:
+        """Learn what an image of a motion took; only what is far from what it may take changes anything."""
+        if seconds > 1.6 * SECONDS:
+            self.pixels = max(FEWEST, self.pixels // 2)
+        elif seconds < 0.3 * SECONDS:
+            self.pixels = min(MOST, self.pixels * 2)
+
+    def better(self, last: Quality, seconds: float, canvas: int) -> Quality | None:
+        """The next quality while all rests.
+
+        Args:
+            last: That of the last image.
+            seconds: What it took.
+            canvas: Pixels that the page has.
+
+        Returns:
+            None where no better one can be seen, or would take too long.
+        """
+        goal = min(FULL, canvas)
+        if last.is_moving:
+            return Quality(min(goal, 256**2), cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False)
+        if last.pixels >= goal or 4 * seconds > LONGEST:
+            return None
+        return Quality(min(goal, 4 * last.pixels), last.cells, last.rays, last.supersampling, is_moving=False)
