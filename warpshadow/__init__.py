@@ -22,6 +22,7 @@ from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.tuning.renderer import Renderer, render
 from warpshadow.tuning.tune import Tuning, tune
+from warpshadow.viewer import view
 
 __version__ = "0.1.0"
 
@@ -58,6 +59,7 @@ __all__ = [
     "thread_count",
     "tune",
     "unwrap",
+    "view",
     "write_image",
     "write_scene",
 ]

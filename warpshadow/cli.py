@@ -1,4 +1,4 @@
-"""The command line: render a scene, explain images, fit spheres to a mesh, look into a light, compile ahead."""
+"""The command line: render and view scenes, explain images, fit spheres to a mesh, look into a light, compile ahead."""
 
 import contextlib
 import math
@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow import Tuning, __version__, quiet
 from warpshadow.assets import files
 from warpshadow.assets.picture import SUFFIXES, Picture
+from warpshadow.viewer import HOST, PORT, serve
 
 app = typer.Typer(
     add_completion=False,
@@ -157,6 +158,27 @@ def render(
             picture = Picture(image, exposure=exposure, tone=tone, background=behind)
             write_image(png, picture)
             typer.echo(f"{png}: exposure {picture.exposure:+.2f} stops")
+
+
+@app.command()
+def view(
+    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
+    host: Annotated[
+        str, typer.Option(help="Address to serve at; by default for this machine alone, 0.0.0.0 is for everybody.")
+    ] = HOST,
+    port: Annotated[int, typer.Option(help="Port, or the next one that is free.", min=0, max=65535)] = PORT,
+    browser: Annotated[bool, typer.Option(help="Open a browser.")] = True,
+    device: Device = "cpu",
+) -> None:
+    """Show a scene in the browser, to be turned with the mouse, until Ctrl+C."""
+    from warpshadow.scene.files import load_scene
+
+    with _clear_errors():
+        loaded = load_scene(scene)
+        viewer = serve(loaded, host=host, port=port, device=_device(device), progress=True, path=scene)
+        typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
+        viewer.open(browser)
+        viewer.wait()
 
 
 @app.command()

@@ -153,11 +153,10 @@ def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: flo
     if isinstance(light, EnvironmentMap):
         light = light.rotated(rotation) if rotation else light
         return light.scaled(scale) if scale != 1 else light
-    if rotation:
-        angle = np.radians(rotation)
-        about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        light = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light
-    return scale * light
+    angle = np.radians(rotation)
+    about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turned: np.ndarray = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light if rotation else light
+    return scale * turned
 
 
 def _body(table: Table, folder: Path) -> Body:

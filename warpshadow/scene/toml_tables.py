@@ -70,13 +70,18 @@ def file(table: Table, key: str, folder: Path) -> Path:
 
 
 def write(path: Path, tables: Mapping[str, object]) -> None:
-    """Write a TOML file that reads back as the same values, to the last bit of a number.
+    """Write a TOML file of tables, as :func:`text` has them."""
+    with files.whole(path) as unfinished:
+        unfinished.write_text(text(tables), encoding="utf-8")
+
+
+def text(tables: Mapping[str, object]) -> str:
+    """Tables as TOML that reads back as the same values, to the last bit of a number.
 
     By hand: tomli-w gives each number of a matrix a line, and puts all bodies into one list; tomlkit is slower to
     import than the rest of a scene file is to read.
 
     Args:
-        path: The file.
         tables: Strings, numbers, truth values and lists of them, tables of these, and lists of tables.
     """
     plain, blocks = {}, []
@@ -87,8 +92,7 @@ def write(path: Path, tables: Mapping[str, object]) -> None:
             blocks += [block(f"[[{name}]]", table) for table in value]
         else:
             plain[name] = value
-    with files.whole(path) as unfinished:
-        unfinished.write_text("\n".join([_lines(plain), *blocks] if plain else blocks), encoding="utf-8")
+    return "\n".join([_lines(plain), *blocks] if plain else blocks)
 
 
 def block(header: str, table: Mapping[str, object]) -> str:

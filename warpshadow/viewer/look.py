@@ -16,7 +16,6 @@ from warpshadow.scene.scene import (
     METHODS,
     READ_BY,
     RECEIVERS,
-    SPHERE_METHODS,
     Body,
     Scene,
     Visibility,
@@ -29,6 +28,9 @@ MOST_CELLS, MOST_SPHERES, MOST_BOUNCES, MOST_STOPS = 1024, 512, 8, 20.0
 
 AS_GIVEN = "as given"
 """Receivers, and numbers of spheres, as the scene has them."""
+
+PICTURE, ERROR = "picture", "error against rays"
+"""What is shown of the scene: it, or, once all rests, how far it is from rays."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Look:
         spheres: For each body that casts shadows, how many; None as the scene has them.
         receivers: Of all bodies, or :data:`AS_GIVEN`.
         bounces: Of light; methods that find none leave them out.
+        shows: :data:`PICTURE` or :data:`ERROR`.
         shows_light: Whether the light itself is behind the bodies.
         places: Of the bodies.
     """
@@ -78,6 +81,7 @@ class Look:
     spheres: int | None
     receivers: str
     bounces: int
+    shows: str
     shows_light: bool
     places: tuple[Place, ...]
 
@@ -97,6 +101,7 @@ class Look:
         check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
         check_bounces(self.bounces)
         within("bounces", self.bounces, 0, MOST_BOUNCES)
+        check.choice("shows", self.shows, (PICTURE, ERROR))
         check.flag("shows_light", self.shows_light)
         for place in self.places:
             check.instance("places", place, Place, "a Place for each body")
@@ -114,6 +119,7 @@ class Look:
             spheres=None,
             receivers=AS_GIVEN,
             bounces=min(scene.bounces, MOST_BOUNCES),
+            shows=PICTURE,
             shows_light=False,
             places=tuple(Place(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
         )
@@ -155,7 +161,7 @@ class Look:
         """The scene as it is shown."""
         settings = self.settings(scene)
         bodies = tuple(
-            dataclasses.replace(body, rotation=place.rotation, translation=place.translation)
+            dataclasses.replace(body, rotation=np.array(place.rotation), translation=np.array(place.translation))
             for body, place in zip(settings.bodies, self.places, strict=True)
         )
         return dataclasses.replace(settings, bodies=bodies, light=self.light(scene.light))
@@ -163,11 +169,6 @@ class Look:
     def has_moved(self, scene: Scene) -> bool:
         """Whether a body is not where the scene has it."""
         return self.places != Look.of(scene).places
-
-    @property
-    def has_spheres(self) -> bool:
-        """Whether the method takes spheres."""
-        return self.method in SPHERE_METHODS
 
 
 def within(name: str, value: object, least: float, most: float) -> None:

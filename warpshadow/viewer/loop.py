@@ -118,6 +118,12 @@ class Loop:
             self.depth = self.depth if depth is None else depth
             self._ask(*self._seats.values())
 
+    def camera_of(self, name: Hashable) -> PageCamera | None:
+        """From where a page looks; None where it is gone, or has not said."""
+        with self._asked:
+            seat = self._seats.get(name)
+            return None if seat is None else seat.camera
+
     def _ask(self, *seats: _Seat) -> None:
         self._last_asked = time.monotonic()
         for seat in seats:

@@ -103,7 +103,6 @@ def upward(camera: Camera) -> tuple[float, float, float]:
     return x, y, z
 
 
-
 def rotation(wxyz: tuple[float, ...] | np.ndarray) -> Rotation:
     """The rotation that a page says as a quaternion, w first."""
     return Rotation.from_quat(np.roll(np.asarray(wxyz, np.float64), -1))

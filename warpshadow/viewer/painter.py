@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
 from warpshadow.tuning.renderer import Renderer
-from warpshadow.viewer.look import Look
+from warpshadow.viewer.look import ERROR, Look
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
 
@@ -30,6 +30,7 @@ _BACKGROUND = 0.05  # linear gray behind what is not covered
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
 _RENDERERS, _SIZES = 6, 8  # that are kept
 _FAR = 160.0  # depth of what is not there [page units]; viser knows none beyond 167
+_RAYS = 256  # of a pixel, that an error is told against
 _DEPTH_PIXELS = 256**2  # of depths, which are sent without loss
 
 Value = TypeVar("Value")
@@ -46,6 +47,7 @@ class Frame:
         quality: What it was allowed to cost.
         seconds: How long it took.
         cells: What it was made with, in words.
+        error: Relative L2 error of the bodies' pixels against rays; None where nobody asked for it.
     """
 
     rgb: np.ndarray
@@ -53,6 +55,7 @@ class Frame:
     quality: Quality
     seconds: float
     cells: str
+    error: float | None = None
 
 
 class Painter:
@@ -66,6 +69,7 @@ class Painter:
     Attributes:
         scene: The scene.
         page_scale: Units of a page in a unit of the scene.
+        coarse_light: The scene's light, as it is used while something moves.
     """
 
     def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
@@ -77,7 +81,7 @@ class Painter:
         self._sized: Recent[Renderer] = Recent(_SIZES)
         self._lights: Recent[EnvironmentMap | np.ndarray] = Recent(4)
         self._geometries: Recent[Geometry] = Recent(_RENDERERS)
-        self._coarse = coarse(scene.light)
+        self.coarse_light = coarse(scene.light)
 
     def paint(self, look: Look, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
         """Paint what a page sees.
@@ -90,7 +94,13 @@ class Painter:
         """
         start = time.perf_counter()
         renderer, view, camera, image = self._drawn(look, page, quality)
-        rgb = picture(image, look.stops, behind=self._behind(look, camera, quality))
+        error = None
+        if look.shows == ERROR and not quality.is_moving:
+            truth = self.image(replace(look, method="ray-traced"), page, replace(quality, rays=_RAYS))
+            error = relative_error(image, truth)
+            rgb = error_picture(image, truth)
+        else:
+            rgb = picture(image, look.stops, behind=self._behind(look, camera, quality))
         depths = None
         if depth:
             depths = self.page_scale * distances(renderer, view)
@@ -100,11 +110,20 @@ class Painter:
             cells = f"{settings.directions} directions"
         else:
             cells = f"{settings.samples} rays" if settings.method == "ray-traced" else settings.method
-        return Frame(rgb, depths, quality, time.perf_counter() - start, cells)
+        return Frame(rgb, depths, quality, time.perf_counter() - start, cells, error)
 
     def image(self, look: Look, page: PageCamera, quality: Quality) -> np.ndarray:
         """Linear RGB, premultiplied, and coverage of what a page sees, shape [height, width, 4]."""
         return self._drawn(look, page, quality)[-1]
+
+    @one_at_a_time
+    def spheres(self, look: Look) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Centers and radii of each body's spheres, in its own space; fitted where that was not done yet."""
+        quality = Quality(1, cells=64, rays=16, supersampling=1, is_moving=True)
+        renderer = self._renderer(replace(look, method="directional"), quality)
+        rest, first = renderer.rest(), renderer.assembly.first_sphere
+        centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
+        return [(centers[a:b], radii[a:b]) for a, b in zip(first[:-1], first[1:], strict=True)]
 
     def natural_stops(self) -> float:
         """Exposure [stops] of the scene's own picture, of few pixels."""
@@ -155,7 +174,7 @@ class Painter:
         return self._geometries.get((id(renderer), look.places), placed)
 
     def _light(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
-        return look.light(self._coarse if quality.is_moving else self.scene.light)
+        return look.light(self.coarse_light if quality.is_moving else self.scene.light)
 
     def _behind(self, look: Look, camera: Camera, quality: Quality) -> np.ndarray:
         """Linear RGB behind the bodies: a gray, or the light itself, that a picture shows as it is."""
@@ -226,9 +245,34 @@ def picture(image: np.ndarray, stops: float, behind: np.ndarray) -> np.ndarray:
 _SRGB = np.round(255 * linear_to_srgb(np.linspace(0, 1, 4096) ** 2)).astype(np.uint8)
 
 
+def relative_error(image: np.ndarray, truth: np.ndarray) -> float | None:
+    """Relative L2 error of color over pixels that are wholly covered in both; None where there is none."""
+    covered = (image[..., 3] == 1) & (truth[..., 3] == 1)
+    size = np.linalg.norm(truth[covered, :3])
+    return float(np.linalg.norm((image - truth)[covered, :3]) / size) if size > 0 else None
+
+
+def error_picture(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """How far an image is from the truth, a fifth of its mean as full red (too bright) or blue (too dark).
+
+    Args:
+        image: Linear RGB and coverage, shape [height, width, 4].
+        truth: Likewise.
+
+    Returns:
+        uint8 of shape [height, width, 3].
+    """
+    covered = truth[truth[..., 3] > 0, :3]
+    mean = float(covered.mean()) if len(covered) else 0.0
+    excess = np.clip((image - truth)[..., :3].mean(axis=-1) / (0.2 * mean), -1, 1) if mean > 0 else 0 * image[..., 0]
+    white = np.ones_like(excess)
+    red, blue = np.minimum(white, 1 + excess), np.minimum(white, 1 - excess)
+    return (255 * np.stack([red, np.minimum(red, blue), blue], axis=-1)).round().astype(np.uint8)
+
+
 def seen_light(light: EnvironmentMap, camera: Camera) -> np.ndarray:
     """Radiance that a camera sees where no body is, shape [height, width, 3]."""
-    _, (x, y, z) = camera.rays()[0], np.moveaxis(camera.rays()[1], -1, 0)
+    x, y, z = np.moveaxis(camera.rays()[1], -1, 0)
     rows, columns, _ = light.radiance.shape
     row = np.arccos(np.clip(y, -1, 1)) / np.pi * rows
     column = np.arctan2(x, -z) / (2 * np.pi) % 1 * columns

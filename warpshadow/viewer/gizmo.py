@@ -1,0 +1,39 @@
+"""Handles to drag a body by: at its middle, in units of a page."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warpshadow.scene.scene import Body
+from warpshadow.viewer.look import Place
+from warpshadow.viewer.page_camera import quaternion, rotation
+
+
+def middle(body: Body) -> np.ndarray:
+    """Middle of a body in its own space, scaled."""
+    low, high = body.mesh.bounds
+    return body.scale * 0.5 * (np.asarray(low, np.float64) + high)
+
+
+def radius(body: Body) -> float:
+    """Half of a body's diagonal [scene units]."""
+    low, high = body.mesh.bounds
+    return 0.5 * body.scale * float(np.linalg.norm(np.asarray(high, np.float64) - low))
+
+
+def handle_of(place: Place, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the handles of a body are: quaternion, w first, and position [page units]."""
+    turned = Rotation.from_rotvec(place.rotation, degrees=True)
+    return quaternion(turned), page_scale * (turned.apply(middle(body)) + place.translation)
+
+
+def place_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> Place:
+    """Where a body is that was dragged by its handles.
+
+    Raises:
+        ValueError: for what is not finite, and for a quaternion of 0.
+    """
+    turned = rotation(wxyz)
+    translation = np.asarray(position, np.float64) / page_scale - turned.apply(middle(body))
+    return Place(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))

@@ -1,0 +1,249 @@
+"""The panel beside the picture, and what can be dragged in it. All pages share it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.primitives import icosphere
+from warpshadow.scene.scene import METHODS, RECEIVERS
+from warpshadow.viewer import gizmo
+from warpshadow.viewer.look import AS_GIVEN, ERROR, PICTURE, Look, Place
+from warpshadow.viewer.loop import Loop
+from warpshadow.viewer.page_camera import quaternion
+from warpshadow.viewer.painter import Painter, picture
+from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
+
+_NOTHING = "nothing"
+_CELLS = (16, 32, 64, 128, 256, 512)
+_SPHERES = (16, 32, 64, 128, 256, 512)
+_HANDLES = "/handles"
+_MAP_COLUMNS = 256
+
+
+class Panel:
+    """What a scene may be changed by.
+
+    Args:
+        server: Shows it.
+        loop: Is told of changes.
+        painter: Knows the scene.
+        path: The scene's file; None where it has none.
+    """
+
+    def __init__(self, server: viser.ViserServer, loop: Loop, painter: Painter, path: Path | None = None):
+        self._server, self._loop, self._painter, self._path = server, loop, painter, path
+        self._scene, self._scale = painter.scene, painter.page_scale
+        self._inputs: list[tuple[Any, Callable[[Look], Any]]] = []
+        self._handles: viser.TransformControlsHandle | None = None
+        self._dragged: int | None = None
+        self._spheres: dict[int, viser.BatchedMeshHandle] = {}
+        self._first = loop.look
+        self._add_light()
+        self._add_shadows()
+        self._add_bodies()
+        save = server.gui.add_button("Save scene", hint="Download the scene as it is shown, and from where you look")
+        save.on_click(self._save)
+
+    # ------------------------------------------------------------------------------------------ what it consists of
+
+    def _add_light(self) -> None:
+        gui, look = self._server.gui, self._loop.look
+        with gui.add_folder("Light"):
+            self._map = None
+            if isinstance(self._scene.light, EnvironmentMap):
+                self._map = gui.add_image(self._map_picture(look), label="middle: +z", format="jpeg")
+            turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, look.turn)
+            self._bind(turn, lambda look: look.turn, lambda value: {"turn": value})
+            scale = gui.add_slider("Scale [stops]", -6.0, 6.0, 0.1, 0.0)
+            self._bind(scale, lambda look: float(np.log2(max(look.scale, 2**-6))), lambda value: {"scale": 2.0**value})
+            if self._map is not None:
+                behind = gui.add_checkbox("Behind the bodies", look.shows_light)
+                self._bind(behind, lambda look: look.shows_light, lambda value: {"shows_light": value})
+            stops = gui.add_slider("Exposure [stops]", look.stops - 6, look.stops + 6, 0.1, look.stops)
+            self._bind(stops, lambda look: look.stops, lambda value: {"stops": value})
+
+    def _add_shadows(self) -> None:
+        gui, look = self._server.gui, self._loop.look
+        cells, counts = sorted({*_CELLS, look.directions}), (AS_GIVEN, *map(str, _SPHERES))
+        with gui.add_folder("Shadows"):
+            method = gui.add_dropdown("Method", METHODS, initial_value=look.method)
+            self._bind(method, lambda look: look.method, lambda value: {"method": value})
+            directions = gui.add_dropdown("Directions", tuple(map(str, cells)), initial_value=str(look.directions))
+            self._bind(directions, lambda look: str(look.directions), lambda value: {"directions": int(value)})
+            softness = gui.add_slider("Softness", 0.05, 1.5, 0.05, look.softness)
+            self._bind(softness, lambda look: look.softness, lambda value: {"softness": value})
+            spheres = gui.add_dropdown("Spheres", counts, hint="Other numbers are fitted once, some 20 s a body")
+            self._bind(
+                spheres,
+                lambda look: AS_GIVEN if look.spheres is None else str(look.spheres),
+                lambda value: {"spheres": None if value == AS_GIVEN else int(value)},
+            )
+            receivers = gui.add_dropdown("Receivers", (AS_GIVEN, *RECEIVERS), initial_value=look.receivers)
+            self._bind(receivers, lambda look: look.receivers, lambda value: {"receivers": value})
+            if self._scene.bounces:
+                bounces = gui.add_slider("Bounces", 0, max(4, look.bounces), 1, look.bounces)
+                self._bind(bounces, lambda look: look.bounces, lambda value: {"bounces": value})
+            shows = gui.add_dropdown("Show", (PICTURE, ERROR), hint="Red: too bright, by 20% of the mean; blue: dark")
+            self._bind(shows, lambda look: look.shows, lambda value: {"shows": value})
+
+    def _add_bodies(self) -> None:
+        gui = self._server.gui
+        self._names = [f"{number}: {body.called}" for number, body in enumerate(self._scene.bodies)]
+        with gui.add_folder("Bodies"):
+            dragged = gui.add_dropdown("Drag", (_NOTHING, *self._names))
+            balls = gui.add_checkbox("Show spheres", False)
+            back = gui.add_button("Put back", hint="Bodies and settings as the scene has them")
+
+        @dragged.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if dragged.value in (_NOTHING, *self._names):
+                self._drag(None if dragged.value == _NOTHING else self._names.index(dragged.value))
+
+        @balls.on_update
+        def _(event: viser.GuiEvent) -> None:  # in a thread of its own: spheres may have to be fitted
+            self._guarded(event, lambda: self._show_spheres(bool(balls.value)))
+
+        @back.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            self._loop.update(lambda _: self._first)
+            self._put_back()
+
+    # ------------------------------------------------------------------------------------------ what it does
+
+    def _bind(self, handle: Any, value_of: Callable[[Look], Any], changes: Callable[[Any], dict[str, Any]]) -> None:
+        """Change the look when a page changes an input; put the input back where that is refused."""
+        self._inputs.append((handle, value_of))
+
+        @handle.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:  # not by ourselves
+                self._guarded(event, lambda: self._changed(**changes(handle.value)))
+
+    def _guarded(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
+        """Do what a page asks for; say why if that is refused."""
+        try:
+            act()
+        except (ValueError, OverflowError, TypeError) as error:
+            self._put_back()
+            if event.client is not None:
+                event.client.add_notification("Refused", str(error), color="red", auto_close_seconds=8)
+
+    def _changed(self, **changes: Any) -> None:
+        before = self._loop.look
+        look = self._loop.change(**changes)
+        if self._map is not None and look.turn != before.turn:
+            self._map.image = self._map_picture(look)
+        if look.spheres != before.spheres and self._spheres:
+            self._server.get_event_loop().run_in_executor(None, self._show_spheres, True)
+
+    def _put_back(self) -> None:
+        """Let inputs and handles say what is shown."""
+        look = self._loop.look
+        for handle, value_of in self._inputs:
+            handle.value = value_of(look)
+        if self._map is not None:
+            self._map.image = self._map_picture(look)
+        self._move_handles(look)
+        self._move_spheres(look)
+
+    def _map_picture(self, look: Look) -> np.ndarray:
+        """The light as it is turned."""
+        light = look.light(self._painter.coarse_light)
+        assert isinstance(light, EnvironmentMap)
+        step = max(1, light.radiance.shape[1] // _MAP_COLUMNS)
+        small = light.radiance[::step, ::step]
+        alpha = np.ones((*small.shape[:2], 1), np.float32)
+        stops = -float(np.log2(max(np.percentile(small.max(axis=-1), 95), 1e-12)))
+        return picture(np.concatenate([small, alpha], axis=-1), stops, np.zeros(3))
+
+    def _save(self, event: viser.GuiEvent) -> None:
+        client = event.client
+        page = None if client is None else self._loop.camera_of(client.client_id)
+        if client is None or page is None:
+            return
+        camera, look = saved_camera(self._scene, page, self._scale), self._loop.look
+        if self._path is not None:
+            client.send_file_download(self._path.name, as_toml(self._path, self._scene, look, camera))
+        else:
+            client.send_file_download("scene.zip", as_archive(self._scene, look, camera))
+
+    # ------------------------------------------------------------------------------------------ in the picture
+
+    def _drag(self, number: int | None) -> None:
+        """Put handles at a body, and take away those of another."""
+        if self._handles is not None:
+            self._handles.remove()
+        self._handles, self._dragged = None, number
+        if number is not None:
+            body = self._scene.bodies[number]
+            wxyz, position = gizmo.handle_of(self._loop.look.places[number], body, self._scale)
+            self._handles = self._server.scene.add_transform_controls(
+                _HANDLES,
+                scale=1.5 * self._scale * gizmo.radius(body),  # they begin inside the body, and end outside of it
+                wxyz=wxyz,
+                position=position,
+            )
+            self._handles.on_update(self._dragging)
+        self._loop.again(depth=self._needs_depth)
+
+    @property
+    def _needs_depth(self) -> bool:
+        return self._handles is not None or bool(self._spheres)
+
+    async def _dragging(self, event: viser.TransformControlsEvent) -> None:
+        number = self._dragged
+        if number is None:
+            return
+        body = self._scene.bodies[number]
+        try:
+            place = gizmo.place_of(event.target.wxyz, event.target.position, body, self._scale)
+        except ValueError:  # not finite
+            self._move_handles(self._loop.look)
+            return
+
+        def moved(look: Look) -> Look:
+            places = [*look.places]
+            places[number] = place
+            return dataclasses.replace(look, places=tuple(places))
+
+        self._move_spheres(self._loop.update(moved))
+
+    def _move_handles(self, look: Look) -> None:
+        if self._handles is not None and self._dragged is not None:
+            body = self._scene.bodies[self._dragged]
+            wxyz, position = gizmo.handle_of(look.places[self._dragged], body, self._scale)
+            self._handles.wxyz, self._handles.position = wxyz, position
+
+    def _show_spheres(self, shows: bool) -> None:
+        for handle in self._spheres.values():
+            handle.remove()
+        self._spheres = {}
+        ball = icosphere(subdivisions=2)
+        for number, (centers, radii) in enumerate(self._painter.spheres(self._loop.look) if shows else ()):
+            if len(radii):
+                factor = self._scale * self._scene.bodies[number].scale
+                self._spheres[number] = self._server.scene.add_batched_meshes_simple(
+                    f"/spheres/{number}",
+                    ball.positions,
+                    ball.faces,
+                    np.tile([1.0, 0.0, 0.0, 0.0], (len(radii), 1)),
+                    factor * centers,
+                    batched_scales=factor * radii,
+                    opacity=0.35,
+                )
+        self._move_spheres(self._loop.look)
+        self._loop.again(depth=self._needs_depth)
+
+    def _move_spheres(self, look: Look) -> None:
+        for number, handle in self._spheres.items():
+            place: Place = look.places[number]
+            handle.wxyz = quaternion(Rotation.from_rotvec(place.rotation, degrees=True))
+            handle.position = self._scale * np.array(place.translation)

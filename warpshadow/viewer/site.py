@@ -1,0 +1,197 @@
+"""The viewer in a browser: viser's server, a page for each client, and the panel beside the picture."""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import io
+import socket
+import time
+import warnings
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import viser
+import warp as wp
+
+from warpshadow import check
+from warpshadow.scene.scene import AUTO, Scene
+from warpshadow.tuning.tune import resolved
+from warpshadow.viewer.door import OWN_NAMES, Server
+from warpshadow.viewer.look import Look
+from warpshadow.viewer.loop import Loop
+from warpshadow.viewer.page_camera import PageCamera, rotation, upward
+from warpshadow.viewer.painter import Frame, Painter, bounds, own_page
+from warpshadow.viewer.panel import Panel
+
+_PATIENCE = 2.0  # seconds that a page has to take a picture before it is sent the next
+_STATUS_SECONDS = 0.25  # between two notes of how long pictures take
+_MOVING_JPEG, _RESTING_JPEG = 80, 95
+
+
+class Site:
+    """A scene in the browser, until it is closed.
+
+    Args:
+        scene: The scene; "auto" is replaced by a choice.
+        host: Address to serve at; others than this machine's own let everybody in who can reach it.
+        port: Port, or the next that is free.
+        device: Warp device.
+        progress: Show progress where something takes longer than a second.
+        path: The scene's file, which is saved with what was changed in it; None where it has none.
+
+    Attributes:
+        painter: Paints pictures.
+        loop: Renders for pages.
+        url: Where the page is.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        host: str,
+        port: int,
+        device: wp.DeviceLike = "cpu",
+        progress: bool = False,
+        path: Path | None = None,
+    ):
+        _check_address(host, port)
+        if scene.visibility.method == AUTO:
+            scene = resolved(scene, device=device, progress=progress)
+        self.painter = Painter(scene, device=device, progress=progress)
+        self.loop = Loop(self.painter.paint, Look.of(scene, self.painter.natural_stops()))
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
+            self._server = Server(host, port)
+        name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
+        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self._server.get_port()}"
+        self._start_where_the_scene_looks()
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        self._panel = Panel(self._server, self.loop, self.painter, path)
+        self._pages: dict[int, _ViserPage] = {}
+        self._server.on_client_connect(self._let_in)
+        self._server.on_client_disconnect(self._let_go)
+
+    def close(self) -> None:
+        """Close all pages and the server."""
+        self.loop.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def _start_where_the_scene_looks(self) -> None:
+        scene, scale = self.painter.scene, self.painter.page_scale
+        page = own_page(scene, scale)
+        forward, position = rotation(page.wxyz).as_matrix()[:, 2], np.array(page.position)
+        low, high = bounds(scene)
+        distance = max(float(forward @ (scale * 0.5 * (low + high) - position)), 0.5)
+        up = upward(scene.camera)
+        self._server.scene.set_up_direction(up)
+        first = self._server.initial_camera
+        first.position = position
+        first.look_at = position + distance * forward
+        first.up = np.array(up)
+        first.fov = float(np.radians(page.fov_y))
+
+    async def _let_in(self, client: viser.ClientHandle) -> None:
+        self._server.refuse_uploads_of(client)
+        page = self._pages[client.client_id] = _ViserPage(client)
+        self.loop.join(client.client_id, page)
+        self._moved(client)
+
+        @client.camera.on_update
+        async def _(_: viser.CameraHandle) -> None:
+            self._moved(client)
+
+    def _moved(self, client: viser.ClientHandle) -> None:
+        """A page looks from elsewhere, unless what it says is no camera."""
+        camera = client.camera
+        try:
+            seen = PageCamera(
+                tuple(camera.wxyz),
+                tuple(camera.position),
+                float(np.degrees(camera.fov)),
+                camera.image_width,
+                camera.image_height,
+            )
+        except (ValueError, TypeError) as error:
+            self._pages[client.client_id].fail(f"camera: {error}")
+        else:
+            self.loop.look_from(client.client_id, seen)
+
+    async def _let_go(self, client: viser.ClientHandle) -> None:
+        self.loop.leave(client.client_id)
+        page = self._pages.pop(client.client_id, None)
+        if page is not None:
+            page.close()
+
+
+class _ViserPage:
+    """A client of viser's, for the loop.
+
+    A page answers a question about its storage after it has taken all that was sent before; so we know that it has
+    taken a picture, and how long that took.
+    """
+
+    def __init__(self, client: viser.ClientHandle):
+        self._client = client
+        self._asking = ThreadPoolExecutor(1)
+        self._taken: Future[None] | None = None
+        self._status = client.gui.add_html("", order=-1.0)
+        self._last_status, self._message = 0.0, ""
+
+    def send(self, frame: Frame, delay: float) -> None:
+        """Begin to send a picture."""
+        quality = _MOVING_JPEG if frame.quality.is_moving else _RESTING_JPEG
+        asked = time.monotonic() - delay
+        self._client.scene.set_background_image(frame.rgb, format="jpeg", jpeg_quality=quality, depth=frame.depth)
+        self._client.flush()
+        self._taken = self._asking.submit(self._ask, frame, asked)
+
+    def wait(self) -> None:
+        """Return when the page has taken the last picture, or after some seconds."""
+        if self._taken is not None:
+            self._taken.result()
+
+    def fail(self, message: str | None) -> None:
+        """Show what went wrong, or that nothing does."""
+        if (message or "") != self._message:
+            self._message = message or ""
+            self._write(f'<b style="color:#f66">{html.escape(self._message)}</b>' if message else "")
+
+    def close(self) -> None:
+        """Ask nothing more."""
+        self._asking.shutdown(wait=False, cancel_futures=True)
+
+    def _ask(self, frame: Frame, asked: float) -> None:
+        with contextlib.suppress(RuntimeError, TimeoutError):  # RuntimeError: gone, or its storage is blocked
+            self._client.local_storage.get_item("taken", timeout=_PATIENCE)
+        now = time.monotonic()
+        if not self._message and (now - self._last_status > _STATUS_SECONDS or not frame.quality.is_moving):
+            self._last_status = now
+            height, width, _ = frame.rgb.shape
+            delay = f"{1e3 * (now - asked):.0f} ms from mouse to picture" if frame.quality.is_moving else "at rest"
+            error = "" if frame.error is None else f"<br>error against rays {frame.error:.2%}"
+            self._write(f"{delay}<br>{width} × {height}, {frame.cells}, {1e3 * frame.seconds:.0f} ms{error}")
+
+    def _write(self, content: str) -> None:
+        self._status.content = f'<div style="padding:0.4em 1em;font-size:0.8em;line-height:1.4">{content}</div>'
+
+
+def _check_address(host: object, port: object) -> None:
+    """Raise ValueError unless one can serve there; warn where others can come in."""
+    if check.whole("port", port, least=0) > 65535:
+        raise ValueError(f"port: got {port}, expected at most 65535")
+    expected = "an address or a name of this machine, such as '127.0.0.1', or '0.0.0.0' for all that it has"
+    check.instance("host", host, str, expected)
+    assert isinstance(host, str)
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()  # type: ignore[arg-type]
+    except (OSError, UnicodeError) as cause:
+        raise ValueError(f"host: got {host!r} ({cause}), expected {expected}") from cause
+    if host not in OWN_NAMES:
+        warnings.warn(
+            f"host: got {host!r}: everybody who can reach this address sees the scene and can change what is shown",
+            stacklevel=4,
+        )

@@ -1,0 +1,115 @@
+"""What Python and the command line know of viewers; viser is imported once one is asked for."""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import html
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.scene.scene import SCENE, Scene
+
+HOST, PORT = "127.0.0.1", 8080
+"""Where pages are by default: for this machine alone."""
+
+
+class Viewer:
+    """A scene in the browser, until it is closed; a notebook shows it.
+
+    Args:
+        url: Where its page is.
+        close: Ends it.
+
+    Attributes:
+        url: Where its page is.
+    """
+
+    def __init__(self, url: str, close: Callable[[], None]):
+        self.url = url
+        self._close = close
+
+    def open(self, browser: bool | None = True) -> None:
+        """Open a browser, or leave it; None: unless this is a notebook."""
+        if browser is None:
+            browser = not hasattr(builtins, "__IPYTHON__")
+        if browser:
+            webbrowser.open(self.url)
+
+    def wait(self) -> None:
+        """Serve until Ctrl+C."""
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+        self.close()
+
+    def close(self) -> None:
+        """Close its pages and its server."""
+        self._close()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{html.escape(self.url)}" width="100%" height="600" style="border:none"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"Viewer({self.url})"
+
+
+def view(
+    scene: Scene,
+    *,
+    host: str = HOST,
+    port: int = PORT,
+    browser: bool | None = None,
+    device: wp.DeviceLike = "cpu",
+    progress: bool = False,
+) -> Viewer:
+    """Show a scene in the browser, where mouse and panel turn it, its light and its bodies.
+
+    Needs viser: ``pip install "warpshadow[viewer]"``.
+
+    Args:
+        scene: The scene.
+        host: Address to serve at. The default is for this machine alone; at others everybody who can reach them sees
+            the scene, and can change what is shown.
+        port: Port, or the next one that is free.
+        browser: Whether to open a browser; None for yes, unless this is a notebook, which shows the page itself.
+        device: Warp device.
+        progress: Show progress where something takes longer than a second.
+
+    Returns:
+        The viewer. A script ends with ``viewer.wait()``, since pages are served only while the process runs.
+
+    Raises:
+        ImportError: without viser.
+    """
+    check.instance("scene", scene, Scene, SCENE)
+    viewer = serve(scene, host=host, port=port, device=device, progress=progress)
+    viewer.open(browser)
+    return viewer
+
+
+def serve(
+    scene: Scene,
+    *,
+    host: str = HOST,
+    port: int = PORT,
+    device: wp.DeviceLike = "cpu",
+    progress: bool = False,
+    path: Path | None = None,
+) -> Viewer:
+    """Serve the page of a scene; see :func:`view`.
+
+    Args:
+        scene, host, port, device, progress: As there.
+        path: The scene's file, which is saved with what was changed in it; None where it has none.
+    """
+    try:
+        from warpshadow.viewer.site import Site
+    except ImportError as cause:
+        raise ImportError(f'the viewer needs viser ({cause}); pip install "warpshadow[viewer]"') from cause
+    site = Site(scene, host=host, port=port, device=device, progress=progress, path=path)
+    return Viewer(site.url, site.close)
