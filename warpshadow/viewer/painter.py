@@ -135,7 +135,7 @@ class Painter:
         sized = _resized(camera, page.size(quality.pixels))
         matrix = wp.array([sized.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         small = renderer.with_cameras([sized])
-        return auto_exposure(small.draw(view=small.view(clip_matrices=matrix)).numpy()[0])
+        return round(auto_exposure(small.draw(view=small.view(clip_matrices=matrix)).numpy()[0]), 1)
 
     @one_at_a_time
     def _drawn(self, look: Look, page: PageCamera, quality: Quality) -> tuple[Renderer, View, Camera, np.ndarray]:

@@ -16,6 +16,8 @@ FEWEST, MOST = 96**2, 512**2
 FULL = 1 << 20
 """Pixels of an image while all rests."""
 
+_STEP = 1.3  # of pixels, that is worth another image
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -67,6 +69,7 @@ class Pace:
         goal = min(FULL, canvas)
         if last.is_moving:
             return Quality(min(goal, 256**2), cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False)
-        if last.pixels >= goal or 4 * seconds > LONGEST:
+        pixels = min(goal, 4 * last.pixels, int(last.pixels * LONGEST / max(seconds, 1e-3)))
+        if last.pixels >= goal or pixels < min(goal, _STEP * last.pixels):
             return None
-        return Quality(min(goal, 4 * last.pixels), last.cells, last.rays, last.supersampling, is_moving=False)
+        return Quality(pixels, last.cells, last.rays, last.supersampling, is_moving=False)

@@ -1,0 +1,117 @@
+"""A scene that is taken home is the one that was shown."""
+
+import dataclasses
+import io
+import zipfile
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from warpshadow.viewer.look import Look, Place
+from warpshadow.viewer.page_camera import PageCamera
+from warpshadow.viewer.painter import own_page
+from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
+
+ROUNDING = 1e-6  # of float32 maps that were turned in one step or in two; whole pixels here
+
+FILE = """
+[camera]
+eye = [0.0, 2.0, 5.0]
+target = [0.0, 0.5, 0.0]
+size = [64, 48]
+supersampling = 3
+
+[light]
+envmap = "sky.exr"
+rotation = 90.0
+scale = 2.0
+
+[visibility]
+order = 4
+
+[[body]]
+primitive = "icosphere"
+spheres = "ball.npz"
+albedo = [0.2, 0.4, 0.6]
+name = "ball"
+
+[[body]]
+primitive = "plane"
+size = 6.0
+segments = 8
+blockers = 0
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    ws.EnvironmentMap(np.random.default_rng(0).uniform(0, 1, (16, 32, 3)).astype(np.float32)).write(
+        tmp_path / "sky.exr"
+    )
+    ws.Spheres([[0, 0, 0]], [1.0]).write(tmp_path / "ball.npz")
+    (tmp_path / "scene.toml").write_text(FILE)
+    return tmp_path / "scene.toml"
+
+
+def changed(scene):
+    return dataclasses.replace(
+        Look.of(scene),
+        turn=45.0,
+        scale=0.5,
+        directions=64,
+        softness=0.5,
+        receivers="pixel",
+        bounces=2,
+        places=(Place((0, 30, 0), (0.1, 1.0, 0)), Place((0, 0, 0), (0, 0, 0))),
+    )
+
+
+def assert_same(read, shown):
+    assert vars(read.visibility) == vars(shown.visibility)
+    assert (read.bounces, read.supersampling) == (shown.bounces, shown.supersampling)
+    np.testing.assert_allclose(read.light.radiance, shown.light.radiance, atol=ROUNDING)
+    np.testing.assert_allclose(read.camera.clip_matrix(), shown.camera.clip_matrix(), atol=ROUNDING)
+    for one, other in zip(read.bodies, shown.bodies, strict=True):
+        assert (one.receivers, one.called) == (other.receivers, other.called)
+        np.testing.assert_allclose(one.rotation, other.rotation)
+        np.testing.assert_allclose(one.translation, other.translation)
+        np.testing.assert_allclose(one.albedo, other.albedo)
+
+
+def test_a_scene_file_comes_back_with_what_was_changed(path, tmp_path):
+    scene = ws.load_scene(path)
+    look, page = changed(scene), own_page(scene, 2.0)
+    camera = saved_camera(scene, page, 2.0)
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, camera))
+    assert 'envmap = "sky.exr"' in (tmp_path / "saved.toml").read_text()
+    assert_same(ws.load_scene(tmp_path / "saved.toml"), dataclasses.replace(look.scene(scene), camera=camera))
+
+
+def test_a_scene_file_of_a_look_that_changes_nothing_is_the_same_scene(path, tmp_path):
+    scene = ws.load_scene(path)
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, Look.of(scene), scene.camera))
+    assert_same(ws.load_scene(tmp_path / "saved.toml"), scene)
+
+
+def test_other_numbers_of_spheres_take_the_place_of_given_ones(path, tmp_path):
+    scene = ws.load_scene(path)
+    look = dataclasses.replace(Look.of(scene), spheres=32)
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, scene.camera))
+    assert [body.blockers for body in ws.load_scene(tmp_path / "saved.toml").bodies] == [32, 0]
+
+
+def test_an_archive_has_the_scene_and_all_that_it_names(path, tmp_path):
+    scene = ws.load_scene(path)
+    look = changed(scene)
+    archive = zipfile.ZipFile(io.BytesIO(as_archive(scene, look, scene.camera)))
+    archive.extractall(tmp_path / "home")
+    assert_same(ws.load_scene(tmp_path / "home" / "scene.toml"), look.scene(scene))
+
+
+def test_a_saved_camera_is_as_high_as_the_scenes_and_as_wide_as_the_page(path):
+    scene = ws.load_scene(path)
+    page = PageCamera((1, 0, 0, 0), (0, 0, -5), 40.0, 2000, 1000)
+    camera = saved_camera(scene, page, 1.0)
+    assert (camera.width, camera.height) == (96, 48)
+    assert camera.intrinsics[0, 0] == pytest.approx(camera.intrinsics[1, 1])
