@@ -584,6 +584,20 @@ def test_cameras_share_the_visibility_of_moving_geometry(device):
     np.testing.assert_array_equal(renderer.draw(view=view).numpy(), renderer.render())
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_renderer_for_other_cameras_draws_what_one_made_for_them_does(device, method):
+    scene = scene_of(method, ball(), ground(receivers="vertex"), light=sunny())
+    renderer = Renderer(scene, device=device)
+    before = renderer.render()
+    cameras = [ws.Camera.look_at((x, 2, 4), (0, 0.6, 0), size=(24, 40)) for x in (-1, 1)]
+    other = renderer.with_cameras(cameras)
+    expected = Renderer(scene, cameras=cameras, device=device).render()
+    np.testing.assert_allclose(other.render(), expected, atol=FLOAT32)
+    np.testing.assert_array_equal(renderer.render(), before)  # which has kept its own
+    np.testing.assert_allclose(pickle.loads(pickle.dumps(other)).render(), expected, atol=FLOAT32)
+    assert other.assembly is renderer.assembly
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -139,7 +139,7 @@ class Renderer:
         """Make a renderer of the same scene for other cameras, which may be of another size; it computes little anew.
 
         Both share what depends on no camera: spheres, own shadows, what is known of the light. Receivers "auto" stay
-        as they were chosen.
+        as they were chosen, and images that show nothing draw no warning.
 
         Args:
             cameras: Any number of them, of one size and near plane, whose images are a batch.
@@ -151,7 +151,7 @@ class Renderer:
         other.cameras, other.has_camera_batch = tuple(cameras), True
         other._cameras = Source("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=other.device))
         other._scene_view = other._last_view = other._last_cameras = None
-        other._has_warned = False
+        other._has_warned = True
         return other
 
     def moved(self: Own, device: wp.DeviceLike) -> Own:
