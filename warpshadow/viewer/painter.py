@@ -120,7 +120,7 @@ class Painter:
     def spheres(self, look: Look) -> list[tuple[np.ndarray, np.ndarray]]:
         """Centers and radii of each body's spheres, in its own space; fitted where that was not done yet."""
         quality = Quality(1, cells=64, rays=16, supersampling=1, is_moving=True)
-        renderer = self._renderer(replace(look, method="directional"), quality)
+        _, renderer = self._renderer(replace(look, method="directional"), quality)
         rest, first = renderer.rest(), renderer.assembly.first_sphere
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         return [(centers[a:b], radii[a:b]) for a, b in zip(first[:-1], first[1:], strict=True)]
@@ -131,7 +131,7 @@ class Painter:
         page = PageCamera((1, 0, 0, 0), (0, 0, 0), 60, camera.width, camera.height)
         look = Look.of(self.scene)
         quality = Quality(128**2, cells=64, rays=16, supersampling=1, is_moving=True)
-        renderer = self._renderer(look, quality)
+        _, renderer = self._renderer(look, quality)
         sized = _resized(camera, page.size(quality.pixels))
         matrix = wp.array([sized.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         small = renderer.with_cameras([sized])
@@ -141,20 +141,21 @@ class Painter:
     def _drawn(self, look: Look, page: PageCamera, quality: Quality) -> tuple[Renderer, View, Camera, np.ndarray]:
         size = page.size(quality.pixels)
         camera = page.camera(size, page_scale=self.page_scale, near=self.scene.camera.near)
-        renderer = self._renderer(look, quality)
-        sized = self._sized.get((id(renderer), size), lambda: renderer.with_cameras([camera]))
+        key, renderer = self._renderer(look, quality)
+        sized = self._sized.get((key, size), lambda: renderer.with_cameras([camera]))
         matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
-        view = sized.view(self._geometry(renderer, look), matrix)
+        view = sized.view(self._geometry(key, renderer, look), matrix)
         light = self._lights.get((look.turn, look.scale, quality.is_moving), lambda: self._light(look, quality))
         return sized, view, camera, sized.draw(light, view=view).numpy()[0]
 
-    def _renderer(self, look: Look, quality: Quality) -> Renderer:
+    def _renderer(self, look: Look, quality: Quality) -> tuple[Hashable, Renderer]:
+        """The renderer of what is shown, and by what it is known."""
         scene = look.settings(self.scene, quality)
         settings = scene.visibility, scene.bounces, scene.supersampling, look.spheres, look.receivers
         key = (*vars(settings[0]).values(), *settings[1:])
-        return self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
+        return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
-    def _geometry(self, renderer: Renderer, look: Look) -> Geometry | None:
+    def _geometry(self, key: Hashable, renderer: Renderer, look: Look) -> Geometry | None:
         """Where bodies are; None where the scene has them."""
         if not look.has_moved(self.scene):
             return None
@@ -171,7 +172,7 @@ class Painter:
                 )
             )
 
-        return self._geometries.get((id(renderer), look.places), placed)
+        return self._geometries.get((key, look.places), placed)
 
     def _light(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
         return look.light(self.coarse_light if quality.is_moving else self.scene.light)

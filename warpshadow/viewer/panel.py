@@ -187,7 +187,7 @@ class Panel:
             wxyz, position = gizmo.handle_of(self._loop.look.places[number], body, self._scale)
             self._handles = self._server.scene.add_transform_controls(
                 _HANDLES,
-                scale=1.5 * self._scale * gizmo.radius(body),  # they begin inside the body, and end outside of it
+                scale=1.2 * self._scale * gizmo.radius(body),  # they begin inside the body, and end outside of it
                 wxyz=wxyz,
                 position=position,
             )

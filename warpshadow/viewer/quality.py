@@ -10,7 +10,7 @@ SECONDS = 1 / 24
 LONGEST = 1.0
 """What an image may take while all rests [s]: so long a page waits when it moves again."""
 
-FEWEST, MOST = 96**2, 512**2
+FEWEST, MOST = 160**2, 512**2
 """Pixels of an image while something moves."""
 
 FULL = 1 << 20

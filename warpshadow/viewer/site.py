@@ -8,7 +8,7 @@ import io
 import socket
 import time
 import warnings
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,7 @@ class Site:
             scene = resolved(scene, device=device, progress=progress)
         self.painter = Painter(scene, device=device, progress=progress)
         self.loop = Loop(self.painter.paint, Look.of(scene, self.painter.natural_stops()))
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a page may close at any time
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
             self._server = Server(host, port)
         name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
@@ -146,12 +147,14 @@ class _ViserPage:
         asked = time.monotonic() - delay
         self._client.scene.set_background_image(frame.rgb, format="jpeg", jpeg_quality=quality, depth=frame.depth)
         self._client.flush()
-        self._taken = self._asking.submit(self._ask, frame, asked)
+        with contextlib.suppress(RuntimeError):  # it was closed in the meantime
+            self._taken = self._asking.submit(self._ask, frame, asked)
 
     def wait(self) -> None:
         """Return when the page has taken the last picture, or after some seconds."""
         if self._taken is not None:
-            self._taken.result()
+            with contextlib.suppress(CancelledError):  # it was closed
+                self._taken.result()
 
     def fail(self, message: str | None) -> None:
         """Show what went wrong, or that nothing does."""

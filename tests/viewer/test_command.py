@@ -1,0 +1,64 @@
+"""`warpshadow view`: it serves until Ctrl+C, and says in one line what is wrong."""
+
+import http.client
+import os
+import re
+import signal
+import subprocess
+import sys
+from urllib.parse import urlsplit
+
+import pytest
+from typer.testing import CliRunner
+
+import warpshadow as ws
+from warpshadow.cli import app
+
+PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
+
+SCENE = """
+camera = {eye = [0, 2, 4], target = [0, 0.5, 0], size = [32, 24]}
+light = {sh = [[1, 1, 1], [0.4, 0.4, 0.4], [0, 0, 0], [0, 0, 0]]}
+[[body]]
+primitive = "icosphere"
+subdivisions = 1
+blockers = 0
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return tmp_path / "scene.toml"
+
+
+@pytest.mark.slow
+def test_it_serves_the_page_until_it_is_interrupted(scene):
+    pytest.importorskip("viser", reason="viser is not installed")
+    command = [*PROGRAM, "view", str(scene), "--port", "0", "--no-browser"]
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as run:
+        line = run.stdout.readline()
+        url = re.match(r"(http://127\.0\.0\.1:\d+) ", line).group(1)
+        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
+        connection.request("GET", "/")
+        answer = connection.getresponse()
+        assert answer.status == 200 and b"<html" in answer.read()
+        run.send_signal(signal.SIGINT)
+        out, err = run.communicate(timeout=60)
+    assert run.returncode == 0 and out == "" and "Traceback" not in err
+
+
+def test_a_mistake_is_one_line(scene, tmp_path):
+    for arguments, part in (([tmp_path / "no.toml"], "no.toml"), ([scene, "--host", "no.host.invalid"], "host: got")):
+        result = CliRunner().invoke(app, ["view", *map(str, arguments), "--no-browser"])
+        assert result.exit_code == 1 and result.stderr.startswith("error: ") and part in result.stderr
+        assert result.stderr.count("\n") == 1
+
+
+def test_without_viser_it_says_what_to_install(scene, monkeypatch):
+    monkeypatch.setitem(sys.modules, "warpshadow.viewer.site", None)
+    with pytest.raises(ImportError, match=r'the viewer needs viser .*; pip install "warpshadow\[viewer\]"'):
+        ws.view(ws.load_scene(scene))
+    result = CliRunner().invoke(app, ["view", str(scene)])
+    assert result.exit_code == 1 and 'pip install "warpshadow[viewer]"' in result.stderr
