@@ -52,14 +52,17 @@ def picture(data):
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
 
-def shown(page):
-    page.rest()
+def shown(site, page, since=0):
+    """The best picture of what was asked for since some number of messages."""
+    page.until(is_image, since)
+    page.until(lambda _: site.loop.is_content)
+    page.rest(0.5)
     return picture(page.images()[-1])
 
 
 def test_a_page_is_sent_the_ball_and_a_note_of_how_long_it_took(site, page):
     page.look_from(position=(0, 0, -8.0))
-    image = shown(page)
+    image = shown(site, page)
     assert image.shape == (120, 160, 3)
     middle, corner = image[55:65, 75:85].mean(), image[:5, :5].mean()
     assert middle > corner + 30 and len(page.images()) >= 2
@@ -78,10 +81,11 @@ def test_a_camera_that_is_none_is_refused_and_the_next_is_taken(page):
 
 def test_inputs_change_the_light_unless_they_make_no_sense(site, page):
     page.look_from(position=(0, 0, -8.0))
-    before = shown(page)
+    before = shown(site, page)
+    since = len(page.heard)
     page.enter("Turn [°]", 120.0)
-    eventually(lambda: site.loop.look.turn == 120.0)
-    assert np.abs(shown(page) - before).mean() > 2
+    assert np.abs(shown(site, page, since) - before).mean() > 2
+    assert site.loop.look.turn == 120.0
     for value in (float("nan"), 1e9):
         since = len(page.heard)
         page.enter("Turn [°]", value)
@@ -95,13 +99,14 @@ def test_inputs_change_the_light_unless_they_make_no_sense(site, page):
 
 def test_a_body_is_dragged_by_handles_and_put_back(site, page):
     page.look_from(position=(0, 0, -8.0))
-    before = shown(page)
+    before = shown(site, page)
     page.enter("Drag", "0: ball")
     page.until(lambda message: message["type"] == "TransformControlsMessage")
     page.until(lambda message: is_image(message) and message["depth_data"])  # which hides handles
+    since = len(page.heard)
     page.say("TransformControlsUpdateMessage", name="/handles", wxyz=(1, 0, 0, 0), position=(1.5, 0, 0), owner="")
     eventually(lambda: site.loop.look.places[0].translation[0] > 0.1)
-    after = shown(page)
+    after = shown(site, page, since)
     columns = np.arange(160)
 
     def center(image):
@@ -137,7 +142,12 @@ def test_two_pages_look_from_where_they_want_and_see_one_scene(site, page):
     other = WirePage(site.url)
     page.look_from(position=(0, 0, -8.0))
     other.look_from(position=(0, 0, -4.0))
-    near, far = shown(other), shown(page)
+    for each in (page, other):
+        each.until(is_image)
+    while not site.loop.is_content:  # each page answers for itself
+        page.listen(0.02)
+        other.listen(0.02)
+    near, far = shown(site, other), shown(site, page)
     background = far[:3, :3].mean()
     assert (near.mean(axis=-1) > background + 30).mean() > 2 * (far.mean(axis=-1) > background + 30).mean()
     other.enter("Turn [°]", 60.0)

@@ -124,6 +124,12 @@ class Loop:
             seat = self._seats.get(name)
             return None if seat is None else seat.camera
 
+    @property
+    def is_content(self) -> bool:
+        """Whether all pages have the best pictures of what they asked for, or the reason why they have none."""
+        with self._asked:
+            return all(seat.is_content and seat.asked is None for seat in self._seats.values())
+
     def _ask(self, *seats: _Seat) -> None:
         self._last_asked = time.monotonic()
         for seat in seats:
@@ -162,12 +168,13 @@ class Loop:
         with self._asked:
             while seat.is_open:
                 if seat.asked is not None and seat.camera is not None:
-                    asked, seat.asked = seat.asked, None
+                    asked, seat.asked, seat.is_content = seat.asked, None, False
                     return seat.camera, pace.moving(), asked
                 better = None
                 if last is not None:
                     camera, quality, seconds = last
                     better = pace.better(quality, seconds, camera.width * camera.height)
+                seat.is_content = better is None
                 if better is None:
                     self._asked.wait()
                     continue
@@ -185,4 +192,5 @@ class _Seat:
         self.page = page
         self.camera: PageCamera | None = None
         self.asked: float | None = None  # when; None where that is answered
+        self.is_content = False  # whether it has the best picture of the latest that it asked for
         self.is_open = True
