@@ -235,7 +235,7 @@ def flats(double, device):
     faces = np.int32([[0, 1, 2], [0, 2, 3]])
     near = np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
     found = [grids(square, faces, is_two_sided=is_two_sided, others=near) for is_two_sided in (False, True)]
-    module = double("stages.bounces.flats")
+    module = double("stages.flats.prepared")
     count = found[0].count
     bodies = [
         module.FlatBody(patches.grid, square, faces, 4 * number, number * count, True)
@@ -265,14 +265,14 @@ def test_light_of_flats(double, flats, check):
 
 def test_what_passes_flats(double, flats, check):
     directions = double("maths.directions").fibonacci(16)
-    passing_flats = double("stages.bounces.flat_light").passing_flats
+    passing_flats = double("stages.flats.passing").passing_flats
     given = (wp.vec3d, flat_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
     check(lambda *scene: passing_flats(*scene, flats, directions), *given)
 
 
 def test_what_patches_show(double, flats, check, device):
     directions = double("maths.directions").fibonacci(16)
-    openness, sparse = double("stages.bounces.openness"), double("stages.bounces.sparse").SparseMatrix
+    openness, sparse = double("stages.bounces.openness"), double("stages.sparse").SparseMatrix
     points, normals = flat_receivers()
     spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii)
@@ -283,7 +283,7 @@ def test_what_patches_show(double, flats, check, device):
 
 
 def test_radiosity_and_own_light(double, device, check):
-    sparse, own_light = double("stages.bounces.sparse").SparseMatrix, double("stages.bounces.own_light").own_light
+    sparse, own_light = double("stages.sparse").SparseMatrix, double("stages.bounces.own_light").own_light
     radiosity = double("stages.bounces.radiosity")
     mean = radiosity.mean_over_sources(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
     factors = sparse.of(np.abs(random(0, 5, 3)), device=device)

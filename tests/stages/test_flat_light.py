@@ -7,9 +7,10 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
-from warpshadow.stages.bounces.flats import FlatBody, Flats
+from warpshadow.stages.bounces.flat_light import flat_light
 from warpshadow.stages.bounces.patches import find_flat_patches
+from warpshadow.stages.flats.passing import passing_flats
+from warpshadow.stages.flats.prepared import FlatBody, Flats
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

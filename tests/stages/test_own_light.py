@@ -11,9 +11,9 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.patches import find_patches
-from warpshadow.stages.bounces.sparse import SparseMatrix
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.ray_tracing import trace_visibility
+from warpshadow.stages.sparse import SparseMatrix
 
 FLOAT32 = 1e-5
 LATTICE = 0.01

@@ -5,7 +5,8 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.stages.bounces.patches import find_flat_patches, find_patches, squeezed, stretched
+from warpshadow.stages.bounces.patches import find_flat_patches, find_patches
+from warpshadow.stages.flats.grid import squeezed, stretched
 
 ROUNDING = 1e-5
 

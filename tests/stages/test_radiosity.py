@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow.device.tape import recorded
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 

@@ -92,6 +92,11 @@ def expand(array: wp.array, instances: int) -> wp.array:
     return concatenate([array], array.shape[1:], instances=instances)
 
 
+def expand_rows(rows: wp.array, instances: int) -> wp.array:
+    """Repeat an array of shape [1, row, item] for every instance, as :func:`expand` does. Differentiable: rows."""
+    return expand(rows.reshape((rows.shape[0], -1)), instances).reshape((instances, *rows.shape[1:]))
+
+
 @functools.cache
 def _make_add(dtype: type) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import common_batch, cut, expand
+from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.directional import Cells, Directional
+from warpshadow.pipeline.directional import Cells
 from warpshadow.pipeline.kept_bounces import KeptBounces
 from warpshadow.pipeline.lighting import Group, InParts, LitPoints, Seen, SphereMethod, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
@@ -28,16 +28,16 @@ from warpshadow.pipeline.own_factors import own_factors
 from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
-from warpshadow.stages.bounces.flat_light import flat_light, passing_flats
-from warpshadow.stages.bounces.flats import FlatBody, Flats
+from warpshadow.stages.bounces.flat_light import flat_light
 from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.radiosity import patch_radiosity
-from warpshadow.stages.bounces.sparse import SparseMatrix
 from warpshadow.stages.bounces.sphere_light import sphere_light
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.flats.prepared import FlatBody, Flats
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.shading import shade
+from warpshadow.stages.sparse import SparseMatrix
 from warpshadow.stages.visibility.directional import transmittance
 
 CELLS = fibonacci(64)
@@ -156,18 +156,22 @@ class Gathering:
         visibility = self._bounces.method.visibility
         count = common_batch({"geometry": group.points, "light": exitance})
         points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, centers, radii))
-        given = points, normals, centers, radii, exitance, _expanded(cells.through, count), cells.own, cells.directions
+        given = (
+            points,
+            normals,
+            centers,
+            radii,
+            exitance,
+            expand_rows(cells.through, count),
+            cells.own,
+            cells.directions,
+        )
         return sphere_light(*given, softness=visibility.softness, merging=visibility.merging)
 
 
 def _shade(transfers: list[wp.array], light: wp.array) -> wp.array:
     """Light receivers by what groups of them see of free light. Differentiable: light."""
     return joined([shade(transfer, light) for transfer in transfers])
-
-
-def _expanded(rows: wp.array, count: int) -> wp.array:
-    """Repeat an array [1, receiver, cell] for every instance. Differentiable: rows."""
-    return expand(rows.reshape((len(rows), -1)), count).reshape((count, *rows.shape[1:]))
 
 
 class LitPart(NamedTuple):
@@ -181,33 +185,15 @@ class LitPart(NamedTuple):
 class LitSources(InParts):
     """Direct light at the sources; what they see is kept with it, for light that bounces."""
 
-    def __init__(
-        self, bounces: SphereBounces, senders: Senders, points: LitPoints, own: Node, light: Source, frames: Node
-    ):
-        self._bounces, self._senders = bounces, senders
-        super().__init__(bounces.method, points, own, light, list, where=" of sources", extra=(frames,))
+    def __init__(self, bounces: SphereBounces, points: LitPoints, own: Node, light: Source):
+        self._bounces = bounces
+        super().__init__(bounces.method, points, own, light, list, where=" of sources")
 
     def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> LitPart:
         """Light a part, and keep what it sees."""
-        (frames,) = extra
         seen = self.see(call, part, own)
-        shading = self.light(call, part, self._bounces.past_flats(part, seen, own, self._senders, frames), own)
+        shading = self.light(call, part, seen, own)
         return LitPart(shading, part, self._bounces.cells(part, seen, own, spheres))
-
-
-class DirectLight(InParts):
-    """Direct light, or transfer vectors, past flat bodies; arguments are those of :class:`InParts`."""
-
-    def __init__(self, bounces: SphereBounces, senders: Senders, frames: Node, *given: Any, **options: Any):
-        self._bounces, self._senders = bounces, senders
-        super().__init__(bounces.method, *given, extra=(frames,), **options)
-
-    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
-        """Light a part."""
-        (frames,) = extra
-        return self.light(
-            call, part, self._bounces.past_flats(part, self.see(call, part, own), own, self._senders, frames), own
-        )
 
 
 class Radiosity(Node):
@@ -264,21 +250,20 @@ class BouncedShading(InParts):
         points: LitPoints,
         own: Node,
         light: Source,
-        frames: Node,
         radiosity: Radiosity,
         senders: Senders,
     ):
-        self._bounces, self._senders = bounces, senders
+        self._bounces = bounces
         given = points.receivers_node, radiosity
         self._gathering = Gathering(bounces, senders, given, functools.partial(receiver_words, points))
         stages = self._gathering.stages
-        super().__init__(bounces.method, points, own, light, joined, extra=(frames, radiosity), beside=stages)
+        super().__init__(bounces.method, points, own, light, joined, extra=(radiosity,), beside=stages)
 
     def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
         """Light a part, directly and by what patches send."""
-        frames, outgoing = extra
+        (outgoing,) = extra
         seen = self.see(call, part, own)
-        direct = self.light(call, part, self._bounces.past_flats(part, seen, own, self._senders, frames), own)
+        direct = self.light(call, part, seen, own)
         cells = self._bounces.cells(part, seen, own, spheres)
         return total_light([direct, *self._gathering.run(call, part, cells, outgoing)])
 
@@ -311,8 +296,6 @@ class SphereBounces:
         self._flats: dict[Senders, PlacedFlats] = {}
         self._spheres_of_sources: dict[Senders, np.ndarray] = {}
         self._nodes: dict[tuple[Senders, int | None], tuple[np.ndarray, np.ndarray]] = {}
-        if isinstance(method, Directional):
-            method.flats = self.flats
 
     def shading(self, points: LitPoints, own: Node, light: Source, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
@@ -330,10 +313,10 @@ class SphereBounces:
         frames = self._frames(points, senders)
         words = f"{len(senders.sides):,} sources"
         sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
-        lit = LitSources(self, senders, self._at(sources, points, materials), own, light, frames)
+        lit = LitSources(self, self._at(sources, points, materials), own, light)
         albedo = self.patches.albedo(materials, senders.bodies)
         radiosity = Radiosity(self, senders, sources, lit, albedo, points.spheres, frames)
-        return BouncedShading(self, points, own, light, frames, radiosity, senders)
+        return BouncedShading(self, points, own, light, radiosity, senders)
 
     def kept_shading(self, points: LitPoints, own: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.
@@ -350,17 +333,10 @@ class SphereBounces:
             direct = Node("shading", _shade, points.transfers, light)
             transfers = points.kept("transfer", sources, lambda: self.method.transfers(at_sources, where))
             return self._still.in_free_light(direct, transfers, light, points, materials)
-        direct = points.kept("direct", light, lambda: self.direct(points, own, light, joined))
-        make = functools.partial(self.direct, at_sources, own, light, joined, where=where)
+        direct = points.kept("direct", light, lambda: InParts(self.method, points, own, light, joined))
+        make = functools.partial(InParts, self.method, at_sources, own, light, joined, where=where)
         lit = points.kept("direct at sources", (light, sources), make)
         return self._still.in_known_light(direct, lit, points, materials)
-
-    def direct(
-        self, points: LitPoints, own: Any, light: Source | None, finish: Callable, **options: Any
-    ) -> DirectLight:
-        """Direct light of points, as :class:`InParts` finds it, past flat bodies."""
-        senders = self.patches.senders(points.materials)
-        return DirectLight(self, senders, self._frames(points, senders), points, own, light, finish, **options)
 
     @functools.cached_property
     def _still(self) -> KeptBounces:
@@ -458,17 +434,9 @@ class SphereBounces:
             self._spheres_of_sources[senders] = self._nearest(senders, None)[0][senders.patch_of_source]
         return self._spheres_of_sources[senders]
 
-    def past_flats(self, group: Group, seen: Seen, light: Any, senders: Senders, frames: wp.array | None) -> Seen:
-        """What a group sees past flat bodies, too, where no spheres stand in for these."""
-        flats = self.flats_of(senders)
-        if flats is None or not isinstance(light, Cells):
-            return seen
-        given = group.points, seen.through, frames, flats.all, light.directions
-        return seen._replace(through=passing_flats(*given, skip=flats.number.get(group.body)))
-
     def cells(self, group: Group, seen: Seen, light: Any, spheres: tuple[wp.array, wp.array]) -> SeenCells:
         """What a group sees in cells, of what it sees, what the method takes of the light, and all spheres."""
-        through, own, directions = seen.through, seen.own, CELLS
+        through, own, directions = seen.through if seen.solid is None else seen.solid, seen.own, CELLS
         if isinstance(light, Cells):
             directions = light.directions
         else:

@@ -15,6 +15,8 @@ from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, 
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import OwnLookup, Traced
 from warpshadow.pipeline.static import Rows, Static
+from warpshadow.spheres import Spheres
+from warpshadow.stages.flats.passing import passing_flats
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
@@ -83,6 +85,22 @@ class Directional(SphereMethod):
     def _scales(self, scale: float) -> dict[str, float]:
         """Settings in radii of cells, of radii that are so much smaller."""
         return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
+
+    @functools.cached_property
+    def blocking_flats(self) -> tuple[int, ...]:
+        """Flat bodies that cast shadows, but for those with spheres of the user's own, unless light bounces."""
+        scene, casting = self.assembly.scene, self.assembly.casting
+        own = [number for number in casting if isinstance(scene.bodies[number].blockers, Spheres) and not scene.bounces]
+        return tuple(number for number in self.flats.numbers if number in casting and number not in own)
+
+    def past_flats(self, group: Group, seen: Seen, light: Cells) -> Seen:
+        """Transmittance past the flat bodies around a group, too."""
+        points, around, through = group.points, group.around, seen.through
+        if around is None or through is None or not points.size:
+            return seen
+        facing = group.normals if group.kept is None else None
+        given = points, through, around.frames, around.flats, light.directions
+        return seen._replace(through=passing_flats(*given, facing=facing, skip=around.skip), solid=through)
 
     def _see_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""

@@ -27,8 +27,8 @@ from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.factors import loose_mesh, trace_factors
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
 from warpshadow.stages.bounces.radiosity import reflect
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -1,7 +1,7 @@
 """Lighting: where light is evaluated, and what each method of visibility makes of it there."""
 
 import functools
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -15,7 +15,8 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.device.progress import progress_bar
 from warpshadow.maths import sh
-from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.assembly import Assembly, Geometry
+from warpshadow.pipeline.flats import FlatsAround, SceneFlats
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import NOT_TRACED, OwnLobes, OwnLookup, OwnShadows, Traced
 from warpshadow.pipeline.reflectance import Materials
@@ -148,7 +149,7 @@ class Method:
         self.basis = own_basis if basis is None else basis
         self.visibility = assembly.scene.visibility
         self.light = Source("light", assembly.scene.light)
-        self._numberings: dict[tuple[int, ...], list[Numbering]] = {}
+        self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
@@ -171,18 +172,18 @@ class Method:
         bodies = np.arange(len(self.assembly.scene.bodies))
         if self.assembly.scene.bounces:
             return bodies
-        if not traced.bodies:
-            return None
-        return np.where(np.isin(bodies, traced.bodies), bodies, -1)
+        named = (*traced.bodies, *traced.flats)
+        return np.where(np.isin(bodies, named), bodies, -1) if named else None
 
     def numbering(self, traced: Traced, has_backs: bool) -> Numbering:
         """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
-        if traced.bodies not in self._numberings:
+        key = traced.bodies, traced.flats
+        if key not in self._numberings:
             faces, can_receive, apart = self.assembly.faces, self.can_receive, self.apart(traced)
             bodies = None if apart is None else apart[self.assembly.body_of_vertex]
             sides = can_receive[:1], can_receive
-            self._numberings[traced.bodies] = [number_receivers(faces, each, bodies=bodies) for each in sides]
-        return self._numberings[traced.bodies][has_backs]
+            self._numberings[key] = [number_receivers(faces, each, bodies=bodies) for each in sides]
+        return self._numberings[key][has_backs]
 
     def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
@@ -262,19 +263,22 @@ class Group(NamedTuple):
     body: int | None = None  # whose receivers they are, where bodies are told apart
     places: Places | None = None  # where they lie on that body
     own: OwnLookup | OwnLobes | None = None  # what they see past it, if that is not up to its spheres; None for all
+    around: FlatsAround | None = None  # flat bodies that block as planes; None for none
 
     def parts(self) -> Iterator["Group"]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept, _, places, _ = self
+        points, normals, centers, radii, kept, _, places, _, around = self
         size = points.shape[1]
         turns = None if self.own is None else self.own.turned
-        if radii.shape[1] or turns is not None:
-            count = common_batch({"points": points, "centers": centers, "radii": radii, "rotations": turns})
+        frames = None if around is None else around.frames
+        if radii.shape[1] or turns is not None or frames is not None:
+            given = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "flats": frames}
+            count = common_batch(given)
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
-        varying = [*self[:4], turns]
+        varying = [*self[:4], turns, frames]
         if kept is not None or size <= PART or varies(varying):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
             return
@@ -294,6 +298,7 @@ class Seen(NamedTuple):
 
     through: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
     own: wp.array | None = None  # the share that its own body lets through, which is in it; None where that is all
+    solid: wp.array | None = None  # past all but flat bodies that block as planes; None where there are none of them
 
 
 class Bouncing(Protocol):
@@ -311,9 +316,6 @@ class Bouncing(Protocol):
     def kept_shading(self, points: LitPoints, own: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still; what does not depend on light and materials is kept."""
 
-    def direct(self, points: LitPoints, own: Any, light: Source | None, finish: Callable, **options: Any) -> Node:
-        """Direct light of points, as :class:`InParts` finds it, past flat bodies."""
-
 
 class SphereMethod(Method):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
@@ -322,7 +324,6 @@ class SphereMethod(Method):
         in_free: What the method takes of any free light.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         bounces: How light bounces; None where it does not.
-        flats: Bodies whose spheres block nothing, since what bounces knows better what they block.
         joins_kept: Whether visibility is found of kept rows and of what moves together.
     """
 
@@ -330,7 +331,27 @@ class SphereMethod(Method):
     why_no_shadows = ""
     joins_kept = False
     bounces: "Bouncing | None" = None
-    flats: tuple[int, ...] = ()
+
+    @functools.cached_property
+    def blocking_flats(self) -> tuple[int, ...]:
+        """Bodies that block as the planes in which they lie, in place of their spheres."""
+        return ()
+
+    @functools.cached_property
+    def flats(self) -> SceneFlats:
+        """The bodies that lie in planes."""
+        return SceneFlats(self.assembly)
+
+    def flats_in(self, geometry: Geometry | None) -> tuple[int, ...]:
+        """Bodies that block as planes in a geometry, by default the scene's: where light does not bounce, no deformed
+        ones.
+        """
+        deformed = () if geometry is None or self.assembly.scene.bounces else geometry.deformed
+        return tuple(body for body in self.blocking_flats if body not in deformed)
+
+    def past_flats(self, group: Group, seen: Seen, light: Any) -> Seen:
+        """What a group sees past the flat bodies around it, too, of what it sees past all else."""
+        raise NotImplementedError
 
     def in_known(self, light: KnownLight) -> Any:
         """What the method takes of known light: its coefficients, and what they belong to."""
@@ -387,8 +408,7 @@ class SphereMethod(Method):
     def transfers(self, points: LitPoints, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to what the method computes in."""
         matrix = self.own_from_basis
-        make = functools.partial(InParts, self) if self.bounces is None else self.bounces.direct
-        own = make(points, self.in_free, None, list, keeps=matrix is None, where=where)
+        own = InParts(self, points, self.in_free, None, list, keeps=matrix is None, where=where)
         if matrix is None or own.requires_grad:
             return own
 
@@ -443,10 +463,24 @@ class InParts(Node):
             idle=lambda: _why_unblocked(method, points),
             keeps=False,
         )
+        flats = points.traced.flats
+        place = functools.partial(method.flats.frames, flats) if flats else lambda _: None
+        frames = Node("", place, points.vertices)
+        self._passing = Node(
+            f"flats{where}",
+            method.past_flats,
+            receivers,
+            self._visibility,
+            own,
+            frames,
+            items=lambda: f"{words()} × {len(flats)} flat {'body' if len(flats) == 1 else 'bodies'}",
+            idle="" if flats else "spheres stand in for what casts shadows",
+            keeps=False,
+        )
         self._transfer = result = Node(
             f"transfer{where}",
             method.transfer,
-            self._visibility,
+            self._passing,
             own,
             items=lambda: f"{words()} × {method.coefficient_count(light)} coefficients",
             keeps=False,
@@ -458,16 +492,17 @@ class InParts(Node):
         shadows = _static_shadows(method, points, light)
         kept = shadows if shadows.function else None
         looked_up: Node | dict = own_shadows if own_shadows.function else {}
-        given = receivers, spheres, own, kept, looked_up, *extra
+        given = receivers, spheres, own, kept, looked_up, frames, *extra
         super().__init__("", None, *given, beside=(own_shadows, shadows, result, *beside), keeps=keeps)
 
     def compute(self, call: Call) -> Any:
         """Find it for one part after another."""
-        receivers, spheres, own, kept, looked_up, *extra = self.values(call)
-        groups = list(self._groups(receivers, spheres, looked_up))
+        receivers, spheres, own, kept, looked_up, frames, *extra = self.values(call)
+        groups = list(self._groups(receivers, spheres, looked_up, frames))
         if self._static is not None and len(receivers.still):
             on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
-            group = Group(*on_static, *self._static.moving_spheres(spheres), kept)
+            moving = self._method.assembly.spheres_of(self._solid(self._static.moving), spheres)
+            group = Group(*on_static, *moving, kept, around=self._around(frames, self._static.moving))
             groups = [group, *groups] if receivers.points.shape[1] else [group]
         total, results = len(receivers.still) + receivers.points.shape[1], []
         with progress_bar(total, "shading", "receiver", wanted=self._progress) as bar:
@@ -483,7 +518,8 @@ class InParts(Node):
 
     def see(self, call: Call, part: Group, own: Any) -> Seen:
         """What a part sees."""
-        return self._visibility.run(call, part, own)
+        seen = self._visibility.run(call, part, own)
+        return seen if part.around is None else self._passing.run(call, part, seen, own)
 
     def light(self, call: Call, part: Group, seen: Seen, own: Any) -> wp.array:
         """Transfer vectors of a part that sees something, or its shading."""
@@ -491,27 +527,53 @@ class InParts(Node):
         return transfer if self._shading is None else self._shading.run(call, transfer, part, own)
 
     def _groups(
-        self, receivers: Receivers, spheres: tuple[wp.array, wp.array], looked_up: dict[int, Any]
+        self,
+        receivers: Receivers,
+        spheres: tuple[wp.array, wp.array],
+        looked_up: dict[int, Any],
+        frames: wp.array | None,
     ) -> Iterator[Group]:
         """Receivers that may move, in groups that the same spheres block."""
         method = self._method
-        bodies = [body for body in range(len(method.assembly.scene.bodies)) if body not in method.flats]
+        bodies = self._solid(range(len(method.assembly.scene.bodies)))
         if not receivers.spans:
-            yield Group(receivers.points, receivers.normals, *method.assembly.spheres_of(bodies, spheres))
+            blocking = method.assembly.spheres_of(bodies, spheres)
+            yield Group(receivers.points, receivers.normals, *blocking, around=self._around(frames))
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
             is_traced = span.body in self._points.traced.bodies
             others = [body for body in bodies if not (is_traced and body == span.body)]
-            group = Group(points, normals, *method.assembly.spheres_of(others, spheres))
+            blocking = method.assembly.spheres_of(others, spheres)
+            group = Group(points, normals, *blocking, around=self._around(frames, but=span.body))
             if span.body >= 0:
                 places, own = method.own.places(receivers, span), looked_up.get(span.body)
                 group = group._replace(body=span.body, places=places, own=own)
             yield group
 
+    def _solid(self, bodies: Iterable[int]) -> list[int]:
+        """Those of some bodies that block by their spheres."""
+        return [body for body in bodies if body not in self._points.traced.flats]
+
+    def _around(
+        self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1
+    ) -> FlatsAround | None:
+        """Flat bodies around receivers of one body: all that block, or some."""
+        flats = self._points.traced.flats
+        named = flats if blocking is None else tuple(body for body in flats if body in blocking)
+        if frames is None or not set(named) - {but}:
+            return None
+        return FlatsAround(self._method.flats.among(flats, named), frames, flats.index(but) if but in flats else None)
+
+
+def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
+    """Number of spheres by which each body blocks light."""
+    bodies = np.arange(len(method.assembly.scene.bodies))
+    return np.where(np.isin(bodies, points.traced.flats), 0, method.assembly.sphere_counts)
+
 
 def _pairs(method: SphereMethod, points: LitPoints) -> str:
     """Receivers and the spheres that block them, in words."""
-    counts = method.assembly.sphere_counts
+    counts = _sphere_counts(method, points)
     words = f"{receiver_words(points, static=False)} × {counts.sum():,} spheres"
     if points.static is None:
         return words
@@ -521,9 +583,10 @@ def _pairs(method: SphereMethod, points: LitPoints) -> str:
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     """Why no visibility has to be found; empty if it has."""
-    counts, (_, moving, static) = method.assembly.sphere_counts, points.counts()
+    counts, (_, moving, static) = _sphere_counts(method, points), points.counts()
     if method.why_no_shadows or not counts.sum():
-        return method.why_no_shadows or "no body has blockers"
+        rest = "but flat ones " if points.traced.flats else ""
+        return method.why_no_shadows or f"no body {rest}has blockers"
     if moving or (points.static and static and (method.joins_kept or counts[list(points.static.moving)].sum())):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
@@ -531,7 +594,7 @@ def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
 
 def _own_shadows(method: SphereMethod, points: LitPoints, light: Any) -> Node:
     """Node of what bodies' receivers look up of their own bodies, by body."""
-    bodies, rotations, _ = points.traced
+    bodies, rotations = points.traced[:2]
     named = [body for body in bodies if not method.own.is_flat[body]]
     if not named or rotations is None:
         return Node("own shadows", None, idle=lambda: _why_no_own(method, points))

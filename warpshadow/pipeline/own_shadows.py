@@ -33,11 +33,12 @@ VERSION = 2
 
 
 class Traced(NamedTuple):
-    """The bodies of a geometry whose own spheres do not block their light, and how bodies are turned."""
+    """The bodies of a geometry whose own spheres do not block their light, and how bodies are turned; and flat ones."""
 
     bodies: tuple[int, ...] = ()
     rotations: Source | None = None
     why: tuple[str, ...] = ()  # the others' do, of each body
+    flats: tuple[int, ...] = ()  # bodies that block as the planes in which they lie, in place of their spheres
 
 
 NOT_TRACED = Traced()

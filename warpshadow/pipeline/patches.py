@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,13 +10,14 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.flats import SceneFlats
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import Patches, find_flat_patches, find_patches
 from warpshadow.stages.bounces.radiosity import mean_over_sources
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
 class ScenePatches:
@@ -25,10 +25,15 @@ class ScenePatches:
 
     Args:
         assembly: The bodies.
+
+    Attributes:
+        flats: Those that lie in a plane.
     """
 
     def __init__(self, assembly: Assembly):
         self.assembly = self._assembly = assembly
+        self._scene_flats = SceneFlats(assembly)
+        self.flats = self._scene_flats.numbers
         self._of_body: dict[int, Patches] = {}
         self._means: dict[tuple, SparseMatrix] = {}
         self._senders: dict[tuple[int, ...], Senders] = {}
@@ -39,7 +44,7 @@ class ScenePatches:
             mesh, is_two_sided = self._assembly.scene.bodies[number].mesh, bool(self._assembly.is_two_sided[number])
             corners, found = (mesh.positions, mesh.surface.faces), None
             if number in self.flats:
-                others = self._others_in_frame(number)
+                others = self._scene_flats.others(number)
                 normal = plane_normal(mesh.positions[mesh.surface.faces].astype(np.float64))
                 heights = [(points - mesh.positions[mesh.surface.faces[0, 0]]) @ normal for points in others]
                 # nobody sees the back of a ground
@@ -48,23 +53,6 @@ class ScenePatches:
                 found = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
             self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided) if found is None else found
         return self._of_body[number]
-
-    def _others_in_frame(self, number: int) -> list[np.ndarray]:
-        """Vertices of each other body where the scene has it, in a body's frame."""
-        bodies = self._assembly.scene.bodies
-        own = bodies[number]
-        return [
-            (body.world_mesh().positions - own.translation) @ own.rotation_matrix() / own.scale
-            for other, body in enumerate(bodies)
-            if other != number
-        ]
-
-    @functools.cached_property
-    def flats(self) -> tuple[int, ...]:
-        """Bodies that lie in a plane."""
-        surfaces = [body.mesh for body in self._assembly.scene.bodies]
-        corners = [mesh.positions[mesh.surface.faces].astype(np.float64) for mesh in surfaces]
-        return tuple(number for number, each in enumerate(corners) if plane_normal(each) is not None)
 
     def senders(self, materials: Materials) -> Senders:
         """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""

@@ -337,7 +337,11 @@ class Renderer:
         if geometry is not None and geometry.rotations is not None:
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
             rotations = Source.renewed("rotations", geometry.rotations, last.traced.rotations if last else None)
-        return self._method.own.traced(geometry, rotations)
+        return self._method.own.traced(geometry, rotations)._replace(flats=self._flats(geometry))
+
+    def _flats(self, geometry: Geometry | None) -> tuple[int, ...]:
+        """Bodies that block as planes in a geometry, by default the scene's."""
+        return self._method.flats_in(geometry) if isinstance(self._method, SphereMethod) else ()
 
     def _call(self, view: LitPoints | None = None) -> Call:
         """A call, which knows what was computed of a view."""
@@ -362,7 +366,8 @@ class Renderer:
             vertices = Source("vertices", geometry.positions)
             spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
-        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call())
+        traced = NOT_TRACED._replace(flats=self._flats(geometry))
+        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), traced=traced)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
         """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.

@@ -1,23 +1,10 @@
-"""Flat light: what bodies that lie in planes, such as a ground or walls, block of each cell and what they send instead.
+"""Flat light: what bodies that lie in planes, such as a ground or walls, send.
 
-Their patches are the nodes of a :class:`.patches.Grid`. Seen from a receiver x, a cell with direction ω and angular
-radius ρ = 2/√Q meets a plane with normal N at height d below the receiver:
+Their patches are the nodes of a grid; :mod:`warpshadow.stages.flats.cells` has what a cell meets of it: coverage h,
+distance t, mean cosine c′ and radiosity B.
 
-    c = −N·ω                                  cosine
-    c′ = ρ s(c/ρ),  s(z) = z,  and 1/3 + 2/3 ((z + 1)/2)³ below z = 1
-                                              mean cosine of the part of the cell that is below the plane's horizon
-    t = d / c′                                distance
-    y = x + t ω                               where, in the plane
-    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²) + a margin
-                                              coverage: part of the cell that the rectangle takes
-
-S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Where the mesh has
-holes, h is multiplied with what it covers of the footprint. Radiosity is bilinear in two mip levels of the grid, which
-are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′.
-
-A flat is seen from both sides, and its back is black unless it has patches there. From its plane to a margin below it a
-receiver sees its front fade away, so that one that lies on the ground is lit as if it were above. Of several flats the
-nearest takes the cell; where they are at about the same distance, the cell is divided:
+A flat is seen from both sides, and its back is black unless it has patches there. Of several flats the nearest takes
+the cell; where they are at about the same distance, the cell is divided:
 
     I = 4/Q Σ_q max(n·ω_q, 0) T_q Σ_k h_k B_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
 
@@ -27,32 +14,37 @@ with 128 cells and 1.3% with 1024; in a prototype by 2.7 instead of 1.9% without
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
-
 import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, expand, instance_in
+from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
-from warpshadow.maths.directions import cell_radius
-from warpshadow.stages.bounces.flat_cells import (
+from warpshadow.stages.flats.cells import (
     FlatScene,
     Met,
+    Place,
+    check_flats,
     fetch,
     fetch_adjoint,
+    find_place,
+    find_place_adjoint,
     find_spot,
+    flat_scene,
+    front_presence,
     meet,
     meet_adjoint,
+    on_side,
     scatter,
     step,
     step_slope,
+    to_place,
+    toward_side,
 )
-from warpshadow.stages.bounces.flats import FlatGrid, Flats
-from warpshadow.stages.bounces.sparse import multiply
+from warpshadow.stages.flats.prepared import FlatGrid, Flats
+from warpshadow.stages.sparse import multiply
 
 _CELL_COST = 15.0
 """Nanoseconds that a cell of a receiver takes, on average over those that meet a flat and those that do not."""
@@ -71,33 +63,19 @@ _ROWS = 14
 
 
 @wp.func
-def _place_receiver(
-    point: wp.vec3, frames: wp.array(dtype=wp.vec3), scene: FlatScene, is_lit: bool, own: wp.array(dtype=wp.vec3)
-):
-    """Write what a receiver is to each flat; returns how many sides it may meet.
-
-    Only flats that block count where none is lit.
-    """
+def _place_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), scene: FlatScene, own: wp.array(dtype=wp.vec3)):
+    """Write what a receiver is to each flat; returns how many sides it may meet."""
     flat_count = scene.grids.shape[0]
     side_count = int(0)
     for f in range(flat_count):
-        grid = scene.grids[f]
-        u = frames[3 * f + 1]
-        v = frames[3 * f + 2]
-        scale_u = wp.length(u)
-        scale_v = wp.length(v)
-        along_u = u / scale_u
-        along_v = v / scale_v
-        normal = wp.cross(along_u, along_v)
-        offset = point - frames[3 * f]
-        height = wp.dot(offset, normal) / scale_u
-        own[4 * f] = wp.vec3(wp.dot(offset, along_u) / scale_u, wp.dot(offset, along_v) / scale_v, height)
-        own[4 * f + 1] = along_u
-        own[4 * f + 2] = along_v
-        own[4 * f + 3] = normal
+        place = find_place(point, frames, f)
+        own[4 * f] = place.at
+        own[4 * f + 1] = place.along_u
+        own[4 * f + 2] = place.along_v
+        own[4 * f + 3] = place.normal
         # below the plane the front fades, and the back takes over
-        front = step(1.0 + 2.0 * height / grid.margin)
-        if f != scene.skip and (is_lit or grid.blocks != 0):
+        front = front_presence(scene.grids[f], place.at[2])
+        if f != scene.skip and wp.length_sq(place.normal) > 0.0:
             if front > 0.0:
                 own[4 * flat_count + side_count] = wp.vec3(float(f), 0.0, front)
                 side_count += 1
@@ -105,6 +83,17 @@ def _place_receiver(
                 own[4 * flat_count + side_count] = wp.vec3(float(f), 1.0, 1.0 - front)
                 side_count += 1
     return side_count
+
+
+@wp.func
+def _kept_place(own: wp.array(dtype=wp.vec3), f: int):
+    """What is written of a flat."""
+    place = Place()
+    place.at = own[4 * f]
+    place.along_u = own[4 * f + 1]
+    place.along_v = own[4 * f + 2]
+    place.normal = own[4 * f + 3]
+    return place
 
 
 @wp.func
@@ -120,50 +109,9 @@ def _place_receiver_adjoint(
     """Add to the gradients of the frames of an instance; returns that of the point."""
     adj_point = wp.vec3()
     for f in range(flat_count):
-        scale_u = wp.length(frames[3 * f + 1])
-        scale_v = wp.length(frames[3 * f + 2])
-        offset = point - frames[3 * f]
-        at = own[4 * f]
-        along_u = own[4 * f + 1]
-        along_v = own[4 * f + 2]
-        normal = own[4 * f + 3]
-        adj = adj_own[4 * f]
-        adj_x = adj[0] / scale_u
-        adj_y = adj[1] / scale_v
-        adj_height = adj[2] / scale_u
-        adj_offset = adj_x * along_u + adj_y * along_v + adj_height * normal
-        adj_point += adj_offset
-        if adj_frames:
-            adj_normal = adj_own[4 * f + 3] + adj_height * offset
-            adj_u = adj_own[4 * f + 1] + adj_x * offset + wp.cross(along_v, adj_normal)
-            adj_v = adj_own[4 * f + 2] + adj_y * offset + wp.cross(adj_normal, along_u)
-            # of an axis' direction, and of its length
-            adj_u = (adj_u - wp.dot(adj_u, along_u) * along_u) / scale_u - (
-                adj_x * at[0] + adj_height * at[2]
-            ) * along_u
-            adj_v = (adj_v - wp.dot(adj_v, along_v) * along_v) / scale_v - (adj_y * at[1]) * along_v
-            wp.atomic_add(adj_frames, instance, 3 * f, -adj_offset)
-            wp.atomic_add(adj_frames, instance, 3 * f + 1, adj_u)
-            wp.atomic_add(adj_frames, instance, 3 * f + 2, adj_v)
+        place, adj = _kept_place(own, f), _kept_place(adj_own, f)
+        adj_point += find_place_adjoint(point, frames, f, place, adj, instance, adj_frames)
     return adj_point
-
-
-@wp.func
-def _on_side(own: wp.array(dtype=wp.vec3), f: int, is_back: bool):
-    """Where a receiver is above a side."""
-    at = own[4 * f]
-    return wp.vec3(at[0], at[1], wp.max(wp.where(is_back, -at[2], at[2]), 0.0))
-
-
-@wp.func
-def _toward(own: wp.array(dtype=wp.vec3), f: int, is_back: bool, direction: wp.vec3):
-    """Direction along the axes of a flat, and its cosine with a side."""
-    along_normal = wp.dot(direction, own[4 * f + 3])
-    return wp.vec3(
-        wp.dot(direction, own[4 * f + 1]),
-        wp.dot(direction, own[4 * f + 2]),
-        wp.where(is_back, along_normal, -along_normal),
-    )
 
 
 @wp.func
@@ -177,7 +125,6 @@ def _meet_sides(
     scene: FlatScene,
     direction: wp.vec3,
     texels: wp.array(dtype=wp.vec3),
-    is_lit: bool,
     part: float,
     side_count: int,
     own: wp.array(dtype=wp.vec3),
@@ -192,15 +139,16 @@ def _meet_sides(
         side = own[sides + i]
         f = int(side[0])
         is_back = side[1] > 0.0
-        toward = _toward(own, f, is_back, direction)
+        place = _kept_place(own, f)
+        toward = toward_side(place, is_back, direction)
         own[cells + 4 * i] = wp.vec3()
         if toward[2] > -scene.radius:
             grid = scene.grids[f]
-            met = meet(grid, scene, _on_side(own, f, is_back), toward, side[2])
+            met = meet(grid, scene, on_side(place, is_back), toward, side[2])
             if met.share > 0.0:
                 covered = float(1.0)
                 radiosity = wp.vec3()
-                sends = is_lit and (grid.sides == 2 or not is_back)
+                sends = grid.sides == 2 or not is_back
                 if sends or grid.is_whole == 0:
                     first_level = _levels_of(grid, is_back)
                     spot = find_spot(grid, scene, met)
@@ -223,7 +171,6 @@ def _meet_sides_adjoint(
     scene: FlatScene,
     direction: wp.vec3,
     texels: wp.array(dtype=wp.vec3),
-    is_lit: bool,
     side_count: int,
     own: wp.array(dtype=wp.vec3),
     adj_own: wp.array(dtype=wp.vec3),
@@ -240,23 +187,23 @@ def _meet_sides_adjoint(
             is_back = side[1] > 0.0
             grid = scene.grids[f]
             kept = own[cells + 4 * i + 2]
-            place = own[cells + 4 * i + 3]
+            spot_place = own[cells + 4 * i + 3]
             met = Met()
             met.share = kept[0]
             met.distance = own[cells + 4 * i][1]
             met.per_cosine = kept[2]
-            met.place = wp.vec2(place[0], place[1])
+            met.place = wp.vec2(spot_place[0], spot_place[1])
             adj_met = adj_own[cells + 4 * i]  # of coverage, distance, and t ρ / c′
             adj_light = adj_own[cells + 4 * i + 1]  # of share × radiosity
             adj_share = adj_met[0] * kept[1]
             adj_spot = wp.vec3()
-            sends = is_lit and (grid.sides == 2 or not is_back)
+            sends = grid.sides == 2 or not is_back
             if sends or grid.is_whole == 0:
                 first_level = _levels_of(grid, is_back)
                 spot = find_spot(grid, scene, met)
                 if grid.is_whole == 0:
-                    adj = wp.vec3(adj_met[0] * kept[0], 0.0, 0.0)
-                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, met, spot, adj)
+                    adj_covered = wp.vec3(adj_met[0] * kept[0], 0.0, 0.0)
+                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, met, spot, adj_covered)
                 if sends:
                     adj_share += wp.dot(adj_light, own[cells + 4 * i + 1])
                     adj = kept[0] * adj_light
@@ -270,7 +217,8 @@ def _meet_sides_adjoint(
             )
             if adj_spot[2] != 0.0:
                 adj_distance += adj_spot[2] / met.distance
-            toward = _toward(own, f, is_back, direction)
+            place = _kept_place(own, f)
+            toward = toward_side(place, is_back, direction)
             adj_at, adj_toward, adj_presence = meet_adjoint(
                 grid,
                 scene,
@@ -282,14 +230,12 @@ def _meet_sides_adjoint(
                 adj_cosine,
                 wp.vec2(adj_spot[0], adj_spot[1]),
             )
-            height = own[4 * f][2]
-            sign = wp.where(is_back, -1.0, 1.0)
-            adj_height = wp.where(sign * height > 0.0, sign * adj_at[2], 0.0)
-            adj_height += adj_presence * sign * step_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
-            adj_own[4 * f] = adj_own[4 * f] + wp.vec3(adj_at[0], adj_at[1], adj_height)
-            adj_own[4 * f + 1] = adj_own[4 * f + 1] + adj_toward[0] * direction
-            adj_own[4 * f + 2] = adj_own[4 * f + 2] + adj_toward[1] * direction
-            adj_own[4 * f + 3] = adj_own[4 * f + 3] - (sign * adj_toward[2]) * direction
+            before = _kept_place(adj_own, f)
+            adj_place = to_place(place, grid, is_back, direction, adj_at, adj_toward, adj_presence, before)
+            adj_own[4 * f] = adj_place.at
+            adj_own[4 * f + 1] = adj_place.along_u
+            adj_own[4 * f + 2] = adj_place.along_v
+            adj_own[4 * f + 3] = adj_place.normal
 
 
 @wp.func
@@ -354,11 +300,11 @@ def _light_receivers(
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
     placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = _place_receiver(points[batch, receiver], placed, scene, True, own)
+    side_count = _place_receiver(points[batch, receiver], placed, scene, own)
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
-        if _meet_sides(scene, directions[q], sent, True, weight, side_count, own):
+        if _meet_sides(scene, directions[q], sent, weight, side_count, own):
             for i in range(side_count):
                 if own[cells + 4 * i][0] > 0.0:
                     share = own[cells + 4 * i + 2][0] * _unhidden(i, i, cells, side_count, own)
@@ -401,7 +347,7 @@ def _light_receivers_adjoint(
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
-    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], scene, True, own)
+    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], scene, own)
     for k in range(4 * scene.grids.shape[0]):
         adj_own[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
@@ -411,7 +357,7 @@ def _light_receivers_adjoint(
         cosine = wp.dot(normal, direction)
         passing = transmittance[batch, receiver, q]
         weight = cosine * passing
-        if _meet_sides(scene, direction, sent, True, cosine, side_count, own):
+        if _meet_sides(scene, direction, sent, cosine, side_count, own):
             for i in range(side_count):
                 adj_own[cells + 4 * i] = wp.vec3()
             total = float(0.0)
@@ -427,7 +373,7 @@ def _light_receivers_adjoint(
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
             if passing > 0.0:
-                _meet_sides_adjoint(scene, direction, sent, True, side_count, own, adj_own, seen_texels, adj_texels)
+                _meet_sides_adjoint(scene, direction, sent, side_count, own, adj_own, seen_texels, adj_texels)
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     adj_point = _place_receiver_adjoint(
@@ -435,140 +381,6 @@ def _light_receivers_adjoint(
     )
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
-
-
-@wp.kernel(enable_backward=False)
-def _pass_flats(
-    first_row: int,
-    worker: int,
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    transmittance: wp.array3d(dtype=wp.float32),
-    frames: wp.array2d(dtype=wp.vec3),
-    scene: FlatScene,
-    directions: wp.array(dtype=wp.vec3),
-    # scratch
-    scratch: wp.array2d(dtype=wp.vec3),
-    # out
-    passing: wp.array3d(dtype=wp.float32),
-):
-    """A thread owns a receiver:  P_q = T_q Π_k (1 − h_k)."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    own = scratch[scratch_place(worker, row)]
-    cells = 6 * scene.grids.shape[0]
-    placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = _place_receiver(points[batch, receiver], placed, scene, False, own)
-    for q in range(directions.shape[0]):
-        part = transmittance[batch, receiver, q]
-        if _meet_sides(scene, directions[q], scene.covered, False, part, side_count, own):
-            for i in range(side_count):
-                part *= 1.0 - own[cells + 4 * i][0]
-        passing[batch, receiver, q] = part
-
-
-@wp.kernel(enable_backward=False)
-def _pass_flats_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    points: wp.array2d(dtype=wp.vec3),
-    transmittance: wp.array3d(dtype=wp.float32),
-    frames: wp.array2d(dtype=wp.vec3),
-    scene: FlatScene,
-    directions: wp.array(dtype=wp.vec3),
-    adj_passing: wp.array3d(dtype=wp.float32),
-    # scratch
-    scratch: wp.array2d(dtype=wp.vec3),
-    adj_scratch: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_points: wp.array2d(dtype=wp.vec3),
-    adj_transmittance: wp.array3d(dtype=wp.float32),
-    # sums
-    adj_frames: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver:  T̄_q += P̄_q Π_k (1 − h_k),  h̄_k = −P̄_q T_q Π_{j≠k} (1 − h_j)."""
-    row = first_row + wp.tid()
-    batch, receiver = split_row(row, points.shape[1])
-    place = scratch_place(worker, row)
-    own = scratch[place]
-    adj_own = adj_scratch[place]
-    seen_frames = instance_in(batch, frames.shape[0])
-    cells = 6 * scene.grids.shape[0]
-    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], scene, False, own)
-    for k in range(4 * scene.grids.shape[0]):
-        adj_own[k] = wp.vec3()
-    for q in range(directions.shape[0]):
-        adj = adj_passing[batch, receiver, q]
-        part = float(1.0)
-        if _meet_sides(scene, directions[q], scene.covered, False, wp.abs(adj), side_count, own):
-            for i in range(side_count):
-                part *= 1.0 - own[cells + 4 * i][0]
-                adj_coverage = -adj * transmittance[batch, receiver, q]
-                for j in range(side_count):
-                    if j != i:
-                        adj_coverage *= 1.0 - own[cells + 4 * j][0]
-                adj_own[cells + 4 * i] = wp.vec3(adj_coverage, 0.0, 0.0)
-            if transmittance[batch, receiver, q] > 0.0:
-                _meet_sides_adjoint(scene, directions[q], scene.covered, False, side_count, own, adj_own, 0, adj_frames)
-        if adj_transmittance:
-            adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj * part
-    adj_point = _place_receiver_adjoint(
-        points[batch, receiver], frames[seen_frames], scene.grids.shape[0], own, adj_own, seen_frames, adj_frames
-    )
-    if adj_points:
-        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
-
-
-def passing_flats(
-    points: wp.array,
-    transmittance: wp.array,
-    frames: wp.array,
-    flats: Flats,
-    directions: np.ndarray,
-    *,
-    skip: int | None = None,
-) -> wp.array:
-    """Transmittance past the flats that cast shadows, times that past all else: T_q Π_k (1 − h_k).
-
-    Args:
-        points: Receivers [scene units], vec3 of shape [batch, receiver].
-        transmittance: Past all else, float32 of shape [batch, receiver, direction]; or the batch is 1 for either.
-        frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`Flats.frames`; the batch may be 1.
-        flats: The flats.
-        directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
-        skip: Number of the flat that the receivers are part of, which blocks none of their light; None for none.
-
-    Returns:
-        Float32 of shape [batch, receiver, direction].
-
-    Differentiable: points, transmittance, frames.
-    """
-    given = _Given.of(flats, points, transmittance, frames, directions, skip)
-    if given is None:
-        return transmittance
-    inputs = [given.points, given.transmittance, frames, given.scene, given.directions]
-    return differentiable(
-        lambda passing: launch(
-            _pass_flats,
-            given.points.size,
-            inputs=inputs,
-            scratch=[given.scratch],
-            outputs=[passing],
-            cost=_CELL_COST * len(directions),
-        ),
-        lambda adj_passing: launch(
-            _pass_flats_adjoint,
-            given.points.size,
-            inputs=[*inputs, adj_passing],
-            scratch=[given.scratch] * 2,
-            outputs=[given.points.grad, given.transmittance.grad],
-            sums=[frames.grad],
-            cost=2 * _CELL_COST * len(directions),
-        ),
-        result=wp.empty(given.transmittance.shape, dtype=wp.float32, device=points.device),
-        variables=inputs[:3],
-    )
 
 
 def flat_light(
@@ -600,76 +412,39 @@ def flat_light(
 
     Differentiable: points, normals, transmittance, frames, radiosity.
     """
+    check_flats(flats, points, transmittance, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
-    others = {"normals": normals, "radiosity": radiosity}
-    given = _Given.of(flats, points, transmittance, frames, directions, skip, others)
-    if given is None:
-        return wp.zeros((common_batch({"points": points, **others}), points.shape[1]), wp.vec3, points.device)
-    normals, texels = expand(normals, given.points.shape[0]), multiply(flats.texels_of_patches, radiosity)
-    variables = [given.points, normals, given.transmittance, frames, texels]
-    inputs = [*variables, given.scene, given.directions]
+    instances = common_batch(
+        {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames, "radiosity": radiosity}
+    )
+    if flats.count == (skip is not None):
+        return wp.zeros((instances, points.shape[1]), wp.vec3, points.device)
+    assert flats.texels_of_patches is not None
+    points, normals = (expand(array, instances) for array in (points, normals))
+    transmittance = expand_rows(transmittance, instances)
+    texels = multiply(flats.texels_of_patches, radiosity)
+    scratch = Scratch((_ROWS * flats.count,), wp.vec3)
+    variables = [points, normals, transmittance, frames, texels]
+    scene, cells = flat_scene(flats, len(directions), skip), constant(directions, wp.vec3, points.device)
+    inputs = [*variables, scene, cells]
     return differentiable(
         lambda light: launch(
             _light_receivers,
-            given.points.size,
+            points.size,
             inputs=inputs,
-            scratch=[given.scratch],
+            scratch=[scratch],
             outputs=[light],
             cost=_CELL_COST * len(directions),
         ),
         lambda adj_light: launch(
             _light_receivers_adjoint,
-            given.points.size,
+            points.size,
             inputs=[*inputs, adj_light],
-            scratch=[given.scratch] * 2,
-            outputs=[given.points.grad, normals.grad, given.transmittance.grad],
+            scratch=[scratch] * 2,
+            outputs=[points.grad, normals.grad, transmittance.grad],
             sums=[frames.grad, texels.grad],
             cost=2 * _CELL_COST * len(directions),
         ),
-        result=wp.empty(given.points.shape, dtype=wp.vec3, device=points.device),
+        result=wp.empty(points.shape, dtype=wp.vec3, device=points.device),
         variables=variables,
     )
-
-
-class _Given(NamedTuple):
-    """What both functions are given, checked, and as kernels take it."""
-
-    points: wp.array
-    transmittance: wp.array
-    scene: FlatScene
-    directions: wp.array
-    scratch: Scratch
-
-    @staticmethod
-    def of(
-        flats: Flats,
-        points: wp.array,
-        transmittance: wp.array,
-        frames: wp.array,
-        directions: np.ndarray,
-        skip: int | None,
-        others: Mapping[str, wp.array] | None = None,
-    ) -> _Given | None:
-        """None where there is no other flat than the one to skip."""
-        check.shape("points", points.shape, ("batch", "receiver"))
-        check.shape("directions", directions.shape, ("direction", 3))
-        check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
-        check.shape("frames", frames.shape, ("batch", 3 * flats.count))
-        if skip is not None:
-            check.choice("skip", skip, range(flats.count))
-        if flats.count == (skip is not None):
-            return None
-        instances = common_batch({"points": points, "transmittance": transmittance, "frames": frames, **(others or {})})
-        scene = FlatScene()
-        scene.grids, scene.levels, scene.level_scales = flats.grids, flats.levels, flats.level_scales
-        scene.covered, scene.skip = flats.covered, -1 if skip is None else skip
-        scene.radius = cell_radius(len(directions))
-        scene.per_radius = 1 / scene.radius
-        rows = expand(transmittance.reshape((transmittance.shape[0], -1)), instances)
-        return _Given(
-            expand(points, instances),
-            rows.reshape((instances, *transmittance.shape[1:])),
-            scene,
-            constant(directions, wp.vec3, points.device),
-            Scratch((_ROWS * flats.count,), wp.vec3),
-        )

@@ -30,9 +30,9 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.maths.directions import check_directions
-from warpshadow.stages.bounces.flat_cells import step
-from warpshadow.stages.bounces.flats import FlatGrid, Flats
-from warpshadow.stages.bounces.sparse import SparseMatrix
+from warpshadow.stages.flats.cells import step
+from warpshadow.stages.flats.prepared import FlatGrid, Flats
+from warpshadow.stages.sparse import SparseMatrix
 
 
 @wp.func
@@ -90,7 +90,7 @@ def turn_from_flats(
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
         spheres: The sphere that stands in for each source, −1 for none, which keeps its normal: NumPy of shape
             [source].
-        frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`.flats.Flats.frames`.
+        frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`.Flats.frames`.
         flats: The flats. Those that cast no shadow do not count.
 
     Returns:

@@ -5,8 +5,8 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
 from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
 @wp.kernel

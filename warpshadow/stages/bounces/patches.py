@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warpshadow.maths.plane import plane_normal
+from warpshadow.stages.flats.grid import Grid, find_grid
 
 _LEAST_PATCHES = 32
 """Patches of a body of few faces: each side of a box has some."""
@@ -35,18 +35,6 @@ _LLOYD_STEPS = 8
 
 _LEARNED = 20_000
 """Pieces that k-means looks at, at most."""
-
-_GRID = 24
-"""Nodes along a grid's longer side."""
-
-_EVEN = 100.0
-"""Spread of a grid that is even, in sizes of its body."""
-
-_ROUNDING = 1e-6
-"""How far off a face a node may lie and still count as on it, as a part of the face or texel."""
-
-_TESTED = 3
-"""Points along each side of a node's texel that are tested to lie on the mesh; odd, so that the node is one."""
 
 
 class Pieces(NamedTuple):
@@ -75,60 +63,6 @@ class Sources(NamedTuple):
     """Patch that each belongs to, ascending, int32 of shape [source]."""
     weights: np.ndarray
     """Share of that patch, which add up to 1 in each, float32 of shape [source]."""
-
-
-class Grid(NamedTuple):
-    """Nodes in a plane, even in coordinates that are stretched far from the middle.
-
-    A point has the coordinates (a, b, d) = frame (x − origin). A node is the middle of a texel of
-
-        ξ = g(a / spread),  η = g(b / spread),  g(z) = sign(z) log(1 + |z|)
-
-    and the texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
-    """
-
-    frame: np.ndarray
-    """Rows: both axes and the normal, float64 of shape [3, 3]."""
-    origin: np.ndarray
-    """Point of the plane around which nodes are dense, float64 of shape [3]."""
-    spread: float
-    """Distance from there within which nodes are about even [units of the body]."""
-    low: np.ndarray
-    high: np.ndarray
-    """Corners of the rectangle in (ξ, η), float64 of shape [2]."""
-    covered: np.ndarray
-    """Share of each node's texel that the mesh covers, float32 of shape [row, column]."""
-    sides: int
-    """1 if the front alone sends light, 2 if the back does, too; its patches follow those of the front."""
-
-    def nodes(self) -> np.ndarray:
-        """Nodes in the plane, (a, b), float64 of shape [row, column, 2]."""
-        return self.points(1)
-
-    def texel_sizes(self) -> np.ndarray:
-        """Widths and heights of the texels at the nodes, [row, column, 2]."""
-        count = np.array(self.covered.shape[::-1])
-        edges = [
-            self.spread * stretched(np.linspace(low, high, number + 1))
-            for low, high, number in zip(self.low, self.high, count, strict=True)
-        ]
-        return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
-
-    def texels_of(self, points: np.ndarray) -> np.ndarray:
-        """Number of the texel that is nearest to each point (a, b) [point, 2]."""
-        height, width = self.covered.shape
-        place = (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
-        column, row = np.clip(place.astype(int), 0, (width - 1, height - 1)).T
-        return row * width + column
-
-    def points(self, split: int) -> np.ndarray:
-        """Points evenly over every texel, ``split`` along each side: [row · split, column · split, 2]."""
-        height, width = self.covered.shape
-        axes = [
-            self.spread * stretched(low + (high - low) * (np.arange(number) + 0.5) / number)
-            for low, high, number in zip(self.low, self.high, (width * split, height * split), strict=True)
-        ]
-        return np.stack(np.meshgrid(*axes), axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,16 +96,6 @@ class Patches:
         """The sphere whose surface is nearest to each patch, of spheres [sphere, 3], [sphere]: int32 [patch]."""
         gaps = np.linalg.norm(self.centers[:, None] - centers, axis=2) - radii
         return np.abs(gaps).argmin(axis=1).astype(np.int32)
-
-
-def squeezed(z: np.ndarray) -> np.ndarray:
-    """g(z) = sign(z) log(1 + |z|): steps are as long as the distance from the middle, but no shorter than there."""
-    return np.sign(z) * np.log1p(np.abs(z))
-
-
-def stretched(y: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`squeezed`."""
-    return np.sign(y) * np.expm1(np.abs(y))
 
 
 def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, count: int = 256) -> Patches:
@@ -231,27 +155,11 @@ def find_flat_patches(
     Returns:
         Patches, row by row: nodes off the mesh have no area and no source. None for a body that is not flat.
     """
-    corners = positions.astype(np.float64)[faces]
-    normal = plane_normal(corners)
-    if normal is None:
+    found = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
+    if found is None:
         return None
-    frame = _smallest_rectangle(corners.reshape(-1, 3), normal)
-    points = corners.reshape(-1, 3) @ frame.T
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    middle, spread = (low + high) / 2, _EVEN * (high - low).max()
-    if others is not None and len(others):
-        near = others @ frame.T[:, :2]
-        reach = np.ptp(near, axis=0).max() / 2
-        if reach > 0:
-            middle, spread = (near.min(axis=0) + near.max(axis=0)) / 2, min(reach, spread)
-    origin = frame.T @ [*middle, points[:, 2].mean()]
-    low, high = squeezed((low - middle) / spread), squeezed((high - middle) / spread)
-    width, height = np.maximum(np.rint(_GRID * (high - low) / (high - low).max()), 1).astype(int)
-    sides = 2 if is_two_sided else 1
-    grid = Grid(frame, origin, float(spread), low, high, np.ones((height, width), np.float32), sides)
-    corners = ((corners - origin) @ frame.T)[..., :2]
-    covered, found = _find_nodes(grid, corners)
-    grid = grid._replace(covered=covered)
+    grid, nodes = found
+    frame, origin = grid.frame, grid.origin
     texels = grid.texel_sizes().reshape(-1, 2)
 
     def longest(middles: np.ndarray) -> np.ndarray:
@@ -260,12 +168,12 @@ def find_flat_patches(
     cut = _cut(positions, faces, longest)
     labels = grid.texels_of((cut.middles - origin) @ frame.T[:, :2])
     centers = origin + grid.nodes().reshape(-1, 2) @ frame[:2]
-    areas = covered.ravel() * texels.prod(axis=1)
+    areas = grid.covered.ravel() * texels.prod(axis=1)
     return Patches(
-        *_on_sides(sides, areas, centers, np.tile(normal, (len(areas), 1))),
-        _sources_of(found, sides, len(areas)),
+        *_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),
+        _sources_of([(*node, 1.0) for node in nodes], grid.sides, len(areas)),
         cut.pieces,
-        _of_sides(labels, sides, len(areas)),
+        _of_sides(labels, grid.sides, len(areas)),
         grid,
     )
 
@@ -396,63 +304,3 @@ def _sources_of(found: list[tuple[int, np.ndarray, int, float]], sides: int, cou
         np.concatenate([owners, owners + np.int32(count)][:sides]),
         np.tile(np.array(weights, np.float32), sides),
     )
-
-
-# ---------------------------------------------------------------------------------------------------- grids
-
-
-def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Axes of the smallest rectangle around points of a plane, and its normal, as rows."""
-    from scipy.spatial import ConvexHull
-
-    aside = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    basis = np.stack([aside, np.cross(normal, aside)]) / np.linalg.norm(aside)
-    flat = points @ basis.T
-    hull = flat[ConvexHull(flat).vertices]
-    edges = _unit(np.roll(hull, -1, axis=0) - hull)
-    across = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
-    sizes = np.ptp(hull @ edges.T, axis=0) * np.ptp(hull @ across.T, axis=0)
-    best = np.flatnonzero(sizes < sizes.min() * (1 + 1e-6))[0]
-    return np.stack([edges[best] @ basis, across[best] @ basis, normal])
-
-
-def _find_nodes(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[tuple[int, np.ndarray, int, float]]]:
-    """Find which share of each texel the faces [face, 3, 2] cover, and a source for each that is not empty."""
-    height, width = grid.covered.shape
-    points = grid.points(_TESTED)
-    shape = np.array([width, height]) * _TESTED
-    places = (squeezed(corners / grid.spread) - grid.low) / (grid.high - grid.low) * shape - 0.5
-    first = np.maximum(np.ceil(places.min(axis=1) - _ROUNDING), 0).astype(int)
-    last = np.minimum(np.floor(places.max(axis=1) + _ROUNDING), shape - 1).astype(int)
-    counts = np.maximum(last - first + 1, 0)
-    faces = np.repeat(np.arange(len(corners)), counts.prod(axis=1))
-    number = np.arange(len(faces)) - np.repeat(
-        np.cumsum(counts.prod(axis=1)) - counts.prod(axis=1), counts.prod(axis=1)
-    )
-    column = first[faces, 0] + number % counts[faces, 0]
-    row = first[faces, 1] + number // counts[faces, 0]
-    barycentrics = _barycentrics(corners[faces], points[row, column])
-    inside = (barycentrics > -_ROUNDING).all(axis=1)
-    owner = np.full(points.shape[:2], -1)
-    owner[row[inside], column[inside]] = np.flatnonzero(inside)
-    tested = owner.reshape(height, _TESTED, width, _TESTED).swapaxes(1, 2).reshape(height * width, -1)
-    covered = (tested >= 0).mean(axis=1)
-    from_middle = np.abs(np.arange(_TESTED**2) - _TESTED**2 // 2).argsort(kind="stable")
-    best = (tested[:, from_middle] >= 0).argmax(axis=1)
-    chosen = tested[np.arange(len(tested)), from_middle[best]]
-    found = [
-        (faces[item], np.maximum(barycentrics[item], 0), texel, 1.0) for texel, item in enumerate(chosen) if item >= 0
-    ]
-    return covered.reshape(height, width).astype(np.float32), found
-
-
-def _barycentrics(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates of points [item, 2] in triangles [item, 3, 2]; NaN in those without an area."""
-    a, b, c = np.moveaxis(triangles - points[:, None], 1, 0)
-    parts = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
-    total = parts.sum(axis=1, keepdims=True)
-    return parts / np.where(total != 0, total, np.nan)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

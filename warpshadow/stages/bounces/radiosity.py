@@ -6,7 +6,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
 def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, device: wp.DeviceLike) -> SparseMatrix:

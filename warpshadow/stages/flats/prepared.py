@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.stages.bounces.patches import Grid, stretched
-from warpshadow.stages.bounces.sparse import SparseMatrix, multiply
+from warpshadow.stages.flats.grid import Grid, stretched
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -58,25 +58,27 @@ class Flats:
 
     Args:
         count: Number of flats.
+        blocking: Those that cast shadows.
         grids: Their grids, of shape [flat].
         levels: First texel, width and height of each mip level, for each side of each flat, vec3i of shape [level].
         level_scales: Its texels for one of the finest level, vec2 of shape [level].
         covered: What the mesh covers of each texel, in all three components, vec3 of shape [texel].
-        texels_of_patches: Matrix of mip levels, [texel, patch].
+        texels_of_patches: Matrix of mip levels, [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · flat, vertex].
     """
 
     count: int
+    blocking: tuple[int, ...]
     grids: wp.array
     levels: wp.array
     level_scales: wp.array
     covered: wp.array
-    texels_of_patches: SparseMatrix
+    texels_of_patches: SparseMatrix | None
     frames_of_vertices: SparseMatrix
 
     @staticmethod
     def of(bodies: Sequence[FlatBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike) -> Flats:
-        """Prepare flat bodies, among bodies that have so many patches and vertices together."""
+        """Prepare flat bodies, among bodies that have so many patches and vertices together; 0 if none sends light."""
         from scipy.sparse import vstack
 
         levels: list[tuple[int, int, int]] = []
@@ -91,17 +93,19 @@ class Flats:
                     scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
                     texel_count += width * height
                     covered.append(matrix @ grid.covered.ravel())
-                    first = body.first_patch + side * grid.covered.size
-                    pyramids.append(_shifted(matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+                    if patch_count:
+                        first = body.first_patch + side * grid.covered.size
+                        pyramids.append(_shifted(matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
             grids.append(_kernel_grid(body, first_level, len(matrices)))
             frames.append(_frame_matrix(body, vertex_count))
         return Flats(
             len(bodies),
+            tuple(number for number, body in enumerate(bodies) if body.blocks),
             wp.array(grids, dtype=FlatGrid, device=device),
             wp.array(np.array(levels), dtype=wp.vec3i, device=device),
             wp.array(np.array(scales), dtype=wp.vec2, device=device),
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
-            SparseMatrix.of(vstack(pyramids), device=device),
+            SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
         )
 

@@ -1,8 +1,30 @@
-"""A cell of directions meets a flat: what is covered, and the radiosity there, with gradients; see flat_light.py."""
+"""A cell of directions meets a flat: what is covered, and the radiosity there, with gradients.
 
+Seen from a receiver x, a cell with direction ω and angular radius ρ = 2/√Q meets a plane with normal N, which is the
+distance d below the receiver:
+
+    c = −N·ω                                  cosine
+    c′ = ρ s(c/ρ),  s(z) = z,  and 1/3 + 2/3 ((z + 1)/2)³ below z = 1
+                                              mean cosine of the part of the cell that is below the plane's horizon
+    t = d / c′                                distance
+    y = x + t ω                               where, in the plane
+    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²) + a margin
+                                              coverage: part of the cell that the rectangle takes
+
+S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Where the mesh has
+holes, h is multiplied with what it covers of the footprint. Radiosity is bilinear in two mip levels of the grid, which
+are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′.
+
+From the plane to a margin below it a receiver sees the front fade away and the back appear, so that one that lies on
+the ground is as if it were above.
+"""
+
+import numpy as np
 import warp as wp
 
-from warpshadow.stages.bounces.flats import FlatGrid
+from warpshadow import check
+from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.flats.prepared import FlatGrid, Flats
 
 
 @wp.struct
@@ -18,6 +40,33 @@ class FlatScene:
     per_radius: float
 
 
+def check_flats(
+    flats: Flats,
+    points: wp.array,
+    transmittance: wp.array,
+    frames: wp.array,
+    directions: np.ndarray,
+    skip: int | None,
+) -> None:
+    """Raise ValueError for what does not fit together."""
+    check.shape("points", points.shape, ("batch", "receiver"))
+    check.shape("directions", directions.shape, ("direction", 3))
+    check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
+    check.shape("frames", frames.shape, ("batch", 3 * flats.count))
+    if skip is not None:
+        check.choice("skip", skip, range(flats.count))
+
+
+def flat_scene(flats: Flats, cell_count: int, skip: int | None) -> FlatScene:
+    """Flats as seen in so many cells by receivers that are part of one, or of none."""
+    scene = FlatScene()
+    scene.grids, scene.levels, scene.level_scales = flats.grids, flats.levels, flats.level_scales
+    scene.covered, scene.skip = flats.covered, -1 if skip is None else skip
+    scene.radius = cell_radius(cell_count)
+    scene.per_radius = 1 / scene.radius
+    return scene
+
+
 @wp.func
 def step(z: float):
     """The smoothstep from 0 at −1 to 1 at 1."""
@@ -30,6 +79,126 @@ def step_slope(z: float):
     """Its derivative."""
     u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
     return 3.0 * u * (1.0 - u)
+
+
+# ---------------------------------------------------------------------------------------------------- receivers
+
+
+@wp.struct
+class Place:
+    """Where a receiver is to a flat."""
+
+    at: wp.vec3  # along both axes, and its height [units of the body]
+    along_u: wp.vec3  # axes of unit length
+    along_v: wp.vec3
+    normal: wp.vec3  # 0 where the flat has no area
+
+
+@wp.func
+def find_place(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
+    """Find the place of a receiver to a flat."""
+    place = Place()
+    scale_u = wp.length(frames[3 * f + 1])
+    scale_v = wp.length(frames[3 * f + 2])
+    if scale_u > 0.0 and scale_v > 0.0:
+        place.along_u = frames[3 * f + 1] / scale_u
+        place.along_v = frames[3 * f + 2] / scale_v
+        place.normal = wp.cross(place.along_u, place.along_v)
+        offset = point - frames[3 * f]
+        place.at = wp.vec3(
+            wp.dot(offset, place.along_u) / scale_u,
+            wp.dot(offset, place.along_v) / scale_v,
+            wp.dot(offset, place.normal) / scale_u,
+        )
+    return place
+
+
+@wp.func
+def find_place_adjoint(
+    point: wp.vec3,
+    frames: wp.array(dtype=wp.vec3),
+    f: int,
+    place: Place,
+    adj: Place,
+    instance: int,
+    adj_frames: wp.array2d(dtype=wp.vec3),
+):
+    """Add to the gradients of the frames of an instance; returns that of the point."""
+    scale_u = wp.length(frames[3 * f + 1])
+    scale_v = wp.length(frames[3 * f + 2])
+    if not (scale_u > 0.0 and scale_v > 0.0):
+        return wp.vec3()
+    offset = point - frames[3 * f]
+    adj_x = adj.at[0] / scale_u
+    adj_y = adj.at[1] / scale_v
+    adj_height = adj.at[2] / scale_u
+    adj_offset = adj_x * place.along_u + adj_y * place.along_v + adj_height * place.normal
+    if adj_frames:
+        adj_normal = adj.normal + adj_height * offset
+        adj_u = adj.along_u + adj_x * offset + wp.cross(place.along_v, adj_normal)
+        adj_v = adj.along_v + adj_y * offset + wp.cross(adj_normal, place.along_u)
+        # of an axis' direction, and of its length
+        adj_u = (adj_u - wp.dot(adj_u, place.along_u) * place.along_u) / scale_u - (
+            adj_x * place.at[0] + adj_height * place.at[2]
+        ) * place.along_u
+        adj_v = (adj_v - wp.dot(adj_v, place.along_v) * place.along_v) / scale_v - (adj_y * place.at[1]) * place.along_v
+        wp.atomic_add(adj_frames, instance, 3 * f, -adj_offset)
+        wp.atomic_add(adj_frames, instance, 3 * f + 1, adj_u)
+        wp.atomic_add(adj_frames, instance, 3 * f + 2, adj_v)
+    return adj_offset
+
+
+@wp.func
+def front_presence(grid: FlatGrid, height: float):
+    """Part of the front that a receiver sees; of the back it sees the rest."""
+    return step(1.0 + 2.0 * height / grid.margin)
+
+
+@wp.func
+def front_presence_slope(grid: FlatGrid, height: float):
+    """Its derivative."""
+    return step_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
+
+
+@wp.func
+def on_side(place: Place, is_back: bool):
+    """Where a receiver is above a side."""
+    return wp.vec3(place.at[0], place.at[1], wp.max(wp.where(is_back, -place.at[2], place.at[2]), 0.0))
+
+
+@wp.func
+def toward_side(place: Place, is_back: bool, direction: wp.vec3):
+    """Direction along the axes of a flat, and its cosine with a side."""
+    along_normal = wp.dot(direction, place.normal)
+    return wp.vec3(
+        wp.dot(direction, place.along_u),
+        wp.dot(direction, place.along_v),
+        wp.where(is_back, along_normal, -along_normal),
+    )
+
+
+@wp.func
+def to_place(
+    place: Place,
+    grid: FlatGrid,
+    is_back: bool,
+    direction: wp.vec3,
+    adj_at: wp.vec3,
+    adj_toward: wp.vec3,
+    adj_presence: float,
+    adj_place: Place,
+):
+    """Gradient of a place, added to what it is from elsewhere, by those of what a side is to a receiver and cell."""
+    sign = wp.where(is_back, -1.0, 1.0)
+    height = place.at[2]
+    adj_height = wp.where(sign * height > 0.0, sign * adj_at[2], 0.0)
+    adj_height += adj_presence * sign * front_presence_slope(grid, height)
+    adj = Place()
+    adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
+    adj.along_u = adj_place.along_u + adj_toward[0] * direction
+    adj.along_v = adj_place.along_v + adj_toward[1] * direction
+    adj.normal = adj_place.normal - (sign * adj_toward[2]) * direction
+    return adj
 
 
 # ---------------------------------------------------------------------------------------------------- coverage
