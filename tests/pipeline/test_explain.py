@@ -648,22 +648,22 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
         image = call()
     tape.backward(grads={image: wp.full(image.shape, wp.vec4(1.0), dtype=wp.vec4)})
     lines = str(explain()).splitlines()
-    assert [line.split()[0] for line in (lines[0], lines[18])] == ["forward", "backward"]
-    (rasterization,) = (line for line in lines[:18] if "rasterization" in line)
+    assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
+    (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
     assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
-    (exposure,) = (line for line in lines[18:] if "exposure" in line)
+    (exposure,) = (line for line in lines[19:] if "exposure" in line)
     assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
     assert "2,304 samples" in exposure
 
 
 def test_an_explanation_computes_nothing(monkeypatch):
-    """Not even the spheres of bodies, which take seconds to fit."""
+    """Not even the spheres of bodies, which take seconds to fit; the ground blocks as a plane."""
     scene = scene_of()
     scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
     renderer = Renderer(scene)
     monkeypatch.setattr(assembly, "scene_blockers", None)
     monkeypatch.setattr(wp, "launch", None)
-    assert "up to 902 receivers × 21 spheres" in str(renderer.explain())
+    assert "up to 902 receivers × 14 spheres" in str(renderer.explain())
 
 
 def test_tensors_explain_themselves():
