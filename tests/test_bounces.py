@@ -29,7 +29,6 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline import bounces as pipeline_bounces
 from warpshadow.pipeline import kept_bounces, lighting
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -400,7 +399,7 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
 
     monkeypatch.setattr(kept_bounces, "trace_factors", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "see", refuse)
-    monkeypatch.setattr(pipeline_bounces, "passing_flats", refuse)
+    monkeypatch.setattr(type(renderer.warp._method), "past_flats", refuse)
     with torch.no_grad():
         assert torch.equal(image_of(image_of.start), kept)
         assert not torch.equal(image_of(0.5 * image_of.start), kept)

@@ -1,12 +1,18 @@
 """Flat bodies that cast shadows block direct light as planes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import warpshadow as ws
+from warpshadow.maths.directions import fibonacci
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.torch import TorchRenderer
+
+STEP = 1e-3
 
 
 def scene_of(*, ground=1, directions=128, method="directional", tilt=0.0):
@@ -23,6 +29,11 @@ def on_ball(image):
     return image[9:22, 10:22, :3]
 
 
+def inside_ball(image):
+    """Pixels away from its silhouette."""
+    return image[11:20, 12:20, :3]
+
+
 def test_a_ground_darkens_a_ball_as_rays_find_it_and_its_sphere_does_not():
     truth = on_ball(ws.render(scene_of(method="ray-traced")))
     own_sphere = scene_blockers(scene_of())[1]
@@ -37,19 +48,50 @@ def test_explanations_tell_of_flats():
     assert not ws.Renderer(scene_of(ground=ws.Spheres([[0, -9, 0]], [9.0]))).explain()["flats"]
 
 
+MOVES = {
+    "ball": np.float32([[0.1, 1, 0.2], [0, 0, 0]]),
+    "ground": np.float32([[0, 0, 0], [0.1, -1, 0.1]]),
+    "both": np.float32([[0.3, 1, 0.2], [-0.2, 1.5, 0.1]]),
+}
+
+
+@pytest.mark.parametrize("step", MOVES.values(), ids=MOVES)
+def test_gradients_of_shading_alone_are_those_of_differences(step):
+    """Points stay where they are on the ball, so no rasterizer takes part."""
+    renderer = ws.Renderer(scene_of(directions=64, tilt=5.0))
+    poses = renderer.scene_poses()
+    translations = poses.translations.numpy()
+    normals = fibonacci(192).astype(np.float32)
+    on_ball_at_rest = translations[0, 0] + np.float32(0.5) * normals
+    weights = np.random.default_rng(0).normal(size=(1, len(normals), 3)).astype(np.float32)
+
+    def shading(shift):
+        placed = wp.array(translations + np.float32(shift) * step, dtype=wp.vec3, requires_grad=True)
+        points = wp.array((on_ball_at_rest + np.float32(shift) * step[0])[None], dtype=wp.vec3, requires_grad=True)
+        with wp.Tape() as tape:
+            geometry = renderer.placed(dataclasses.replace(poses, translations=placed))
+            lit = renderer.shade(view=renderer.at_points(points, wp.array(normals[None], dtype=wp.vec3), geometry))
+        return lit, points, placed, tape
+
+    lit, points, placed, tape = shading(0)
+    tape.backward(grads={lit: wp.array(weights, dtype=wp.vec3)})
+    found = (placed.grad.numpy()[0] * step).sum() + (points.grad.numpy()[0] @ step[0]).sum()
+    below, above = ((shading(shift)[0].numpy().astype(float) * weights).sum() for shift in (-STEP, STEP))
+    assert found == pytest.approx((above - below) / (2 * STEP), rel=0.005)
+
+
 @pytest.mark.parametrize("moving", [None, ["ball"], ["ground"]])
-def test_gradients_to_poses_are_those_of_differences(moving):
+def test_gradients_of_pixels_inside_the_ball_are_those_of_differences(moving):
+    """At silhouettes a difference of images is of another kind: pixels there have a gradient of areas."""
     renderer = TorchRenderer(scene_of(directions=64, tilt=5.0))
     rotations, translations, scales = renderer.scene_poses()
-    step = torch.tensor([[0.1, 1.0, 0.2], [0.1, -1.0, 0.1]])
-    if moving is not None:
-        step[1 if moving == ["ball"] else 0] = 0
+    step = torch.from_numpy(MOVES["both" if moving is None else moving[0]])
 
     def loss(shift):
         geometry = renderer.placed(rotations, translations + shift * step, scales, moving=moving)
-        return (on_ball(renderer(geometry=geometry)).double() ** 2).sum()
+        return (inside_ball(renderer(geometry=geometry)).double() ** 2).sum()
 
     shift = torch.zeros((), requires_grad=True)
     loss(shift).backward()
-    ends = [float(loss(torch.tensor(sign * 1e-3))) for sign in (1, -1)]
-    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=0.01)
+    ends = [float(loss(torch.tensor(sign * STEP))) for sign in (1, -1)]
+    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=0.01)
