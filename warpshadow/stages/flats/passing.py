@@ -31,7 +31,7 @@ from warpshadow.stages.flats.cells import (
     to_place,
     toward_side,
 )
-from warpshadow.stages.flats.prepared import Flats
+from warpshadow.stages.flats.prepared import FlatGrid, Flats
 
 _CELL_COST = 4.0
 """Nanoseconds that a cell of a receiver takes, on average over those that meet a flat and those that do not."""
@@ -47,17 +47,11 @@ class _Covered:
 
 
 @wp.func
-def _cover(scene: FlatScene, f: int, place: Place, is_back: bool, direction: wp.vec3):
-    """What a side of a flat takes of a cell."""
+def _cover(scene: FlatScene, grid: FlatGrid, place: Place, is_back: bool, direction: wp.vec3, presence: float):
+    """What a side of a flat takes of a cell, of the part of it that is there."""
     covered = _Covered()
     cosine = wp.dot(direction, place.normal)
-    if wp.where(is_back, cosine, -cosine) <= -scene.radius:
-        return covered
-    grid = scene.grids[f]
-    presence = front_presence(grid, place.at[2])
-    if is_back:
-        presence = 1.0 - presence
-    if presence > 0.0:
+    if presence > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
         covered.met = meet(grid, scene, on_side(place, is_back), toward_side(place, is_back, direction), presence)
         covered.part = 1.0
         if grid.is_whole == 0 and covered.met.share > 0.0:
@@ -70,16 +64,16 @@ def _cover(scene: FlatScene, f: int, place: Place, is_back: bool, direction: wp.
 @wp.func
 def _cover_adjoint(
     scene: FlatScene,
-    f: int,
+    grid: FlatGrid,
     place: Place,
     is_back: bool,
     direction: wp.vec3,
+    presence: float,
     covered: _Covered,
     adj: float,
     adj_place: Place,
 ):
     """Gradient of the place, added to what it is from elsewhere."""
-    grid = scene.grids[f]
     met = covered.met
     adj_spot = wp.vec3()
     if grid.is_whole == 0:
@@ -89,12 +83,11 @@ def _cover_adjoint(
     adj_distance = float(0.0)
     if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
         adj_distance = adj_spot[2] / met.distance
-    presence = front_presence(grid, place.at[2])
     adj_at, adj_toward, adj_presence = meet_adjoint(
         grid,
         scene,
         toward_side(place, is_back, direction),
-        wp.where(is_back, 1.0 - presence, presence),
+        presence,
         met,
         adj * covered.part,
         adj_distance,
@@ -105,11 +98,17 @@ def _cover_adjoint(
 
 
 @wp.func
-def _faces(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int, direction: wp.vec3):
-    """Whether a receiver looks towards a direction; without normals it looks everywhere."""
+def _normal(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
+    """Where a receiver looks; 0 for one that looks everywhere."""
     if facing:
-        return wp.dot(facing[instance_in(batch, facing.shape[0]), receiver], direction) > 0.0
-    return True
+        return facing[instance_in(batch, facing.shape[0]), receiver]
+    return wp.vec3()
+
+
+@wp.func
+def _looks(normal: wp.vec3, direction: wp.vec3):
+    """Whether it looks towards a direction."""
+    return wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -131,12 +130,15 @@ def _pass(
     batch, receiver = split_row(first_row + wp.tid(), points.shape[1])
     place = find_place(points[batch, receiver], frames[instance_in(batch, frames.shape[0])], f)
     exists = wp.length_sq(place.normal) > 0.0
+    grid = scene.grids[f]
+    front = front_presence(grid, place.at[2])
+    normal = _normal(facing, batch, receiver)
     for q in range(directions.shape[0]):
         direction = directions[q]
         part = transmittance[batch, receiver, q]
-        if exists and part > 0.0 and _faces(facing, batch, receiver, direction):
-            part *= 1.0 - _cover(scene, f, place, False, direction).coverage
-            part *= 1.0 - _cover(scene, f, place, True, direction).coverage
+        if exists and part > 0.0 and _looks(normal, direction):
+            part *= 1.0 - _cover(scene, grid, place, False, direction, front).coverage
+            part *= 1.0 - _cover(scene, grid, place, True, direction, 1.0 - front).coverage
         passing[batch, receiver, q] = part
 
 
@@ -165,23 +167,26 @@ def _pass_adjoint(
     point = points[batch, receiver]
     place = find_place(point, frames[instance], f)
     exists = wp.length_sq(place.normal) > 0.0
+    grid = scene.grids[f]
+    front = front_presence(grid, place.at[2])
+    normal = _normal(facing, batch, receiver)
     adj_place = Place()
     for q in range(directions.shape[0]):
         direction = directions[q]
         adj = adj_passing[batch, receiver, q]
         passed = float(1.0)
-        if exists and adj != 0.0 and _faces(facing, batch, receiver, direction):
-            at_front = _cover(scene, f, place, False, direction)
-            at_back = _cover(scene, f, place, True, direction)
+        if exists and adj != 0.0 and _looks(normal, direction):
+            at_front = _cover(scene, grid, place, False, direction, front)
+            at_back = _cover(scene, grid, place, True, direction, 1.0 - front)
             passed = (1.0 - at_front.coverage) * (1.0 - at_back.coverage)
             adj_blocked = -adj * transmittance[batch, receiver, q]
-            if adj_blocked != 0.0:
-                if at_front.coverage > 0.0:
-                    adj_front = adj_blocked * (1.0 - at_back.coverage)
-                    adj_place = _cover_adjoint(scene, f, place, False, direction, at_front, adj_front, adj_place)
-                if at_back.coverage > 0.0:
-                    adj_back = adj_blocked * (1.0 - at_front.coverage)
-                    adj_place = _cover_adjoint(scene, f, place, True, direction, at_back, adj_back, adj_place)
+            # a cell that is covered wholly stays so
+            if adj_blocked != 0.0 and at_front.coverage > 0.0 and at_front.coverage < 1.0:
+                adj_front = adj_blocked * (1.0 - at_back.coverage)
+                adj_place = _cover_adjoint(scene, grid, place, False, direction, front, at_front, adj_front, adj_place)
+            if adj_blocked != 0.0 and at_back.coverage > 0.0 and at_back.coverage < 1.0:
+                back, adj_back = 1.0 - front, adj_blocked * (1.0 - at_front.coverage)
+                adj_place = _cover_adjoint(scene, grid, place, True, direction, back, at_back, adj_back, adj_place)
         if adj_transmittance:
             adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj * passed
     adj_point = find_place_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
