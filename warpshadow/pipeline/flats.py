@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.stages.flats.grid import find_grid
 from warpshadow.stages.flats.prepared import FlatBody, Flats
@@ -41,9 +40,7 @@ class SceneFlats:
     @functools.cached_property
     def numbers(self) -> tuple[int, ...]:
         """Bodies that lie in a plane."""
-        surfaces = [body.mesh for body in self._assembly.scene.bodies]
-        corners = [mesh.positions[mesh.surface.faces].astype(np.float64) for mesh in surfaces]
-        return tuple(number for number, each in enumerate(corners) if plane_normal(each) is not None)
+        return tuple(np.flatnonzero(self._assembly.is_flat).tolist())
 
     def others(self, number: int) -> list[np.ndarray]:
         """Vertices of each other body where the scene has it, in a body's frame."""
