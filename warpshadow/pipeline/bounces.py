@@ -47,8 +47,8 @@ CELLS = fibonacci(64)
 class SeenCells(NamedTuple):
     """What a part of receivers sees in cells of directions."""
 
-    own: wp.array | None  # [batch, receiver, cell], the share that its own body lets through; None where that is all
-    through: wp.array  # [batch, receiver, cell], and what all bodies do but flat ones
+    past_own: wp.array | None  # [batch, receiver, cell], transmittance past its own body; None where that is 1
+    past_solid: wp.array  # [batch, receiver, cell], past all bodies but flats, its own included
     directions: np.ndarray  # [cell, 3]
 
 
@@ -146,7 +146,7 @@ class Gathering:
     def _from_flats(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array:
         flats = self._bounces.flats_of(outgoing.senders)
         assert flats is not None
-        given = group.points, group.normals, cells.through, outgoing.frames, outgoing.radiosity, flats.all
+        given = group.points, group.normals, cells.past_solid, outgoing.frames, outgoing.radiosity, flats.all
         return flat_light(*given, cells.directions, skip=flats.number.get(group.body))
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
@@ -162,8 +162,8 @@ class Gathering:
             centers,
             radii,
             exitance,
-            expand_rows(cells.through, count),
-            cells.own,
+            expand_rows(cells.past_solid, count),
+            cells.past_own,
             cells.directions,
         )
         return sphere_light(*given, softness=visibility.softness, merging=visibility.merging)
@@ -185,15 +185,15 @@ class LitPart(NamedTuple):
 class LitSources(InParts):
     """Direct light at the sources; what they see is kept with it, for light that bounces."""
 
-    def __init__(self, bounces: SphereBounces, points: LitPoints, own: Node, light: Source):
+    def __init__(self, bounces: SphereBounces, points: LitPoints, taken: Node, light: Source):
         self._bounces = bounces
-        super().__init__(bounces.method, points, own, light, list, where=" of sources")
+        super().__init__(bounces.method, points, taken, light, list, where=" of sources")
 
-    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> LitPart:
+    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> LitPart:
         """Light a part, and keep what it sees."""
-        seen = self.see(call, part, own)
-        shading = self.light(call, part, seen, own)
-        return LitPart(shading, part, self._bounces.cells(part, seen, own, spheres))
+        seen = self.see(call, part, taken)
+        shading = self.light(call, part, seen, taken)
+        return LitPart(shading, part, self._bounces.cells(part, seen, taken, spheres))
 
 
 class Radiosity(Node):
@@ -248,7 +248,7 @@ class BouncedShading(InParts):
         self,
         bounces: SphereBounces,
         points: LitPoints,
-        own: Node,
+        taken: Node,
         light: Source,
         radiosity: Radiosity,
         senders: Senders,
@@ -257,14 +257,14 @@ class BouncedShading(InParts):
         given = points.receivers_node, radiosity
         self._gathering = Gathering(bounces, senders, given, functools.partial(receiver_words, points))
         stages = self._gathering.stages
-        super().__init__(bounces.method, points, own, light, joined, extra=(radiosity,), beside=stages)
+        super().__init__(bounces.method, points, taken, light, joined, extra=(radiosity,), beside=stages)
 
-    def find(self, call: Call, part: Group, own: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
+    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
         """Light a part, directly and by what patches send."""
         (outgoing,) = extra
-        seen = self.see(call, part, own)
-        direct = self.light(call, part, seen, own)
-        cells = self._bounces.cells(part, seen, own, spheres)
+        seen = self.see(call, part, taken)
+        direct = self.light(call, part, seen, taken)
+        cells = self._bounces.cells(part, seen, taken, spheres)
         return total_light([direct, *self._gathering.run(call, part, cells, outgoing)])
 
 
@@ -297,33 +297,33 @@ class SphereBounces:
         self._spheres_of_sources: dict[Senders, np.ndarray] = {}
         self._nodes: dict[tuple[Senders, int | None], tuple[np.ndarray, np.ndarray]] = {}
 
-    def shading(self, points: LitPoints, own: Node, light: Source, materials: Materials) -> Node:
+    def shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         Args:
             points: The receivers.
-            own: What the method takes of the light.
+            taken: What the method takes of the light.
             light: The light.
             materials: What the bodies reflect.
         """
         senders = self.patches.senders(materials)
         if not senders.bodies:
             idle = Node("bounces", None, idle="every body is black")
-            return InParts(self.method, points, own, light, joined, beside=(idle,))
+            return InParts(self.method, points, taken, light, joined, beside=(idle,))
         frames = self._frames(points, senders)
         words = f"{len(senders.sides):,} sources"
         sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
-        lit = LitSources(self, self._at(sources, points, materials), own, light)
+        lit = LitSources(self, self._at(sources, points, materials), taken, light)
         albedo = self.patches.albedo(materials, senders.bodies)
         radiosity = Radiosity(self, senders, sources, lit, albedo, points.spheres, frames)
-        return BouncedShading(self, points, own, light, radiosity, senders)
+        return BouncedShading(self, points, taken, light, radiosity, senders)
 
-    def kept_shading(self, points: LitPoints, own: Any, light: Source, materials: Materials) -> Node:
+    def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.
 
         Args:
             points: The receivers, among bodies that stand where the scene has them.
-            own: What the method takes of the light, or of any where it is free.
+            taken: What the method takes of the light, or of any where it is free.
             light: The light, known or free.
             materials: What the bodies reflect.
         """
@@ -333,8 +333,8 @@ class SphereBounces:
             direct = Node("shading", _shade, points.transfers, light)
             transfers = points.kept("transfer", sources, lambda: self.method.transfers(at_sources, where))
             return self._still.in_free_light(direct, transfers, light, points, materials)
-        direct = points.kept("direct", light, lambda: InParts(self.method, points, own, light, joined))
-        make = functools.partial(InParts, self.method, at_sources, own, light, joined, where=where)
+        direct = points.kept("direct", light, lambda: InParts(self.method, points, taken, light, joined))
+        make = functools.partial(InParts, self.method, at_sources, taken, light, joined, where=where)
         lit = points.kept("direct at sources", (light, sources), make)
         return self._still.in_known_light(direct, lit, points, materials)
 
@@ -345,7 +345,7 @@ class SphereBounces:
     def _at(self, sources: Node, points: LitPoints, materials: Materials) -> LitPoints:
         """Sources, to be lit among the bodies among which points are."""
         given = self.method, materials, points.vertices, points.spheres, sources, points.call
-        return LitPoints(*given, normals=points.normals, traced=points.traced)
+        return LitPoints(*given, normals=points.normals, blocking=points.blocking)
 
     def _frames(self, points: LitPoints, senders: Senders) -> Node:
         """Node of where flat bodies are; its value is None without any."""
@@ -382,14 +382,15 @@ class SphereBounces:
         spheres, start = np.full(len(senders.areas), -1, np.int32), 0
         nearest = [np.empty(0, int)]
         for other in self.blocking(body):
-            own = slice(*first_sphere[other : other + 2])
-            count = len(radii[own])
+            of_body = slice(*first_sphere[other : other + 2])
+            count = len(radii[of_body])
             of_spheres = np.full(count, -1)
             if count and other in senders.bodies:
                 place = senders.bodies.index(other)
                 patches, first = senders.patches[place], senders.first[place]
-                spheres[first : senders.first[place + 1]] = start + patches.nearest_spheres(centers[own], radii[own])
-                gaps = np.linalg.norm(centers[own][:, None] - patches.centers, axis=2)
+                nearest_spheres = patches.nearest_spheres(centers[of_body], radii[of_body])
+                spheres[first : senders.first[place + 1]] = start + nearest_spheres
+                gaps = np.linalg.norm(centers[of_body][:, None] - patches.centers, axis=2)
                 of_spheres = first + gaps.argmin(axis=1)
             nearest.append(of_spheres)
             start += count
@@ -421,7 +422,8 @@ class SphereBounces:
             _, radii = self.assembly.spheres_of(self.blocking(None), spheres)
             normals = turn_from_flats(sources.points, normals, radii, self._spheres_of(senders), frames, flats.all)
         rows = [
-            wp.full_like(part.through, 1.0, requires_grad=False) if part.own is None else part.own for part in cells
+            wp.full_like(part.past_solid, 1.0, requires_grad=False) if part.past_own is None else part.past_own
+            for part in cells
         ]
         passing = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
@@ -434,18 +436,19 @@ class SphereBounces:
             self._spheres_of_sources[senders] = self._nearest(senders, None)[0][senders.patch_of_source]
         return self._spheres_of_sources[senders]
 
-    def cells(self, group: Group, seen: Seen, light: Any, spheres: tuple[wp.array, wp.array]) -> SeenCells:
+    def cells(self, group: Group, seen: Seen, taken: Any, spheres: tuple[wp.array, wp.array]) -> SeenCells:
         """What a group sees in cells, of what it sees, what the method takes of the light, and all spheres."""
-        through, own, directions = seen.through if seen.solid is None else seen.solid, seen.own, CELLS
-        if isinstance(light, Cells):
-            directions = light.directions
+        if isinstance(taken, Cells):
+            directions, past_own = taken.directions, seen.past_own
+            past_solid = seen.past_all if seen.past_solid is None else seen.past_solid
         else:
-            own, through = None, self._transmittance(group, self.blocking(None), spheres, directions)
-        if own is None and group.body is not None and group.body not in self.flats:
-            own = self._transmittance(group, [group.body], spheres, directions)
-        if through is None:
-            through = wp.full((*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device)
-        return SeenCells(own, through, directions)
+            directions, past_own = CELLS, None
+            past_solid = self._transmittance(group, self.blocking(None), spheres, directions)
+        if past_own is None and group.body is not None and group.body not in self.flats:
+            past_own = self._transmittance(group, [group.body], spheres, directions)
+        if past_solid is None:
+            past_solid = wp.full((*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device)
+        return SeenCells(past_own, past_solid, directions)
 
     def _transmittance(
         self, group: Group, bodies: list[int], spheres: tuple[wp.array, wp.array], directions: np.ndarray
@@ -460,7 +463,7 @@ class SphereBounces:
     def factors(self, body: int) -> SparseMatrix:
         """What share of the hemisphere of each of a body's sites its own patches take, found once, by rays."""
         if body not in self._factors:
-            sites, patches = self.method.own.sites(body), self.patches.of_body(body)
+            sites, patches = self.method.own_shadows.sites(body), self.patches.of_body(body)
             faces = self.assembly.scene.bodies[body].mesh.surface.faces
             vertices = sites.positions[: self.assembly.first_vertex[body + 1] - self.assembly.first_vertex[body]]
             points, normals = sites.positions, sites.normals

@@ -13,7 +13,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, map_of
 from warpshadow.pipeline.node import Source
-from warpshadow.pipeline.own_shadows import OwnLookup, Traced
+from warpshadow.pipeline.own_shadows import Blocking, OwnLookup
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.spheres import Spheres
 from warpshadow.stages.flats.passing import passing_flats
@@ -39,17 +39,17 @@ class Cells(NamedTuple):
 class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
 
-    traces_own = True
+    traces_own_shadows = True
 
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(assembly.scene.visibility.directions)
         super().__init__(assembly, CellBasis(self._directions), basis, progress=progress)
-        self.in_free = Cells(self._directions)
+        self.taken_if_free = Cells(self._directions)
 
-    def in_known(self, light: KnownLight) -> Cells:
+    def taken_from(self, light: KnownLight) -> Cells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
         if not isinstance(light, EnvironmentMap):
-            return Cells(self._directions, self._on_device(self.own_basis.coefficients(light)))
+            return Cells(self._directions, self._on_device(self.native_basis.coefficients(light)))
         cells = light.cells(self._directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         narrow = find_narrow(power, cells.directions, cells.spreads, softness)
@@ -62,25 +62,27 @@ class Directional(SphereMethod):
         """Number of coefficients that take part: all."""
         return len(self._directions)
 
-    def own_shadows(self, bodies: tuple[int, ...], rotations: wp.array, light: Cells) -> dict[int, OwnLookup]:
+    def look_up(self, bodies: tuple[int, ...], rotations: wp.array, taken: Cells) -> dict[int, OwnLookup]:
         """What receivers of some bodies look up of these. Differentiable: rotations."""
-        return self.own.lookups(bodies, rotations, light.directions, light.spreads)
+        return self.own_shadows.lookups(bodies, rotations, taken.directions, taken.spreads)
 
-    def see(self, group: Group, light: Cells) -> Seen:
+    def see(self, group: Group, taken: Cells) -> Seen:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
-        points, normals, centers, radii, kept = group[:5]
-        own = self._see_own(group)
+        points, normals, centers, radii, kept_rows = group[:5]
+        past_own = self._past_own(group)
         if not (radii.shape[1] and points.size):
-            shape = *points.shape, len(light.directions)
-            return Seen(wp.full(shape, 1.0, dtype=wp.float32, device=points.device) if own is None else own, own)
+            if past_own is not None:
+                return Seen(past_own, past_own)
+            shape = *points.shape, len(taken.directions)
+            return Seen(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
         # kept cells have light although their middles are below the horizon
-        facing = normals if kept is None else None
+        facing = normals if kept_rows is None else None
         block, scales = functools.partial(directional.transmittance, points, facing, centers, radii), self._scales
-        passing = block(light.directions, **scales(1.0))
-        if light.narrow is not None:
-            directions, places, scale = light.narrow
+        passing = block(taken.directions, **scales(1.0))
+        if taken.narrow is not None:
+            directions, places, scale = taken.narrow
             passing = put_narrow(passing, block(directions, **scales(scale)), places)
-        return Seen(passing if own is None else multiply_transmittances(own, passing), own)
+        return Seen(passing if past_own is None else multiply_transmittances(past_own, passing), past_own)
 
     def _scales(self, scale: float) -> dict[str, float]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -90,40 +92,41 @@ class Directional(SphereMethod):
     def blocking_flats(self) -> tuple[int, ...]:
         """Flat bodies that cast shadows, but for those with spheres of the user's own, unless light bounces."""
         scene, casting = self.assembly.scene, self.assembly.casting
-        own = [number for number in casting if isinstance(scene.bodies[number].blockers, Spheres) and not scene.bounces]
-        return tuple(number for number in self.flats.numbers if number in casting and number not in own)
+        has_given = [isinstance(body.blockers, Spheres) and not scene.bounces for body in scene.bodies]
+        return tuple(number for number in self.flats.numbers if number in casting and not has_given[number])
 
-    def past_flats(self, group: Group, seen: Seen, light: Cells) -> Seen:
+    def past_flats(self, group: Group, seen: Seen, taken: Cells) -> Seen:
         """Transmittance past the flat bodies around a group, too."""
-        points, around, through = group.points, group.around, seen.through
-        if around is None or through is None or not points.size:
+        points, flats, past_solid = group.points, group.flats, seen.past_all
+        if flats is None or past_solid is None or not points.size:
             return seen
-        facing = group.normals if group.kept is None else None
-        given = points, through, around.frames, around.flats, light.directions
-        return seen._replace(through=passing_flats(*given, facing=facing, skip=around.skip), solid=through)
+        facing = group.normals if group.kept_rows is None else None
+        given = points, past_solid, flats.frames, flats.flats, taken.directions
+        past_all = passing_flats(*given, facing=facing, skip=flats.skip)
+        return seen._replace(past_all=past_all, past_solid=past_solid)
 
-    def _see_own(self, group: Group) -> wp.array | None:
+    def _past_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""
-        if group.own is None or not group.points.size:
+        if group.own_shadow is None or not group.points.size:
             return None
-        assert group.places is not None and isinstance(group.own, OwnLookup)
-        rows, lookup, supports = group.own
+        assert group.places is not None and isinstance(group.own_shadow, OwnLookup)
+        rows, lookup, supports = group.own_shadow
         return gather_own(group.normals, group.places, lookup, supports, rows)
 
-    def transfer(self, seen: Seen, group: Group, light: Cells) -> wp.array:
+    def transfer(self, seen: Seen, group: Group, taken: Cells) -> wp.array:
         """Transfer vectors; the transmittance as it is where kept cells hold known light."""
-        assert seen.through is not None
-        if group.kept is None:
-            return directional_transfer(seen.through, group.normals, light.directions)
-        return seen.through if _has_light(group.kept) else cell_transfer(seen.through, group.kept)
+        assert seen.past_all is not None
+        if group.kept_rows is None:
+            return directional_transfer(seen.past_all, group.normals, taken.directions)
+        return seen.past_all if _has_light(group.kept_rows) else cell_transfer(seen.past_all, group.kept_rows)
 
-    def light_part(self, transfer: wp.array, group: Group, light: Cells) -> wp.array:
+    def light_part(self, transfer: wp.array, group: Group, taken: Cells) -> wp.array:
         """Shading of a part, vec3 of shape [batch, receiver]."""
-        if group.kept is not None and _has_light(group.kept):
-            return light_cells(transfer, group.kept)
-        return super().light_part(transfer, group, light)
+        if group.kept_rows is not None and _has_light(group.kept_rows):
+            return light_cells(transfer, group.kept_rows)
+        return super().light_part(transfer, group, taken)
 
-    def kept_rows(self, static: Static, light: Source | None, traced: Traced) -> Rows:
+    def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
         is_scenes = light is self.light
         return static.rows("lit cells" if is_scenes else "cells", functools.partial(self._trace, is_scenes))

@@ -12,7 +12,7 @@ from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
 from warpshadow.pipeline.node import Source
-from warpshadow.pipeline.own_shadows import OwnLobes, Traced
+from warpshadow.pipeline.own_shadows import Blocking, OwnLobes
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.stages.kept_cells import add_rows
 from warpshadow.stages.own_shadows.lobes import own_lobes
@@ -35,15 +35,15 @@ class LogSH(SphereMethod):
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         self._order = order = assembly.scene.visibility.order
         super().__init__(assembly, HarmonicBasis(order), basis, progress=progress)
-        self.in_free = Bands(min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order)
-        self.traces_own = self.visibility.method == "log-sh"
-        if not self.traces_own:
+        self.taken_if_free = Bands(min(order, self.basis.order) if isinstance(self.basis, HarmonicBasis) else order)
+        self.traces_own_shadows = self.visibility.method == "log-sh"
+        if not self.traces_own_shadows:
             self.why_no_shadows = "the method is to have no shadows"
 
-    def in_known(self, light: KnownLight) -> Bands:
+    def taken_from(self, light: KnownLight) -> Bands:
         """The bands that the light has."""
         count = self._band_count(light)
-        coefficients = self.own_basis.coefficients(light)[None, : count**2]
+        coefficients = self.native_basis.coefficients(light)[None, : count**2]
         return Bands(count, wp.array(coefficients, dtype=wp.vec3, device=self.assembly.device))
 
     def _band_count(self, light: KnownLight) -> int:
@@ -53,54 +53,56 @@ class LogSH(SphereMethod):
         """Number of coefficients that take part."""
         known = None if light is None else light.value()
         if known is None or isinstance(known, wp.array):
-            return self.in_free.bands**2
+            return self.taken_if_free.bands**2
         return self._band_count(known) ** 2
 
-    def own_shadows(self, bodies: tuple[int, ...], rotations: wp.array, light: Bands) -> dict[int, OwnLobes]:
+    def look_up(self, bodies: tuple[int, ...], rotations: wp.array, taken: Bands) -> dict[int, OwnLobes]:
         """The lobes of some bodies, turned. Differentiable: rotations."""
-        return self.own.turned_lobes(bodies, rotations, self._order)
+        return self.own_shadows.turned_lobes(bodies, rotations, self._order)
 
-    def see(self, group: Group, light: Bands) -> Seen:
+    def see(self, group: Group, taken: Bands) -> Seen:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
-        points, _, _, radii, kept = group[:5]
-        if not points.size or (kept is None and not radii.shape[1]):
+        points, _, _, radii, kept_rows = group[:5]
+        if not points.size or (kept_rows is None and not radii.shape[1]):
             return Seen(None)
         if radii.shape[1]:
             log = self._logs(*group[:4])
         else:
             log = wp.zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
-        if kept is not None:
-            add_rows(kept, log)
+        if kept_rows is not None:
+            add_rows(kept_rows, log)
         return Seen(exponential.exponentiate(log, base=self.visibility.base))
 
-    def transfer(self, seen: Seen, group: Group, light: Bands) -> wp.array:
+    def transfer(self, seen: Seen, group: Group, taken: Bands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
-        own = self._own_lobes(seen, group, light)
-        if own is None:
-            return sh_transfer(seen.through, group.normals, order=self._order, bands=light.bands)
-        return own if seen.through is None else sh_product(seen.through, own, order=self._order, bands=light.bands)
+        lobes = self._own_lobes(seen, group, taken)
+        if lobes is None:
+            return sh_transfer(seen.past_all, group.normals, order=self._order, bands=taken.bands)
+        if seen.past_all is None:
+            return lobes
+        return sh_product(seen.past_all, lobes, order=self._order, bands=taken.bands)
 
-    def _own_lobes(self, seen: Seen, group: Group, light: Bands) -> wp.array | None:
+    def _own_lobes(self, seen: Seen, group: Group, taken: Bands) -> wp.array | None:
         """Lobes that receivers' own bodies leave, [batch, receiver, order²]; only the light's bands if nothing blocks.
 
         None where they are clamped cosines.
         """
-        if group.kept is not None and group.kept.rows.shape[1] == 2:
-            assert seen.through is not None
-            lobes = wp.zeros(seen.through.shape, dtype=wp.float32, device=seen.through.device)
-            add_rows(group.kept, lobes, channel=1)
+        if group.kept_rows is not None and group.kept_rows.rows.shape[1] == 2:
+            assert seen.past_all is not None
+            lobes = wp.zeros(seen.past_all.shape, dtype=wp.float32, device=seen.past_all.device)
+            add_rows(group.kept_rows, lobes, channel=1)
             return lobes
-        if group.own is None or not group.points.size:
+        if group.own_shadow is None or not group.points.size:
             return None
-        assert group.places is not None and isinstance(group.own, OwnLobes)
-        bands = light.bands if seen.through is None else self._order
-        return own_lobes(group.own.lobes, group.places, group.own.turn, order=self._order, bands=bands)
+        assert group.places is not None and isinstance(group.own_shadow, OwnLobes)
+        bands = taken.bands if seen.past_all is None else self._order
+        return own_lobes(group.own_shadow.lobes, group.places, group.own_shadow.turn, order=self._order, bands=bands)
 
-    def kept_rows(self, static: Static, light: Source | None, traced: Traced) -> Rows:
+    def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
-        if any(body in traced.bodies for body in static.bodies):
-            find = functools.partial(self._accumulate_and_turn, traced.bodies)
-            return static.rows(("log sums and lobes", traced.bodies), find)
+        if any(body in blocking.traced for body in static.bodies):
+            find = functools.partial(self._accumulate_and_turn, blocking.traced)
+            return static.rows(("log sums and lobes", blocking.traced), find)
         return static.rows("log sums", self._accumulate)
 
     def _accumulate(self, static: Static, vertices: np.ndarray, normals: wp.array) -> wp.array:
@@ -115,7 +117,8 @@ class LogSH(SphereMethod):
         body_of_vertex, device = self.assembly.body_of_vertex, self.assembly.device
         rows = np.empty((len(vertices), 2, self._order**2), np.float32)
         bodies = body_of_vertex[vertices % len(body_of_vertex)]
-        turned = self.own.turned_lobes(tuple(np.intersect1d(traced, bodies).tolist()), static.rotations, self._order)
+        named = tuple(np.intersect1d(traced, bodies).tolist())
+        turned = self.own_shadows.turned_lobes(named, static.rotations, self._order)
         for body in np.unique(bodies).tolist():
             of_body = np.flatnonzero(bodies == body)
             given = static.gathered(vertices[of_body], normals)
@@ -123,10 +126,10 @@ class LogSH(SphereMethod):
             rows[of_body, 0] = self._logs(*given, *static.spheres_of(blocking)).numpy()[0]
             if body in turned:
                 lobes, turn = turned[body]
-                own = own_lobes(lobes, self.own.places_of(body, vertices[of_body]), turn, order=self._order)
+                found = own_lobes(lobes, self.own_shadows.places_of(body, vertices[of_body]), turn, order=self._order)
             else:
-                own = sh_transfer(None, given[1], order=self._order)
-            rows[of_body, 1] = own.numpy()[0]
+                found = sh_transfer(None, given[1], order=self._order)
+            rows[of_body, 1] = found.numpy()[0]
         return wp.array(rows, dtype=wp.float32, device=device)
 
     def _logs(self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array) -> wp.array:

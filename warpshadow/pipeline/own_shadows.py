@@ -32,17 +32,17 @@ VERSION = 2
 """Part of the key of cached rows: raise it whenever they would come out differently."""
 
 
-class Traced(NamedTuple):
-    """The bodies of a geometry whose own spheres do not block their light, and how bodies are turned; and flat ones."""
+class Blocking(NamedTuple):
+    """How the bodies of a geometry block light: by their spheres, but for some."""
 
-    bodies: tuple[int, ...] = ()
-    rotations: Source | None = None
-    why: tuple[str, ...] = ()  # the others' do, of each body
-    flats: tuple[int, ...] = ()  # bodies that block as the planes in which they lie, in place of their spheres
+    traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
+    rotations: Source | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
+    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
+    flats: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
 
 
-NOT_TRACED = Traced()
-"""All bodies are blocked by their spheres."""
+BY_SPHERES = Blocking()
+"""All bodies block by their spheres."""
 
 
 class OwnLookup(NamedTuple):
@@ -88,10 +88,10 @@ class OwnShadows:
 
     # ------------------------------------------------------------------------------------------ which bodies
 
-    def traced(self, geometry: Geometry | None, rotations: Source | None) -> Traced:
-        """The bodies of a geometry, by default the scene's, whose own spheres do not block their light."""
+    def blocking(self, geometry: Geometry | None, rotations: Source | None) -> Blocking:
+        """How the bodies of a geometry, by default the scene's, block light; none as planes."""
         why = tuple(self._why_spheres(body, geometry) for body in range(len(self._samples_receive)))
-        return Traced(tuple(body for body, reason in enumerate(why) if not reason), rotations, why)
+        return Blocking(tuple(body for body, reason in enumerate(why) if not reason), rotations, why)
 
     def _why_spheres(self, body: int, geometry: Geometry | None) -> str:
         """Why a body's own spheres block its light in a geometry, by default the scene's; empty if they do not."""

@@ -33,7 +33,7 @@ from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.lighting import Light, LitPoints, SphereMethod, joined
 from warpshadow.pipeline.log_sh import LogSH
 from warpshadow.pipeline.node import Call, Clock, Node, Source
-from warpshadow.pipeline.own_shadows import NOT_TRACED, Traced
+from warpshadow.pipeline.own_shadows import BY_SPHERES, Blocking
 from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
@@ -299,9 +299,9 @@ class Renderer:
         vertices, spheres, cameras, static = self._vertices, self._spheres, self._cameras, None
         last, poses, matrices = self._last_view, [None], self.cameras
         if geometry is not None:
-            own = self.assembly.rest.arrays()
+            rest = self.assembly.rest.arrays()
             for name, array in geometry.arrays().items():
-                check.shape(f"geometry.{name}", array.shape, ("batch", *own[name].shape[1:]), PLACED)
+                check.shape(f"geometry.{name}", array.shape, ("batch", *rest[name].shape[1:]), PLACED)
             poses = geometry.positions
             vertices = Source.renewed("vertices", poses, last.vertices if last else None)
             spheres = Source.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
@@ -315,7 +315,7 @@ class Renderer:
             static = self._statics.get(geometry.moving)
             if static is None or not static.are_those_of(geometry):
                 static = Static(self.assembly, geometry)
-        given = vertices, spheres, cameras, static, self._traced(geometry, last)
+        given = vertices, spheres, cameras, static, self._blocking(geometry, last)
         for view in (self._scene_view, last):
             if view is not None and view.given == given:
                 return view
@@ -329,15 +329,15 @@ class Renderer:
             stands=geometry is None and clip_matrices is None and image_count == 1,
         )
 
-    def _traced(self, geometry: Geometry | None, last: LitPoints | None = None) -> Traced:
-        """The bodies of a geometry, by default the scene's, whose own spheres do not block their light."""
-        if not self._method.traces_own:
-            return NOT_TRACED
+    def _blocking(self, geometry: Geometry | None, last: LitPoints | None = None) -> Blocking:
+        """How the bodies of a geometry, by default the scene's, block light."""
+        if not self._method.traces_own_shadows:
+            return BY_SPHERES
         rotations = self._rotations
         if geometry is not None and geometry.rotations is not None:
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
-            rotations = Source.renewed("rotations", geometry.rotations, last.traced.rotations if last else None)
-        return self._method.own.traced(geometry, rotations)._replace(flats=self._flats(geometry))
+            rotations = Source.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
+        return self._method.own_shadows.blocking(geometry, rotations)._replace(flats=self._flats(geometry))
 
     def _flats(self, geometry: Geometry | None) -> tuple[int, ...]:
         """Bodies that block as planes in a geometry, by default the scene's."""
@@ -366,8 +366,8 @@ class Renderer:
             vertices = Source("vertices", geometry.positions)
             spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
-        traced = NOT_TRACED._replace(flats=self._flats(geometry))
-        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), traced=traced)
+        blocking = BY_SPHERES._replace(flats=self._flats(geometry))
+        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), blocking=blocking)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
         """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
@@ -380,17 +380,17 @@ class Renderer:
 
         Differentiable: geometry.
         """
-        traced, assembly, vertices, spheres = self._traced(geometry), self.assembly, self._vertices, self._spheres
+        blocking, assembly, vertices, spheres = self._blocking(geometry), self.assembly, self._vertices, self._spheres
         if geometry is not None:
             vertices = Source("vertices", geometry.positions)
             spheres = Source("spheres", (geometry.centers, geometry.radii))
-        apart = self._method.apart(traced)
+        apart = self._method.apart(blocking)
         bodies = None if apart is None else apart[assembly.body_of_face[sides % len(assembly.body_of_face)]]
         normals = Node("", vertex_normals, vertices, assembly.faces)
         given = assembly.faces, sides, barycentrics, bodies
         node = Node("", receivers_on_faces, vertices, normals, *given)
         points = self._method, self._materials, vertices, spheres, node, self._call()
-        return LitPoints(*points, normals=normals, traced=traced)
+        return LitPoints(*points, normals=normals, blocking=blocking)
 
     @functools.cached_property
     def _own_view(self) -> View:

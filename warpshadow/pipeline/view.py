@@ -10,7 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
-from warpshadow.pipeline.own_shadows import Traced
+from warpshadow.pipeline.own_shadows import Blocking
 from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
 from warpshadow.stages import film
@@ -35,14 +35,14 @@ class View(LitPoints):
         spheres: Centers and radii of the spheres.
         cameras: Clip matrices.
         static: The static bodies among moving ones; None where any may move.
-        traced: The bodies whose own spheres do not block their light.
+        blocking: How the bodies block light.
         call: Has what may not be kept of it.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
         stands: As for :class:`LitPoints`.
 
     Attributes:
-        given: Vertices, spheres, cameras, static bodies and traced ones.
+        given: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of what is seen.
     """
 
@@ -54,21 +54,21 @@ class View(LitPoints):
         spheres: Source,
         cameras: Source,
         static: Static | None,
-        traced: Traced,
+        blocking: Blocking,
         *,
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
         stands: bool = False,
     ):
-        self.given = vertices, spheres, cameras, static, traced
-        self._apart = method.apart(traced)
+        self.given = vertices, spheres, cameras, static, blocking
+        self._apart = method.apart(blocking)
         self.cameras = cameras
         self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, cameras, static)
-        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, traced, stands)
+        super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, blocking, stands)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
@@ -114,7 +114,7 @@ class View(LitPoints):
             keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
             numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order, bodies)
         elif is_static is None:
-            numbering = method.numbering(self.traced, has_backs)
+            numbering = method.numbering(self.blocking, has_backs)
         else:
             numbering = number_receivers(assembly.faces, keeps_vertex, is_static, bodies=bodies)
         wants_samples = method.samples_receive[assembly.body_of_face]
@@ -165,8 +165,8 @@ class View(LitPoints):
         can_receive, static = self.method.can_receive, 0
         if self.static is not None:
             static = int((can_receive & self.static.has_vertex).sum())
-        own = self._sample_count * self.method.samples_receive.any()
-        return "up to ", int(self._pose_count * (can_receive.sum() - static) + own), static
+        samples = self._sample_count * self.method.samples_receive.any()
+        return "up to ", int(self._pose_count * (can_receive.sum() - static) + samples), static
 
     def _samples(self) -> str:
         return f"{self._sample_count:,} samples"
