@@ -29,7 +29,7 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline import kept_bounces, lighting
+from warpshadow.pipeline import groups, kept_bounces
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 METHODS = ("directional", "log-sh")
@@ -208,7 +208,7 @@ def test_one_bounce_asks_for_no_light_between_sources():
 def test_receivers_lit_in_parts_are_lit_alike(method, monkeypatch):
     scene = bounced(method, ON_BOTH)
     whole = ws.Renderer(scene).shade().numpy()
-    monkeypatch.setattr(lighting, "PART", 200)
+    monkeypatch.setattr(groups, "PART", 200)
     np.testing.assert_allclose(ws.Renderer(scene).shade().numpy(), whole, rtol=2e-5, atol=1e-6)
 
 

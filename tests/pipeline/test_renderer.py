@@ -12,7 +12,7 @@ import warpshadow as ws
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import lighting
+from warpshadow.pipeline import by_spheres, groups
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.tuning.point_sample import PointSample
@@ -626,7 +626,7 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
     ball = ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE, translation=(0, 1, 0))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 16), blockers=0)), dome(), CAMERA, ws.Visibility(method))
     whole = Renderer(scene).render()
-    monkeypatch.setattr(lighting, "PART", 37)
+    monkeypatch.setattr(groups, "PART", 37)
     renderer = Renderer(scene)
     np.testing.assert_array_equal(renderer.render(), whole)
     assert "transfer" in str(renderer.explain())
@@ -634,11 +634,11 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
 
 def test_parts_of_receivers_need_little_memory(monkeypatch):
     """What is shaded at once is seen by its largest transfer vectors."""
-    monkeypatch.setattr(lighting, "PART", 64)
+    monkeypatch.setattr(groups, "PART", 64)
     sizes = []
-    shade = lighting.shade
+    shade = by_spheres.shade
     monkeypatch.setattr(
-        lighting,
+        by_spheres,
         "shade",
         lambda transfer, *rest, **most: sizes.append(transfer.shape[1]) or shade(transfer, *rest, **most),
     )

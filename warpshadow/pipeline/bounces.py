@@ -20,9 +20,11 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.by_spheres import InParts, SphereMethod
 from warpshadow.pipeline.directional import Cells
+from warpshadow.pipeline.groups import Group, Seen
 from warpshadow.pipeline.kept_bounces import KeptBounces
-from warpshadow.pipeline.lighting import Group, InParts, LitPoints, Seen, SphereMethod, joined, receiver_words
+from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.own_factors import own_factors
 from warpshadow.pipeline.patches import ScenePatches, Senders

@@ -11,7 +11,9 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod, map_of
+from warpshadow.pipeline.by_spheres import SphereMethod
+from warpshadow.pipeline.groups import Group, Seen
+from warpshadow.pipeline.lighting import KnownLight, map_of
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import Blocking, OwnLookup
 from warpshadow.pipeline.static import Rows, Static

@@ -10,7 +10,9 @@ from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.lighting import Group, KnownLight, Seen, SphereMethod
+from warpshadow.pipeline.by_spheres import SphereMethod
+from warpshadow.pipeline.groups import Group, Seen
+from warpshadow.pipeline.lighting import KnownLight
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import Blocking, OwnLobes
 from warpshadow.pipeline.static import Rows, Static

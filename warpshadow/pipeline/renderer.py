@@ -20,6 +20,7 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.assembly import PLACED, Assembly, Geometry, as_geometry
+from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.choice_of_receivers import (
     COARSE_FACE,
     Choice,
@@ -30,7 +31,7 @@ from warpshadow.pipeline.choice_of_receivers import (
 )
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.lighting import Light, LitPoints, SphereMethod, joined
+from warpshadow.pipeline.lighting import Light, LitPoints, joined
 from warpshadow.pipeline.log_sh import LogSH
 from warpshadow.pipeline.node import Call, Clock, Node, Source
 from warpshadow.pipeline.own_shadows import BY_SPHERES, Blocking

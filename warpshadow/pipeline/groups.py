@@ -1,0 +1,147 @@
+"""Groups: receivers that the same bodies block in the same way, and what a group sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warpshadow.device.batch import common_batch, cut, expand
+from warpshadow.device.launch import varies
+from warpshadow.pipeline.flats import FlatsAround, SceneFlats
+from warpshadow.pipeline.lighting import LitPoints
+from warpshadow.pipeline.node import Call
+from warpshadow.pipeline.own_shadows import OwnLobes, OwnLookup
+from warpshadow.stages.kept_cells import KeptRows
+from warpshadow.stages.own_shadows.sites import Places
+from warpshadow.stages.receivers import Receivers
+
+PART = 1 << 13
+"""Receivers that are lit at once where no gradient is asked for."""
+
+
+class Group(NamedTuple):
+    """Receivers that the same spheres block: those of all bodies, or of those other than the receivers' own."""
+
+    points: wp.array  # [batch, receiver] vec3
+    normals: wp.array  # [batch, receiver] vec3
+    centers: wp.array  # [batch, sphere] vec3
+    radii: wp.array  # [batch, sphere] float32
+    kept_rows: KeptRows | None = None  # of static bodies, which block their light, too
+    body: int | None = None  # whose receivers they are, where bodies are told apart
+    places: Places | None = None  # where they lie on that body
+    own_shadow: OwnLookup | OwnLobes | None = None  # by rays; None where there is none, or its spheres block
+    flats: FlatsAround | None = None  # bodies that block as planes; None without any
+
+    def parts(self) -> Iterator[Group]:
+        """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
+
+        For a gradient they come all at once, and so do those with kept rows.
+        """
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats = self
+        size = points.shape[1]
+        turns = None if own_shadow is None else own_shadow.turned
+        frames = None if flats is None else flats.frames
+        if radii.shape[1] or turns is not None or frames is not None:
+            given = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "flats": frames}
+            count = common_batch(given)
+            points, normals, centers, radii = [expand(array, count) for array in self[:4]]
+        varying = [*self[:4], turns, frames]
+        if kept_rows is not None or size <= PART or varies(varying):
+            yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
+            return
+        for start in range(0, size, PART):
+            part = slice(start, min(start + PART, size))
+            yield self._replace(
+                points=points[:, part].contiguous(),
+                normals=normals[:, part].contiguous(),
+                centers=centers,
+                radii=radii,
+                places=None if places is None else places.part(part),
+            )
+
+
+class Seen(NamedTuple):
+    """What a group sees of the light."""
+
+    past_all: wp.array | None  # visibility or transmittance past all bodies; None where nothing blocks
+    past_own: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
+    past_solid: wp.array | None = None  # transmittance past all but flats; None where no flats block
+
+
+class Grouping:
+    """How receivers are put into groups.
+
+    Args:
+        points: The receivers.
+        flats: The scene's bodies that lie in a plane.
+    """
+
+    def __init__(self, points: LitPoints, flats: SceneFlats):
+        self._points, self._flats = points, flats
+        self._assembly, self._static = points.assembly, points.static
+
+    def groups(
+        self,
+        call: Call,
+        receivers: Receivers,
+        spheres: tuple[wp.array, wp.array],
+        kept_rows: KeptRows | None,
+        own_shadows: dict[int, Any],
+        frames: wp.array | None,
+    ) -> list[Group]:
+        """Put receivers into groups.
+
+        Args:
+            call: Has the normals of static bodies.
+            receivers: All of them.
+            spheres: Centers and radii of all spheres.
+            kept_rows: What static bodies block of the light of those on them.
+            own_shadows: What receivers of bodies see past these, by body.
+            frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · flat]; None without any.
+        """
+        groups = list(self._that_move(receivers, spheres, own_shadows, frames))
+        if self._static is None or not len(receivers.still):
+            return groups
+        on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
+        moving = self._assembly.spheres_of(self._solid(self._static.moving), spheres)
+        group = Group(*on_static, *moving, kept_rows, flats=self._flats_around(frames, self._static.moving))
+        return [group, *groups] if receivers.points.shape[1] else [group]
+
+    def _that_move(
+        self,
+        receivers: Receivers,
+        spheres: tuple[wp.array, wp.array],
+        own_shadows: dict[int, Any],
+        frames: wp.array | None,
+    ) -> Iterator[Group]:
+        """Those that may move."""
+        bodies = self._solid(range(len(self._assembly.scene.bodies)))
+        if not receivers.spans:
+            blocking = self._assembly.spheres_of(bodies, spheres)
+            yield Group(receivers.points, receivers.normals, *blocking, flats=self._flats_around(frames))
+        for span in receivers.spans:
+            points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
+            is_traced = span.body in self._points.blocking.traced
+            others = [body for body in bodies if not (is_traced and body == span.body)]
+            blocking = self._assembly.spheres_of(others, spheres)
+            group = Group(points, normals, *blocking, flats=self._flats_around(frames, but=span.body))
+            if span.body >= 0:
+                places = self._points.method.own_shadows.places(receivers, span)
+                group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))
+            yield group
+
+    def _solid(self, bodies: Iterable[int]) -> list[int]:
+        """Those of some bodies that block by their spheres."""
+        return [body for body in bodies if body not in self._points.blocking.flats]
+
+    def _flats_around(
+        self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1
+    ) -> FlatsAround | None:
+        """Flat bodies around receivers of one body: all that block, or some."""
+        flats = self._points.blocking.flats
+        named = flats if blocking is None else tuple(body for body in flats if body in blocking)
+        if frames is None or not set(named) - {but}:
+            return None
+        return FlatsAround(self._flats.among(flats, named), frames, flats.index(but) if but in flats else None)
