@@ -8,7 +8,10 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.pipeline import own_factors
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.own_shadows import OwnShadows
+from warpshadow.pipeline.patches import ScenePatches
+from warpshadow.stages.sparse import SparseMatrix
 
 
 def scene_of(mesh: ws.Mesh) -> ws.Scene:
@@ -51,18 +54,25 @@ def test_they_are_traced_once_for_a_shape_wherever_it_stands(traced):
     assert traced == [162, 162]
 
 
+def factors_of(scene: ws.Scene) -> SparseMatrix:
+    """Form factors of its first body."""
+    assembly = Assembly(scene)
+    own_shadows = OwnShadows(assembly, np.zeros(len(scene.bodies), bool))
+    return own_factors.OwnFactors(own_shadows, ScenePatches(assembly)).of(0)
+
+
 def test_a_damaged_file_is_traced_again_with_one_warning(traced, tmp_path):
     scene = scene_of(dented(1.5))
-    factors = Renderer(scene)._method.bounces.factors(0)
+    factors = factors_of(scene)
     (path,) = (tmp_path / "form_factors").iterdir()
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.warns(UserWarning, match="cached form factors .* cannot be read") as caught:
-        again = Renderer(scene)._method.bounces.factors(0)
+        again = factors_of(scene)
     assert len(caught) == 1 and traced == [162, 162] and path.read_bytes() == whole
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        read = Renderer(scene)._method.bounces.factors(0)
+        read = factors_of(scene)
     assert traced == [162, 162]
     for one, second, third in zip(factors.rows, again.rows, read.rows, strict=True):
         np.testing.assert_array_equal(one.numpy(), second.numpy())

@@ -30,13 +30,7 @@ from warpshadow.stages.shading import shade
 
 
 class Bouncing(Protocol):
-    """How light bounces in a scene: what is added to a method of spheres.
-
-    Attributes:
-        flats: Bodies that lie in a plane.
-    """
-
-    flats: tuple[int, ...]
+    """How light bounces in a scene: what is added to a method of spheres."""
 
     def shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
         """Shading of points, direct and bounced, given what the method takes of the light."""
@@ -176,7 +170,7 @@ class InParts(Node):
         extra: tuple[Node, ...] = (),
         beside: tuple[Node, ...] = (),
     ):
-        self._grouping = Grouping(points, method.flats)
+        self.method, self._grouping = method, Grouping(points, method.flats)
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         own_shadows = _own_shadows(method, points, taken)

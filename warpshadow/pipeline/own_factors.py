@@ -11,8 +11,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.cache import cache_path, remembered
+from warpshadow.pipeline.own_shadows import OwnShadows
+from warpshadow.pipeline.patches import ScenePatches
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.sparse import SparseMatrix
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -22,6 +25,33 @@ VERSION = 1
 
 _RAYS = 512
 """Rays of a site."""
+
+
+class OwnFactors:
+    """Form factors of bodies for themselves, each body's found when it is first asked for.
+
+    Args:
+        own_shadows: Has the bodies' sites.
+        patches: Has their patches.
+        progress: Show progress where it takes longer than a second.
+    """
+
+    def __init__(self, own_shadows: OwnShadows, patches: ScenePatches, *, progress: bool = False):
+        self._own_shadows, self._patches, self._progress = own_shadows, patches, progress
+        self._of_body: dict[int, SparseMatrix] = {}
+
+    def of(self, body: int) -> SparseMatrix:
+        """What share of the hemisphere of each of a body's sites its own patches take."""
+        if body not in self._of_body:
+            assembly, sites = self._patches.assembly, self._own_shadows.sites(body)
+            mesh, points, normals = assembly.scene.bodies[body].mesh, sites.positions, sites.normals
+            if assembly.is_two_sided[body]:
+                points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
+            vertices = sites.positions[: len(mesh.positions)]
+            given = self._patches.of_body(body), vertices, mesh.surface.faces, points, normals
+            found = own_factors(*given, device=assembly.device, progress=self._progress)
+            self._of_body[body] = SparseMatrix.of(found, device=assembly.device)
+        return self._of_body[body]
 
 
 def own_factors(

@@ -106,11 +106,6 @@ class OwnShadows:
             return "geometry has no rotations; placed(…) makes one that has them"
         return ""
 
-    @property
-    def is_flat(self) -> np.ndarray:
-        """Bodies that lie in a plane, which block none of their own light, bool of shape [body]."""
-        return self._assembly.is_flat
-
     # ------------------------------------------------------------------------------------------ where
 
     def sites(self, body: int) -> Sites:
@@ -163,7 +158,7 @@ class OwnShadows:
         """What receivers of bodies look up of them for cells, as for find_supports. Differentiable: rotations."""
         found = {}
         for body in bodies:
-            if not self.is_flat[body]:
+            if not self._assembly.is_flat[body]:
                 rows = self.rows(body)
                 supports = find_supports(directions, spreads, rows.ray_count, rotations.device)
                 found[body] = OwnLookup(rows, find_lookups(rotations, body, supports), supports)
@@ -174,7 +169,7 @@ class OwnShadows:
         return {
             body: OwnLobes(self._lobes_of(body, order), find_turned(rotations, body, order))
             for body in bodies
-            if not self.is_flat[body]
+            if not self._assembly.is_flat[body]
         }
 
     def _lobes_of(self, body: int, order: int) -> wp.array:
@@ -184,7 +179,7 @@ class OwnShadows:
 
     def missing(self, bodies: tuple[int, ...]) -> int:
         """Number of bodies, of some, of which nothing is in memory yet."""
-        return sum(not (self.is_flat[body] or body in self._rows) for body in bodies)
+        return sum(not (self._assembly.is_flat[body] or body in self._rows) for body in bodies)
 
     def _row_count(self, body: int) -> int:
         return len(self.sites(body).positions) * (1 + bool(self._assembly.is_two_sided[body]))

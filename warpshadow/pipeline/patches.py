@@ -31,7 +31,7 @@ class ScenePatches:
     """
 
     def __init__(self, assembly: Assembly):
-        self.assembly = self._assembly = assembly
+        self.assembly = assembly
         self._scene_flats = SceneFlats(assembly)
         self.flats = self._scene_flats.numbers
         self._of_body: dict[int, Patches] = {}
@@ -41,7 +41,7 @@ class ScenePatches:
     def of_body(self, number: int) -> Patches:
         """Patches of a body in its own frame; those of a flat one are a grid."""
         if number not in self._of_body:
-            mesh, is_two_sided = self._assembly.scene.bodies[number].mesh, bool(self._assembly.is_two_sided[number])
+            mesh, is_two_sided = self.assembly.scene.bodies[number].mesh, bool(self.assembly.is_two_sided[number])
             corners, found = (mesh.positions, mesh.surface.faces), None
             if number in self.flats:
                 others = self._scene_flats.others(number)
@@ -56,14 +56,14 @@ class ScenePatches:
 
     def senders(self, materials: Materials) -> Senders:
         """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""
-        casting = [number for number in self.flats if self._assembly.scene.bodies[number].casts_shadow]
+        casting = [number for number in self.flats if self.assembly.scene.bodies[number].casts_shadow]
         bodies = tuple(
             number
-            for number in range(len(self._assembly.scene.bodies))
+            for number in range(len(self.assembly.scene.bodies))
             if number in casting or not materials.is_black(number)
         )
         if bodies not in self._senders:
-            self._senders[bodies] = Senders(self._assembly, bodies, [self.of_body(n) for n in bodies])
+            self._senders[bodies] = Senders(self.assembly, bodies, [self.of_body(n) for n in bodies])
         return self._senders[bodies]
 
     # ------------------------------------------------------------------------------------------ albedo
@@ -89,18 +89,18 @@ class ScenePatches:
         if key not in self._means:
             from scipy.sparse import csr_matrix, vstack
 
-            mesh, patches = self._assembly.scene.bodies[number].mesh, self.of_body(number)
+            mesh, patches = self.assembly.scene.bodies[number].mesh, self.of_body(number)
             shape = mesh.positions, mesh.surface.faces
             if size is not None:
                 assert mesh.uvs is not None and mesh.surface.uv_faces is not None
-                own = mean_over_texels(patches, *shape, mesh.uvs, mesh.surface.uv_faces, size)
+                means = mean_over_texels(patches, *shape, mesh.uvs, mesh.surface.uv_faces, size)
             elif color_count == 1:
-                own = csr_matrix(np.ones((patches.count, 1)))
+                means = csr_matrix(np.ones((patches.count, 1)))
             else:
-                own = mean_over_vertices(patches, *shape)
+                means = mean_over_vertices(patches, *shape)
             others = {other: csr_matrix((self.of_body(other).count, color_count)) for other in bodies}
-            matrix = vstack([*(others | {number: own}).values()])
-            self._means[key] = SparseMatrix.of(matrix, device=self._assembly.device)
+            matrix = vstack([*(others | {number: means}).values()])
+            self._means[key] = SparseMatrix.of(matrix, device=self.assembly.device)
         return self._means[key]
 
 
@@ -113,7 +113,7 @@ class Senders:
         patches: Of each of them.
 
     Attributes:
-        bodies, patches: As given.
+        assembly, bodies, patches: As given.
         first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].
         areas: Of all patches where the scene has their bodies [scene units²], float32 of shape [patch].
         sides: Side of a face that each source lies on, int32 of shape [source].
@@ -123,7 +123,7 @@ class Senders:
     """
 
     def __init__(self, assembly: Assembly, bodies: tuple[int, ...], patches: list[Patches]):
-        self._assembly, self.bodies, self.patches = assembly, bodies, patches
+        self.assembly, self.bodies, self.patches = assembly, bodies, patches
         self.first = np.cumsum([0, *(each.count for each in patches)])
         face_count = int(assembly.first_face[-1])
         sides = [
@@ -143,7 +143,7 @@ class Senders:
 
     def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
         """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""
-        return receivers_on_faces(positions, normals, self._assembly.faces, self.sides, self.barycentrics, self._bodies)
+        return receivers_on_faces(positions, normals, self.assembly.faces, self.sides, self.barycentrics, self._bodies)
 
 
 def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:

@@ -234,7 +234,7 @@ class Renderer:
         """
         if positions is not None and isinstance(self._method, SphereMethod) and self._method.bounces is not None:
             number = self.scene.body_number(body)
-            if number in self._method.bounces.flats:
+            if self.assembly.is_flat[number]:
                 raise ValueError(
                     f"positions: got some for body {number} ({self.scene.bodies[number].called!r}), which is flat; "
                     f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
