@@ -386,7 +386,7 @@ def test_light_above_the_shadow_of_a_disc_is_that_of_rays(device):
     others = np.array([[-0.8, 0, -0.8], [0.8, 1.6, 0.8]])
     patches, flats, frames = single(device, size=6.0, others=others)
     grid = patches.grid
-    centers = grid.nodes() @ grid.frame[:2][:, [0, 2]] + grid.origin[[0, 2]]
+    centers = grid.middles() @ grid.frame[:2][:, [0, 2]] + grid.origin[[0, 2]]
     radiosity = np.repeat(soft_shadow(centers).reshape(-1, 1), 3, axis=1)
     rng = np.random.default_rng(2)
     normals = rng.normal(size=(150, 3))

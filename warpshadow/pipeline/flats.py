@@ -69,8 +69,7 @@ class SceneFlats:
         if number not in self._bodies:
             mesh, others = self._assembly.scene.bodies[number].mesh, self.others(number)
             corners = mesh.positions, mesh.surface.faces
-            found = find_grid(*corners, is_two_sided=False, others=np.concatenate(others) if others else None)
-            assert found is not None
+            grid, _ = find_grid(*corners, is_two_sided=False, others=np.concatenate(others) if others else None)
             first_vertex = int(self._assembly.first_vertex[number])
-            self._bodies[number] = FlatBody(found[0], *corners, first_vertex, 0, blocks=True)
+            self._bodies[number] = FlatBody(grid, *corners, first_vertex, 0, blocks=True)
         return self._bodies[number]

@@ -42,16 +42,17 @@ class ScenePatches:
         """Patches of a body in its own frame; those of a flat one are a grid."""
         if number not in self._of_body:
             mesh, is_two_sided = self.assembly.scene.bodies[number].mesh, bool(self.assembly.is_two_sided[number])
-            corners, found = (mesh.positions, mesh.surface.faces), None
-            if number in self.flats:
+            corners = mesh.positions, mesh.surface.faces
+            if self.assembly.is_flat[number]:
                 others = self._scene_flats.others(number)
                 normal = plane_normal(mesh.positions[mesh.surface.faces].astype(np.float64))
                 heights = [(points - mesh.positions[mesh.surface.faces[0, 0]]) @ normal for points in others]
                 # nobody sees the back of a ground
                 is_two_sided = is_two_sided and (not others or bool(min(map(np.mean, heights)) < 0))
                 points = np.concatenate(others) if others else None
-                found = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
-            self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided) if found is None else found
+                self._of_body[number] = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
+            else:
+                self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided)
         return self._of_body[number]
 
     def senders(self, materials: Materials) -> Senders:

@@ -1,6 +1,6 @@
 """Flat light: what bodies that lie in planes, such as a ground or walls, send.
 
-Their patches are the nodes of a grid; :mod:`warpshadow.stages.flats.cells` has what a cell meets of it: coverage h,
+Their patches are the texels of a grid; :mod:`warpshadow.stages.flats.cells` has what a cell meets of it: coverage h,
 distance t, mean cosine c′ and radiosity B.
 
 A flat is seen from both sides, and its back is black unless it has patches there. Of several flats the nearest takes
@@ -8,7 +8,7 @@ the cell; where they are at about the same distance, the cell is divided:
 
     I = 4/Q Σ_q max(n·ω_q, 0) T_q Σ_k h_k B_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
 
-Measured for 150 receivers on a ball over a ground with the shadow of a disc, 24² nodes: I is off by 2.0% (relative L2)
+Measured for 150 receivers on a ball over a ground with the shadow of a disc, 24² texels: I is off by 2.0% (relative L2)
 with 128 cells and 1.3% with 1024; in a prototype by 2.7 instead of 1.9% without mip levels.
 """
 

@@ -142,23 +142,23 @@ def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool
 
 def find_flat_patches(
     positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
-) -> Patches | None:
-    """Find the patches of a body that lies in a plane: the nodes of a grid over its smallest rectangle.
+) -> Patches:
+    """Find the patches of a body that lies in a plane: the texels of a grid over its smallest rectangle.
 
     Args:
         positions: Vertices [units of the body], shape [vertex, 3].
         faces: Faces that wind alike, shape [face, 3].
         is_two_sided: Whether the back sends light, too.
-        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: nodes are dense near them.
+        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
 
     Returns:
-        Patches, row by row: nodes off the mesh have no area and no source. None for a body that is not flat.
+        Patches, row by row: texels off the mesh have no area and no source.
+
+    Raises:
+        ValueError: for a body that does not lie in a plane.
     """
-    found = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
-    if found is None:
-        return None
-    grid, nodes = found
+    grid, covered = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
     frame, origin = grid.frame, grid.origin
     texels = grid.texel_sizes().reshape(-1, 2)
 
@@ -167,11 +167,11 @@ def find_flat_patches(
 
     cut = _cut(positions, faces, longest)
     labels = grid.texels_of((cut.middles - origin) @ frame.T[:, :2])
-    centers = origin + grid.nodes().reshape(-1, 2) @ frame[:2]
+    centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
     areas = grid.covered.ravel() * texels.prod(axis=1)
     return Patches(
         *_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),
-        _sources_of([(*node, 1.0) for node in nodes], grid.sides, len(areas)),
+        _sources_of([(*point, 1.0) for point in covered], grid.sides, len(areas)),
         cut.pieces,
         _of_sides(labels, grid.sides, len(areas)),
         grid,

@@ -1,4 +1,4 @@
-"""Grids: nodes in the plane of a flat body, dense near the other bodies, and what of their texels its mesh covers."""
+"""Grids: texels in the plane of a flat body, small near the other bodies, and what of them its mesh covers."""
 
 from __future__ import annotations
 
@@ -9,48 +9,48 @@ import numpy as np
 from warpshadow.maths.plane import plane_normal
 
 _GRID = 24
-"""Nodes along a grid's longer side."""
+"""Texels along a grid's longer side."""
 
 _EVEN = 100.0
 """Spread of a grid that is even, in sizes of its body."""
 
 _ROUNDING = 1e-6
-"""How far off a face a node may lie and still count as on it, as a part of the face or texel."""
+"""How far off a face a point may lie and still count as on it, as a part of the face or texel."""
 
 _TESTED = 3
-"""Points along each side of a node's texel that are tested to lie on the mesh; odd, so that the node is one."""
+"""Points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one."""
 
 
 class Grid(NamedTuple):
-    """Nodes in a plane, even in coordinates that are stretched far from the middle.
+    """Texels in a plane, even in coordinates that are stretched far from the middle.
 
-    A point has the coordinates (a, b, d) = frame (x − origin). A node is the middle of a texel of
+    A point has the coordinates (a, b, d) = frame (x − origin). With
 
         ξ = g(a / spread),  η = g(b / spread),  g(z) = sign(z) log(1 + |z|)
 
-    and the texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
+    texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
     """
 
     frame: np.ndarray
     """Rows: both axes and the normal, float64 of shape [3, 3]."""
     origin: np.ndarray
-    """Point of the plane around which nodes are dense, float64 of shape [3]."""
+    """Point of the plane around which texels are small, float64 of shape [3]."""
     spread: float
-    """Distance from there within which nodes are about even [units of the body]."""
+    """Distance from there within which texels are about even [units of the body]."""
     low: np.ndarray
     high: np.ndarray
     """Corners of the rectangle in (ξ, η), float64 of shape [2]."""
     covered: np.ndarray
-    """Share of each node's texel that the mesh covers, float32 of shape [row, column]."""
+    """Share of each texel that the mesh covers, float32 of shape [row, column]."""
     sides: int
     """1 if the front alone sends light, 2 if the back does, too; its patches follow those of the front."""
 
-    def nodes(self) -> np.ndarray:
-        """Nodes in the plane, (a, b), float64 of shape [row, column, 2]."""
+    def middles(self) -> np.ndarray:
+        """Middles of the texels in the plane, (a, b), float64 of shape [row, column, 2]."""
         return self.points(1)
 
     def texel_sizes(self) -> np.ndarray:
-        """Widths and heights of the texels at the nodes, [row, column, 2]."""
+        """Widths and heights of the texels at their middles, [row, column, 2]."""
         count = np.array(self.covered.shape[::-1])
         edges = [
             self.spread * stretched(np.linspace(low, high, number + 1))
@@ -85,7 +85,7 @@ def stretched(y: np.ndarray) -> np.ndarray:
     return np.sign(y) * np.expm1(np.abs(y))
 
 
-class Node(NamedTuple):
+class CoveredPoint(NamedTuple):
     """A point of the mesh in a texel of a grid, as near as may be to the texel's middle."""
 
     face: int
@@ -95,23 +95,26 @@ class Node(NamedTuple):
 
 def find_grid(
     positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
-) -> tuple[Grid, list[Node]] | None:
+) -> tuple[Grid, list[CoveredPoint]]:
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
     Args:
         positions: Vertices [units of the body], shape [vertex, 3].
         faces: Faces that wind alike, shape [face, 3].
         is_two_sided: Whether the back sends light, too.
-        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: nodes are dense near them.
+        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
 
     Returns:
-        The grid, and a point in each texel of which the mesh covers some. None for a body that is not flat.
+        The grid, and a point in each texel of which the mesh covers some.
+
+    Raises:
+        ValueError: for a body that does not lie in a plane.
     """
     corners = positions.astype(np.float64)[faces]
     normal = plane_normal(corners)
     if normal is None:
-        return None
+        raise ValueError(f"faces: got {len(faces)} that do not lie in one plane, expected a flat body")
     frame = _smallest_rectangle(corners.reshape(-1, 3), normal)
     points = corners.reshape(-1, 3) @ frame.T
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -127,7 +130,7 @@ def find_grid(
     sides = 2 if is_two_sided else 1
     grid = Grid(frame, origin, float(spread), low, high, np.ones((height, width), np.float32), sides)
     corners = ((corners - origin) @ frame.T)[..., :2]
-    covered, found = _find_nodes(grid, corners)
+    covered, found = _find_covered(grid, corners)
     return grid._replace(covered=covered), found
 
 
@@ -148,7 +151,7 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.stack([edges[best] @ basis, across[best] @ basis, normal])
 
 
-def _find_nodes(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[Node]]:
+def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[CoveredPoint]]:
     """Find which share of each texel the faces [face, 3, 2] cover, and a source for each that is not empty."""
     height, width = grid.covered.shape
     points = grid.points(_TESTED)
@@ -173,7 +176,9 @@ def _find_nodes(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[Node]
     best = (tested[:, from_middle] >= 0).argmax(axis=1)
     chosen = tested[np.arange(len(tested)), from_middle[best]]
     found = [
-        Node(faces[item], np.maximum(barycentrics[item], 0), texel) for texel, item in enumerate(chosen) if item >= 0
+        CoveredPoint(faces[item], np.maximum(barycentrics[item], 0), texel)
+        for texel, item in enumerate(chosen)
+        if item >= 0
     ]
     return covered.reshape(height, width).astype(np.float32), found
 
