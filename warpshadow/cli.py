@@ -175,7 +175,7 @@ def view(
 
     with _clear_errors():
         loaded = load_scene(scene)
-        viewer = serve(loaded, host=host, port=port, device=_device(device), progress=True, path=scene)
+        viewer = serve(loaded, host=host, port=port, device=_device(device), path=scene)
         typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
         viewer.open(browser)
         viewer.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ class Panel:
         self._handles: viser.TransformControlsHandle | None = None
         self._dragged: int | None = None
         self._spheres: dict[int, viser.BatchedMeshHandle] = {}
+        self._showing = threading.Lock()  # spheres may have to be fitted, so they are shown in threads of their own
         self._first = loop.look
         self._add_light()
         self._add_shadows()
@@ -99,7 +101,7 @@ class Panel:
         self._names = [f"{number}: {body.called}" for number, body in enumerate(self._scene.bodies)]
         with gui.add_folder("Bodies"):
             dragged = gui.add_dropdown("Drag", (_NOTHING, *self._names))
-            balls = gui.add_checkbox("Show spheres", False)
+            self._balls = balls = gui.add_checkbox("Show spheres", False)
             back = gui.add_button("Put back", hint="Bodies and settings as the scene has them")
 
         @dragged.on_update
@@ -109,7 +111,7 @@ class Panel:
 
         @balls.on_update
         def _(event: viser.GuiEvent) -> None:  # in a thread of its own: spheres may have to be fitted
-            self._guarded(event, lambda: self._show_spheres(bool(balls.value)))
+            self._guarded(event, self._show_spheres)
 
         @back.on_click
         async def _(event: viser.GuiEvent) -> None:
@@ -142,7 +144,7 @@ class Panel:
         if self._map is not None and look.turn != before.turn:
             self._map.image = self._map_picture(look)
         if look.spheres != before.spheres and self._spheres:
-            self._server.get_event_loop().run_in_executor(None, self._show_spheres, True)
+            self._server.get_event_loop().run_in_executor(None, self._show_spheres)
 
     def _put_back(self) -> None:
         """Let inputs and handles say what is shown."""
@@ -171,9 +173,10 @@ class Panel:
             return
         camera, look = saved_camera(self._scene, page, self._scale), self._loop.look
         if self._path is not None:
-            client.send_file_download(self._path.name, as_toml(self._path, self._scene, look, camera))
+            name, content = self._path.name, as_toml(self._path, self._scene, look, camera)
         else:
-            client.send_file_download("scene.zip", as_archive(self._scene, look, camera))
+            name, content = "scene.zip", as_archive(self._scene, look, camera)
+        client.send_file_download(name, content, save_immediately=True)
 
     # ------------------------------------------------------------------------------------------ in the picture
 
@@ -222,7 +225,14 @@ class Panel:
             wxyz, position = gizmo.handle_of(look.places[self._dragged], body, self._scale)
             self._handles.wxyz, self._handles.position = wxyz, position
 
-    def _show_spheres(self, shows: bool) -> None:
+    def _show_spheres(self) -> None:
+        """Show spheres or none, as the panel says by the time it is this thread's turn."""
+        with self._showing:
+            self._replace_spheres(bool(self._balls.value))
+        self._move_spheres(self._loop.look)
+        self._loop.again(depth=self._needs_depth)
+
+    def _replace_spheres(self, shows: bool) -> None:
         for handle in self._spheres.values():
             handle.remove()
         self._spheres = {}
@@ -239,11 +249,9 @@ class Panel:
                     batched_scales=factor * radii,
                     opacity=0.35,
                 )
-        self._move_spheres(self._loop.look)
-        self._loop.again(depth=self._needs_depth)
 
     def _move_spheres(self, look: Look) -> None:
-        for number, handle in self._spheres.items():
+        for number, handle in list(self._spheres.items()):
             place: Place = look.places[number]
             handle.wxyz = quaternion(Rotation.from_rotvec(place.rotation, degrees=True))
             handle.position = self._scale * np.array(place.translation)

@@ -54,7 +54,7 @@ class Site:
         host: str,
         port: int,
         device: wp.DeviceLike = "cpu",
-        progress: bool = False,
+        progress: bool = True,
         path: Path | None = None,
     ):
         _check_address(host, port)

@@ -65,7 +65,7 @@ def view(
     port: int = PORT,
     browser: bool | None = None,
     device: wp.DeviceLike = "cpu",
-    progress: bool = False,
+    progress: bool = True,
 ) -> Viewer:
     """Show a scene in the browser, where mouse and panel turn it, its light and its bodies.
 
@@ -98,7 +98,7 @@ def serve(
     host: str = HOST,
     port: int = PORT,
     device: wp.DeviceLike = "cpu",
-    progress: bool = False,
+    progress: bool = True,
     path: Path | None = None,
 ) -> Viewer:
     """Serve the page of a scene; see :func:`view`.
