@@ -1,5 +1,6 @@
 """The command line: what it writes, what it prints, and one clear line for each mistake."""
 
+import dataclasses
 import errno
 import functools
 import re
@@ -132,6 +133,36 @@ def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
     behind = loaded.background() if background == "environment" else background
     ws.Picture(ws.render(loaded), background=behind, tone="filmic").write(tmp_path / "python.png")
     assert (tmp_path / "python.png").read_bytes() == (tmp_path / "out.png").read_bytes()
+
+
+def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
+    from PIL import Image, ImageSequence
+
+    options = "--turntable", 4, "--background", "environment"
+    result = run("render", scene, "-o", tmp_path / "turn.gif", *options)
+    assert result.exit_code == 0 and "turn.gif: 4 frames" in result.stdout
+    with Image.open(tmp_path / "turn.gif") as file:
+        frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(file)]).astype(int)
+    loaded = ws.load_scene(scene)
+    first = ws.Picture(ws.render(loaded), background=loaded.background())
+    camera = loaded.camera.turned(90, (0, 0.8, 0))  # about the ball
+    second = dataclasses.replace(loaded, camera=camera)
+    pictures = first, ws.Picture(ws.render(second), exposure=first.exposure, background=second.background())
+    for frame, picture in zip(frames[:2], pictures, strict=True):
+        assert np.abs(frame - picture.pixels).max() <= 2  # 256 colors for 192 pixels
+    assert frames.shape == (4, 12, 16, 3) and np.abs(frames[1] - frames[0]).mean() > 3
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "part"),
+    [
+        ("turn.exr", ("--turntable", 4), "got extension '.exr', expected .mp4 or .gif or .webp"),
+        ("turn.gif", (), "videos take --turntable FRAMES"),
+        ("turn.gif", ("--turntable", 4, "--png", "out.png"), "--png: got it beside --turntable"),
+    ],
+)
+def test_a_turntable_is_a_video_and_a_video_a_turntable(scene, tmp_path, output, options, part):
+    fails("render", scene, "-o", tmp_path / output, *options, parts=(part,))
 
 
 def test_a_background_that_is_none_is_refused_before_the_work(scene, tmp_path):

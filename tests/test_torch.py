@@ -703,3 +703,27 @@ def test_light_that_is_no_tensor_is_refused(renderer):
     light = np.ones((renderer.basis.size, 3), np.float32)
     with pytest.raises(ValueError, match="light: got ndarray, expected a tensor of torch.float32"):
         renderer(light)
+
+
+@pytest.mark.parametrize("count", [None, 1, 3])
+def test_the_cameras_and_poses_of_a_scene_are_what_the_renderer_takes(count):
+    scene = small_scene()
+    cameras = None if count is None else [scene.camera.turned(10 * k) for k in range(count)]
+    renderer = TorchRenderer(scene, cameras=cameras)
+    composed = renderer.clip_matrices(*renderer.scene_cameras())
+    expected = np.stack([camera.clip_matrix() for camera in renderer.cameras])
+    np.testing.assert_allclose(composed, expected[0] if count is None else expected, rtol=1e-5, atol=1e-5)
+    placed = renderer.placed(*renderer.scene_poses())
+    np.testing.assert_allclose(placed.positions.numpy(), renderer.warp.geometry().positions.numpy()[0], atol=1e-6)
+
+
+def test_rotations_are_scipys_quaternions_with_w_last_and_vectors_in_radians():
+    """What a body's rotation is in degrees."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", (10, 50, -70), degrees=True)
+    body = ws.Body(ws.icosphere(1.0, 0), rotation=turn.as_rotvec(degrees=True))
+    np.testing.assert_allclose(body.rotation_matrix(), turn.as_matrix(), atol=1e-12)
+    for parameters in (turn.as_quat(), turn.as_rotvec()):
+        made = rotation_matrices(torch.tensor(parameters, dtype=torch.float32))
+        np.testing.assert_allclose(made, turn.as_matrix(), atol=1e-6)

@@ -13,6 +13,7 @@ from warpshadow.assets.picture import Picture
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.assets.unwrap import unwrap
+from warpshadow.assets.video import write_video
 from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
@@ -62,6 +63,7 @@ __all__ = [
     "view",
     "write_image",
     "write_scene",
+    "write_video",
 ]
 
 

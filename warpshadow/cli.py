@@ -6,6 +6,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional
 
@@ -16,6 +17,8 @@ import warp as wp
 from warpshadow import Tuning, __version__, quiet
 from warpshadow.assets import files
 from warpshadow.assets.picture import SUFFIXES, Picture
+from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
+from warpshadow.scene.scene import Scene
 from warpshadow.viewer import HOST, PORT, serve
 
 app = typer.Typer(
@@ -89,7 +92,11 @@ def render(
     scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", help="Image to write: .exr, linear float32 RGBA, alpha = coverage."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Image to write: .exr, linear float32 RGBA, alpha = coverage; of --turntable: .mp4, .gif, .webp.",
+        ),
     ],
     png: Annotated[
         Optional[Path], typer.Option(help="Also write an sRGB picture: .png, or .jpg, which is on black.")
@@ -104,6 +111,9 @@ def render(
     background: Annotated[
         str, typer.Option(help="Background of the picture: transparent, environment, or a color: white, #ffcc00.")
     ] = "transparent",
+    turntable: Annotated[
+        Optional[int], typer.Option(help="Write a video of so many frames in which the camera goes around.", min=1)
+    ] = None,
     method: Annotated[
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(
@@ -133,8 +143,15 @@ def render(
     from warpshadow.tuning.tune import describe, resolved
 
     with _clear_errors():
-        is_picture = output.suffix.lower() in SUFFIXES
-        _check_output(output, ".exr", instead=f"; pictures are written by --png {output}" if is_picture else "")
+        if turntable is None:
+            is_picture, is_video = (output.suffix.lower() in suffixes for suffixes in (SUFFIXES, VIDEO_SUFFIXES))
+            remedy = f"; pictures are written by --png {output}" if is_picture else "; videos take --turntable FRAMES"
+            _check_output(output, ".exr", instead=remedy if is_picture or is_video else "")
+        else:
+            _check_output(output, *VIDEO_SUFFIXES)
+            check_video(output)
+            if png is not None:
+                raise ValueError("--png: got it beside --turntable, expected one of them")
         if png is not None:
             _check_output(png, *SUFFIXES)
         plain = None if background in ("transparent", "environment") else background
@@ -149,15 +166,48 @@ def render(
         if parsed.visibility.method == AUTO:
             typer.echo(f"auto: {describe(loaded)}")
         start = time.perf_counter()
+        if turntable is not None:
+            write_video(output, _turntable(loaded, turntable, where, exposure, tone, background))
+            typer.echo(f"{output}: {turntable} frames, {time.perf_counter() - start:.2f} s")
+            return
         image = Renderer(loaded, device=where, progress=True).render()
         seconds = time.perf_counter() - start
         write_image(output, image)
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
         if png is not None:
-            behind = loaded.background() if background == "environment" else plain
-            picture = Picture(image, exposure=exposure, tone=tone, background=behind)
+            picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
             write_image(png, picture)
             typer.echo(f"{png}: exposure {picture.exposure:+.2f} stops")
+
+
+def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
+    """The background of a picture, by its option."""
+    if background == "environment":
+        return scene.background()
+    return None if background == "transparent" else background
+
+
+def _turntable(
+    scene: Scene, count: int, device: wp.Device, exposure: float | None, tone: str, background: str
+) -> Iterator[Picture]:
+    """Pictures from all around what a camera would frame, by default at the exposure of the first."""
+    from warpshadow.assets.camera import framed_points
+    from warpshadow.device.progress import progress_bar
+    from warpshadow.pipeline.renderer import Renderer
+
+    points = framed_points(scene)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    renderer = Renderer(scene, device=device, progress=True)
+    with progress_bar(count, "rendering", "frame") as bar:
+        for number in range(count):
+            camera = scene.camera.turned(360 * number / count, middle)
+            matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44, device=device)
+            image = renderer.draw(view=renderer.view(clip_matrices=matrices)).numpy()[0]
+            behind = _behind(replace(scene, camera=camera), background)
+            picture = Picture(image, exposure=exposure, tone=tone, background=behind)
+            exposure = picture.exposure
+            yield picture
+            bar.update()
 
 
 @app.command()

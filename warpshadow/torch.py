@@ -272,12 +272,30 @@ class TorchRenderer(torch.nn.Module):
         return given.apply_geometry(place)
 
     def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Rotations [body, 3, 3], translations [body, 3] and scales [body] of the scene's bodies, as copies."""
+        """The bodies' poses as :meth:`placed` takes them, as copies.
+
+        Returns:
+            Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body]. A
+            ``Body.rotation`` is in degrees; :func:`rotation_matrices` takes radians.
+        """
         poses = self.warp.scene_poses()
         rotations, translations, scales = (
             wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales)
         )
         return rotations, translations, scales
+
+    def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The cameras as :meth:`clip_matrices` takes them, as copies; one camera has no batch.
+
+        Returns:
+            Rotations [camera, 3, 3] and translations [camera, 3] from the world to the camera (OpenCV's axes), and
+            intrinsics [camera, 3, 3]; [3, 3], [3] and [3, 3] of the scene's own camera.
+        """
+        names = "rotation", "translation", "intrinsics"
+        stacked = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
+        of_cameras = (torch.tensor(each, dtype=torch.float32, device=self.device) for each in stacked)
+        R, t, K = of_cameras if self.warp.has_camera_batch else (each[0] for each in of_cameras)
+        return R, t, K
 
     @one_at_a_time
     def deformed(

@@ -101,6 +101,20 @@ def test_a_scene_without_a_camera_shows_all_its_bodies():
     )
 
 
+def test_a_turned_camera_sees_what_the_camera_sees_of_things_turned_with_it():
+    camera = Camera.look_at((1, 2, 3), (0.2, 0, -0.3), up=(0.1, 1, 0), size=SIZE, near=0.2)
+    points, middle = np.random.default_rng(0).normal(size=(9, 3)), np.array([0.5, 7, -0.2])
+    quarter = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # +z to +x: counter-clockwise from above
+    turned = camera.turned(90, middle)
+    np.testing.assert_allclose(turned.project((points - middle) @ quarter.T + middle), camera.project(points))
+    assert (turned.width, turned.height, turned.near) == (*SIZE, 0.2)
+    np.testing.assert_allclose(turned.turned(270, middle).clip_matrix(), camera.clip_matrix(), atol=1e-12)
+    with pytest.raises(ValueError, match="^degrees: got"):
+        camera.turned("90")
+    with pytest.raises(ValueError, match="^about: got"):
+        camera.turned(90, 0)
+
+
 @pytest.mark.parametrize(
     ("name", "shown", "options"),
     [

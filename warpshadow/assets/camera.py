@@ -156,7 +156,7 @@ class Camera:
         Raises:
             ValueError: when up is parallel to the direction, or all that is shown is one point.
         """
-        points = _framed_points(shown)
+        points = framed_points(shown)
         away = check.array("direction", direction, (3,))
         if not away.any():
             raise ValueError(f"direction: got {away.tolist()}, expected a direction, of any length but 0")
@@ -234,6 +234,20 @@ class Camera:
         """Center of projection [scene units], shape [3]."""
         return -self.rotation.T @ self.translation
 
+    def turned(self, degrees: float, about: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Camera:
+        """Turn the camera about the vertical line through a point: +y, counter-clockwise seen from above.
+
+        Args:
+            degrees: The angle.
+            about: A point of the line [scene units], shape [3].
+        """
+        middle = check.array("about", about, (3,))
+        angle = np.radians(check.number("degrees", degrees))
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        rotation = self.rotation @ turn.T
+        translation = self.translation + (self.rotation - rotation) @ middle
+        return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
+
     def resized(self, factor: float) -> Camera:
         """The same view on an image ``factor`` times as wide and high (supersampling: 2, 3, ...)."""
         factor = check.positive("factor", factor)
@@ -281,7 +295,7 @@ class Camera:
         return self.eye, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
-def _framed_points(shown: Any) -> np.ndarray:
+def framed_points(shown: Any) -> np.ndarray:
     """Points of what a camera is to show, float64: of what is not flat, if there is any."""
     placed = getattr(shown, "bodies", shown)
     placed = (placed,) if hasattr(placed, "world_points") else placed
