@@ -126,10 +126,6 @@ class Static:
         """Centers and radii of their spheres."""
         return self.spheres_of(self.bodies)
 
-    def moving_spheres(self, spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
-        """Centers and radii of the spheres of what moves, of those of all bodies. Differentiable: spheres."""
-        return self._assembly.spheres_of(self.moving, spheres)
-
     @functools.cached_property
     def mesh(self) -> wp.Mesh | None:
         """The mesh of the static bodies that rays meet."""
