@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,6 +18,19 @@ class _Shown(threading.local):
 
 
 _shown = _Shown()
+
+
+class _Within:
+    """What a block within another bar updates: once it takes longer than a second, the bar says what it waits for."""
+
+    def __init__(self, bar: Any, what: str):
+        self._bar, self._what, self._start = bar, what, time.monotonic()
+
+    def update(self, count: int = 1) -> None:
+        """Called as a bar's."""
+        if self._what and time.monotonic() - self._start >= _DELAY:
+            self._bar.set_postfix_str(self._what)
+            self._what = ""  # said
 
 
 @contextlib.contextmanager
@@ -36,17 +50,14 @@ def progress_bar(total: int, what: str, unit: str, *, wanted: bool = True, stays
     from tqdm.auto import tqdm
 
     outer = _shown.bar
-    is_seen = wanted and outer is None
+    if wanted and outer is not None:
+        yield _Within(outer, what)
+        outer.set_postfix_str("", refresh=False)
+        return
     delay = 0 if stays else _DELAY
-    with tqdm(total=total, desc=what, unit=unit, delay=delay, leave=stays, disable=not is_seen) as bar:
-        if is_seen:
-            _shown.bar = bar
-        elif wanted:
-            outer.set_postfix_str(what)
+    with tqdm(total=total, desc=what, unit=unit, delay=delay, leave=stays, disable=not wanted) as bar:
         try:
+            _shown.bar = bar if wanted else outer
             yield bar
         finally:
-            if is_seen:
-                _shown.bar = None
-            elif wanted:
-                outer.set_postfix_str("", refresh=False)
+            _shown.bar = outer
