@@ -29,6 +29,7 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
+from warpshadow.pipeline import bounces as pipeline_bounces
 from warpshadow.pipeline import groups, kept_bounces
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -186,7 +187,7 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     renderer = ws.Renderer(bounced("directional", ON_BOTH))
     light = wp.zeros((1, renderer.basis.size), dtype=wp.vec3, requires_grad=True)
     explained = renderer.explain(light, geometry=renderer.placed())
-    for name in ("own light", "flat light", "sphere light", "radiosity", "own light of sources"):
+    for name in ("own light", "flat light", "sphere light", "radiosity", "own light of patches"):
         assert explained[name].forward and explained[name].backward, name
     still = renderer.explain(light)
     for name in ("form factors", "transfer of sources", "bounces"):
@@ -199,9 +200,11 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     assert ws.Renderer(ground).explain()["own light"].forward.why == "all that reflects is flat"
 
 
-def test_one_bounce_asks_for_no_light_between_sources():
+def test_one_bounce_asks_for_no_light_between_bodies_sources():
     explained = ws.Renderer(bounced("directional", ON_BOTH, 1)).explain()
-    assert explained["own light of sources"].forward.why == "light bounces once"
+    assert explained["own light of patches"].forward
+    for name in ("flat light of sources", "sphere light of sources"):
+        assert explained[name].forward.why == "light bounces once", name
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -212,14 +215,31 @@ def test_receivers_lit_in_parts_are_lit_alike(method, monkeypatch):
     np.testing.assert_allclose(ws.Renderer(scene).shade().numpy(), whole, rtol=2e-5, atol=1e-6)
 
 
+def bowl(receivers: str = "vertex", **options) -> ws.Body:
+    """A ball's lower part, open above."""
+    ball = ws.icosphere(0.8, 3)
+    mesh = ws.Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0.1])
+    return ws.Body(mesh, blockers=0, translation=(0, 1, 0), receivers=receivers, **options)
+
+
+def test_light_goes_on_within_a_bowl(monkeypatch):
+    """As along paths that bounce as often, although it bounces once between bodies."""
+    scene = ws.Scene([bowl(albedo=(0.8, 0.6, 0.4))], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=1)
+    paths = dataclasses.replace(
+        scene, bounces=1 + kept_bounces.OWN_BOUNCES, visibility=ws.Visibility("ray-traced", samples=4096)
+    )
+    expected, found = (ws.render(each)[..., :3].sum(axis=(0, 1)) for each in (paths, scene))
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+    monkeypatch.setattr(pipeline_bounces, "OWN_BOUNCES", 0)
+    once = ws.render(scene)[..., :3].sum(axis=(0, 1))
+    assert once[0] < 0.9 * expected[0]
+
+
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 def test_receivers_at_pixels_and_backs_of_open_bodies_are_lit(receivers):
     """A bowl, seen from within and without."""
-    mesh = ws.icosphere(0.8, 3)
-    low = mesh.positions[mesh.faces].mean(axis=1)[:, 1] < 0.1
-    bowl = ws.Body(ws.Mesh(mesh.positions, mesh.faces[low]), blockers=0, translation=(0, 1, 0), receivers=receivers)
     ground = ws.Body(ws.plane(4.0, 8), blockers=1)
-    scene = ws.Scene([bowl, ground], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=2)
+    scene = ws.Scene([bowl(receivers), ground], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=2)
     direct, found = (ws.render(dataclasses.replace(scene, bounces=count)) for count in (0, 2))
     assert np.isfinite(found).all()
     assert (found - direct).min() > -1e-5
@@ -340,6 +360,26 @@ def test_light_and_reflectance_have_the_gradient_of_an_image_with_bounces(method
     directions = np.random.default_rng(5).normal(size=(4, len(image_of.start)))
     got, expected = gradient_and_differences(image_of, directions, 1e-2, slice(4))
     assert relative_error(got, expected) < 1e-4
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["light", "albedo"])
+@pytest.mark.parametrize("still", [True, False])
+def test_light_that_goes_on_within_a_bowl_has_its_gradient(method, name, still):
+    """Of the image, a polynomial of albedo; where geometry is given, too."""
+    scene = ws.Scene([bowl()], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, ws.Visibility(method), bounces=1)
+    renderer = TorchRenderer(scene)
+    given = {} if still else {"geometry": renderer.placed(*renderer.scene_poses())}
+    start = torch.full((renderer.basis.size, 3), 0.3) if name == "light" else torch.full((1, 3), 0.7)
+
+    def image_of(values: torch.Tensor) -> torch.Tensor:
+        values = values.reshape(start.shape)
+        return renderer(values, **given) if name == "light" else renderer(albedo=[values], **given)
+
+    image_of.start = start.flatten()
+    directions = np.random.default_rng(6).normal(size=(3, start.numel()))
+    got, expected = gradient_and_differences(image_of, directions, 1e-2, slice(4))
+    assert relative_error(got, expected) < 1e-3
 
 
 # ---------------------------------------------------------------------------------------------- batches

@@ -36,6 +36,12 @@ def ball_on_ground(*, bounces: int = 2, size: int = 20) -> ws.Scene:
     return ws.Scene(bodies, ws.EnvironmentMap(sky), camera, RAYS, supersampling=1, bounces=bounces)
 
 
+def bowl() -> ws.Mesh:
+    """The ball's lower part, open above."""
+    ball = ws.icosphere(0.5, 3)
+    return ws.Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0.1])
+
+
 @pytest.fixture(scope="module")
 def renderer() -> TorchRenderer:
     return TorchRenderer(ball_on_ground())
@@ -133,9 +139,10 @@ def test_black_bodies_send_nothing(renderer, direct):
     torch.testing.assert_close(bounced[..., :3][at_ground], without[..., :3][at_ground], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("method", ["ray-traced", "directional"])
 @pytest.mark.parametrize("given", ["light", "light and colors"])
-def test_iterations_are_those_of_a_twin_in_float64(given, renderer, monkeypatch):
-    """B = a M (S + F B) and I = W F B, of the form factors F that rays find."""
+def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
+    """B = a M (S + F B) and I = W F B, of the form factors F that rays find; some go on where patches share a body."""
     traced, trace = [], kept_bounces.trace_factors
 
     def listed(*arguments, **options):
@@ -143,12 +150,15 @@ def test_iterations_are_those_of_a_twin_in_float64(given, renderer, monkeypatch)
         return traced[-1]
 
     monkeypatch.setattr(kept_bounces, "trace_factors", listed)
-    engine = ws.Renderer(renderer.scene)
+    scene = ball_on_ground()
+    scene = replace(scene, bodies=(replace(scene.bodies[0], mesh=bowl()), *scene.bodies[1:]))
+    scene = replace(scene, visibility=ws.Visibility(method, samples=512))
+    engine = ws.Renderer(scene, basis=ws.HarmonicBasis(3))
     view = engine.view()
     light = wp.array(np.random.default_rng(SEED).normal(size=(1, 9, 3)), dtype=wp.vec3)
     materials = view.materials
     if given == "light and colors":  # those that it has
-        color = wp.array(np.atleast_2d(renderer.scene.bodies[2].albedo)[None], dtype=wp.vec3)
+        color = wp.array(np.atleast_2d(scene.bodies[2].albedo)[None], dtype=wp.vec3)
         materials = materials.replaced([None, None, color], None)
     shading = view.shading(light, materials).value(view.call).numpy()[0]
     (factors,) = (node for name, (_, node) in view._kept.items() if name == "form factors")
@@ -156,7 +166,8 @@ def test_iterations_are_those_of_a_twin_in_float64(given, renderer, monkeypatch)
     patches = ScenePatches(engine.assembly)
     senders = patches.senders(view.materials)
     albedo = patches.albedo(view.materials, senders.bodies).value(view.call).numpy()[0].astype(np.float64)
-    transfer = view._kept["transfer of sources"][1].value(view.call)[0].numpy()[0].astype(np.float64)
+    (transfers,) = (node for name, (_, node) in view._kept.items() if name in ("transfer", "transfer of sources"))
+    transfer = np.concatenate([each.numpy()[0] for each in transfers.value(view.call)]).astype(np.float64)
 
     def dense(matrix) -> np.ndarray:
         starts, columns, weights = (array.numpy() for array in matrix.rows)
@@ -166,10 +177,17 @@ def test_iterations_are_those_of_a_twin_in_float64(given, renderer, monkeypatch)
 
     mean, (between, of_nodes) = dense(senders.mean), [each.toarray().astype(np.float64) for each in traced]
     at_sources = transfer @ light.numpy()[0].astype(np.float64)
-    radiosity = albedo * (mean @ at_sources)
-    radiosity = albedo * (mean @ (at_sources + between @ radiosity))
+    of_bodies = np.repeat(np.arange(len(senders.bodies)), np.diff(senders.first))
+    is_own = of_bodies[senders.patch_of_source][:, None] == of_bodies
+    assert (between * is_own).sum(axis=1).max() > 0.3
+    once = albedo * (mean @ at_sources)
+    radiosity = albedo * (mean @ (at_sources + between @ once))
+    for _ in range(kept_bounces.OWN_BOUNCES):
+        past = at_sources + (between * ~is_own) @ once
+        radiosity = albedo * (mean @ (past + (between * is_own) @ radiosity))
     expected = dense(factors.of_receivers) @ (of_nodes @ radiosity)
-    direct = view.transfers.value(view.call)[0].numpy()[0].astype(np.float64) @ light.numpy()[0]
+    rows = np.concatenate([each.numpy()[0] for each in view.transfers.value(view.call)]).astype(np.float64)
+    direct = rows @ light.numpy()[0]
     scale = np.abs(shading).max()
     assert np.abs(expected).max() > 0.05 * scale
     np.testing.assert_allclose(shading, direct + expected, atol=2e-5 * scale)

@@ -7,6 +7,8 @@ Patches of bodies have a radiosity B, what they send if direct light S and bounc
 and G is applied as often as light bounces: first at the sources, points where patches are lit, at last at the receivers
 of the image. G has three parts, each a stage of its own: what a body's own patches send to it, what flat bodies send,
 and what bodies send that spheres stand in for. Where the light of a cell is blocked one of them takes its place.
+Between patches of one body the first part is a small matrix that does not change. Hollow bodies keep light for long:
+there it goes on when it has bounced often enough between bodies.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
-from warpshadow.pipeline.gathering import Gathering, Outgoing, SeenCells, StandIns, see_cells
+from warpshadow.pipeline.gathering import ALL_FLAT, Gathering, Outgoing, SeenCells, StandIns, see_cells
 from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.kept_bounces import KeptBounces
+from warpshadow.pipeline.kept_bounces import OWN_BOUNCES, KeptBounces
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.own_factors import OwnFactors
@@ -55,6 +57,7 @@ class Radiosity(Node):
         self,
         count: int,
         stand_ins: StandIns,
+        own_factors: OwnFactors,
         gathering: Gathering,
         sources: Node,
         lit: Node,
@@ -62,32 +65,38 @@ class Radiosity(Node):
         spheres: Source,
         frames: Node,
     ):
-        self._count, self._stand_ins, self._gathering = count, stand_ins, gathering
-        words = f"{len(stand_ins.senders.areas):,} patches"
+        self._count, self._stand_ins, self._own_factors, self._gathering = count, stand_ins, own_factors, gathering
+        senders = stand_ins.senders
+        words = f"{len(senders.areas):,} patches"
+        idle = ALL_FLAT if all(senders.assembly.is_flat[body] for body in senders.bodies) else ""
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=words, keeps=False)
-        beside = self._reflect, *gathering.stages
+        self._own = Node("own light of patches", patch_radiosity, albedo, lit, items=words, idle=idle, keeps=False)
+        beside = self._reflect, self._own, *gathering.stages
         super().__init__("", None, sources, lit, albedo, spheres, frames, beside=beside)
 
     def compute(self, call: Call) -> Outgoing:
-        """Reflect direct light, then light that has bounced once, and so on."""
+        """Reflect direct light, then light that has bounced once, and so on; what bodies send themselves for longer."""
         sources, lit, albedo, spheres, frames = self.values(call)
-        mean = self._stand_ins.senders.mean
+        senders, count = self._stand_ins.senders, self._count
         shown = self._stand_ins.shown(sources, [part.cells for part in lit], spheres, frames)
-        direct = joined([part.direct for part in lit])
-        bounced: list[wp.array] = []
-        for bounce in range(self._count):
-            light = total_light([direct, *bounced])
-            radiosity = self._reflect.run(call, albedo, light, mean)
-            outgoing = Outgoing(self._stand_ins, radiosity, shown, spheres, frames)
-            if bounce + 1 < self._count:
-                bounced = [joined([self._gather(call, part, outgoing) for part in lit])]
-        return outgoing
+        between = None if self._own.idle else self._own_factors.between_patches(senders, [part.group for part in lit])
 
-    def _gather(self, call: Call, part: LitPart, outgoing: Outgoing) -> wp.array:
-        parts = self._gathering.run(call, part.group, part.cells, outgoing)
-        if parts:
-            return total_light(parts)
-        return wp.zeros((1, part.group.points.shape[1]), dtype=wp.vec3, device=outgoing.radiosity.device)
+        def sent(radiosity: wp.array) -> Outgoing:
+            return Outgoing(self._stand_ins, radiosity, shown, spheres, frames)
+
+        past = radiosity = self._reflect.run(call, albedo, joined([part.direct for part in lit]), senders.mean)
+        for bounce in range(1, count if between is None else count + OWN_BOUNCES):
+            if bounce < count:
+                outgoing = sent(radiosity)
+                light = joined([self._light(call, part, outgoing) for part in lit])
+                past = self._reflect.run(call, albedo, light, senders.mean)
+            parts = [past] if between is None else [past, self._own.run(call, albedo, radiosity, between)]
+            radiosity = total_light(parts)
+        return sent(radiosity)
+
+    def _light(self, call: Call, part: LitPart, outgoing: Outgoing) -> wp.array:
+        """Light of a part of the sources past its own body, from the sky and from others."""
+        return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
 
 
 class BouncedShading(LitParts):
@@ -145,8 +154,10 @@ class SphereBounces:
         sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
         lit = LitParts(method, self._at(sources, points, materials), taken, light, list, where=where)
         albedo = self._patches.albedo(materials, senders.bodies)
-        at_sources = gathering((lit, albedo, frames), words, where, "light bounces once" if self._count == 1 else "")
-        radiosity = Radiosity(self._count, stand_ins, at_sources, sources, lit, albedo, points.spheres, frames)
+        why_not = "light bounces once" if self._count == 1 else ""
+        at_sources = gathering((lit, albedo, frames), words, where, why_not, only_others=True)
+        given = self._count, stand_ins, self._own_factors, at_sources, sources, lit, albedo, points.spheres, frames
+        radiosity = Radiosity(*given)
         at_points = gathering((points.receivers_node, radiosity), functools.partial(receiver_words, points))
         return BouncedShading(method, points, taken, light, radiosity, at_points)
 
@@ -172,7 +183,7 @@ class SphereBounces:
 
     @functools.cached_property
     def _still(self) -> KeptBounces:
-        return KeptBounces(self._patches, self._count, progress=self._method.progress)
+        return KeptBounces(self._patches, self._count, own_bounces=OWN_BOUNCES, progress=self._method.progress)
 
     def _at(self, sources: Node, points: LitPoints, materials: Materials) -> LitPoints:
         """Sources, to be lit among the bodies among which points are."""

@@ -36,6 +36,9 @@ from warpshadow.stages.visibility.directional import transmittance
 CELLS = fibonacci(64)
 """Where receivers look for bounced light if direct light is found in harmonics."""
 
+ALL_FLAT = "all that reflects is flat"
+"""Why no body sends light to itself, in words."""
+
 
 class SeenCells(NamedTuple):
     """What a part of receivers sees in cells of directions."""
@@ -234,9 +237,10 @@ class Gathering:
         words: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
+        only_others: Leave out what bodies send to themselves.
 
     Attributes:
-        stages: Nodes of its three parts.
+        stages: Nodes of its parts.
     """
 
     def __init__(
@@ -248,21 +252,23 @@ class Gathering:
         words: str | Callable[[], str],
         where: str = "",
         why_not: str = "",
+        only_others: bool = False,
     ):
         self._visibility, self._own_factors = visibility, own_factors
         self._is_flat, sphere_counts = senders.assembly.is_flat, senders.assembly.sphere_counts
         solid = [body for body in senders.bodies if not self._is_flat[body]]
         idle = (
-            "" if solid else "all that reflects is flat",
+            "" if solid else ALL_FLAT,
             "" if len(solid) < len(senders.bodies) else "nothing flat reflects",
             "" if any(sphere_counts[body] for body in solid) else "nothing that reflects has spheres",
         )
         functions = self._from_itself, self._from_flats, self._from_spheres
         names = "own light", "flat light", "sphere light"
-        self.stages = tuple(
+        stages = tuple(
             Node(f"{name}{where}", function, *given, items=words, idle=why_not or why, keeps=False)
             for name, function, why in zip(names, functions, idle, strict=True)
         )
+        self.stages = stages[1:] if only_others else stages
 
     def run(self, call: Call, group: Group, cells: SeenCells, outgoing: Outgoing) -> list[wp.array]:
         """What a group gets in each way in which it gets some, vec3 of shape [batch, receiver]."""

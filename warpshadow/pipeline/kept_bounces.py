@@ -5,7 +5,8 @@ With direct shading S and albedo a an iteration finds the radiosity of patches a
 
     B = a (M S + M F B),  M the mean over sources,        starting from B = a M S,
 
-and what receivers get of it, F B. Receivers of an image are many: F is found at some of them, and interpolated.
+and what receivers get of it, F B. Light that a body sends to itself may go on for longer than that.
+Receivers of an image are many: F is found at some of them, and interpolated.
 It is linear in light: of free light among bodies whose colors are known all of it is one matrix, which is kept.
 Differentiable in light and albedo.
 """
@@ -33,6 +34,9 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+OWN_BOUNCES = 8
+"""How often a body's light for itself goes on where that of others has ended. Of a hollow body it dies away slowly."""
+
 _RAYS = 1024
 """Rays of a node or source, which find its form factors."""
 
@@ -40,7 +44,8 @@ _RAYS = 1024
 class _Factors(NamedTuple):
     """What is kept of a geometry."""
 
-    between: SparseMatrix  # [patch, patch], means over the sources of the first
+    of_itself: SparseMatrix  # [patch, patch] of the same body, means over the sources of the first
+    of_others: SparseMatrix  # [patch, patch] of different ones, likewise
     of_nodes: SparseMatrix  # [node, patch], nodes of each view after one another
     of_receivers: SparseMatrix  # [receiver, node]
     shape: tuple[int, int]  # views, receivers of each
@@ -64,11 +69,13 @@ class KeptBounces:
     Args:
         patches: Of the scene.
         bounces: How often, 1 or more.
+        own_bounces: How often a body's light for itself goes on then.
         progress: Show progress where it takes longer than a second.
     """
 
-    def __init__(self, patches: ScenePatches, bounces: int, *, progress: bool = False):
-        self._patches, self._bounces, self._progress = patches, bounces, progress
+    def __init__(self, patches: ScenePatches, bounces: int, *, own_bounces: int = 0, progress: bool = False):
+        self._patches, self._progress = patches, progress
+        self._bounces, self._own_bounces = bounces, own_bounces
 
     def sources(self, points: LitPoints, materials: Materials) -> Node:
         """Node of the points of patches that are lit, of one instance."""
@@ -138,9 +145,11 @@ class KeptBounces:
 
     def _at_nodes(self, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
         """What nodes get of light that has bounced, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
-        radiosity = reflect(albedo, at_patches)
-        for _ in range(self._bounces - 1):
-            radiosity = reflect(albedo, multiply(factors.between, radiosity, plus=at_patches))
+        past, radiosity = at_patches, reflect(albedo, at_patches)  # past their own bodies, from the sky and from others
+        for bounce in range(1, self._bounces + self._own_bounces):
+            if bounce < self._bounces:
+                past = multiply(factors.of_others, radiosity, plus=at_patches)
+            radiosity = reflect(albedo, multiply(factors.of_itself, radiosity, plus=past))
         return multiply(factors.of_nodes, radiosity)
 
     def _words(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
@@ -148,7 +157,7 @@ class KeptBounces:
 
     def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
         def find(positions: wp.array, sources: Receivers, receivers: Receivers) -> _Factors:
-            from scipy.sparse import block_diag
+            from scipy.sparse import block_diag, coo_matrix
 
             if len(positions) > 1:
                 raise ValueError(
@@ -168,8 +177,15 @@ class KeptBounces:
                 for places in (at, facing)
             )
             of_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0])
+            between = (senders.mean.on_host() @ of_sources).tocoo()
+            is_own = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
+            of_itself, of_others = (
+                coo_matrix((between.data[which], (between.row[which], between.col[which])), between.shape)
+                for which in (is_own, ~is_own)
+            )
             return _Factors(
-                SparseMatrix.of(senders.mean.on_host() @ of_sources, device=device),
+                SparseMatrix.of(of_itself, device=device),
+                SparseMatrix.of(of_others, device=device),
                 SparseMatrix.of(trace(at_nodes, of_nodes), device=device),
                 SparseMatrix.of(block_diag(list(map(interpolation, at, facing, chosen))), device=device),
                 at.shape[:2],

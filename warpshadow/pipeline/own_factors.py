@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.cache import cache_path, remembered
+from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.own_shadows import OwnShadows
-from warpshadow.pipeline.patches import ScenePatches
+from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.sparse import SparseMatrix
@@ -39,6 +40,7 @@ class OwnFactors:
     def __init__(self, own_shadows: OwnShadows, patches: ScenePatches, *, progress: bool = False):
         self._own_shadows, self._patches, self._progress = own_shadows, patches, progress
         self._of_body: dict[int, SparseMatrix] = {}
+        self._between: dict[Senders, SparseMatrix] = {}
 
     def of(self, body: int) -> SparseMatrix:
         """What share of the hemisphere of each of a body's sites its own patches take."""
@@ -52,6 +54,30 @@ class OwnFactors:
             found = own_factors(*given, device=assembly.device, progress=self._progress)
             self._of_body[body] = SparseMatrix.of(found, device=assembly.device)
         return self._of_body[body]
+
+    def between_patches(self, senders: Senders, sources: Sequence[Group]) -> SparseMatrix:
+        """What share of the hemisphere of each patch others of its body take, in the mean over its sources."""
+        if senders not in self._between:
+            from scipy.sparse import vstack
+
+            of_sources = vstack([self._of_group(senders, group) for group in sources])
+            between = senders.mean.on_host() @ of_sources
+            self._between[senders] = SparseMatrix.of(between, device=senders.assembly.device)
+        return self._between[senders]
+
+    def _of_group(self, senders: Senders, group: Group) -> csr_matrix:
+        """What share of the hemisphere of each source of a group the patches of its body take, of all patches."""
+        from scipy.sparse import csr_matrix
+
+        shape, body = (group.points.shape[1], len(senders.areas)), group.body
+        if body not in senders.bodies or senders.assembly.is_flat[body]:
+            return csr_matrix(shape, dtype=np.float32)
+        assert body is not None and group.places is not None
+        factors, (sites, weights) = self.of(body).on_host(), (each.numpy()[0] for each in group.places)
+        starts = np.arange(0, sites.size + 1, 3)
+        of_patches = csr_matrix((weights.ravel(), sites.ravel(), starts), (shape[0], factors.shape[0])) @ factors
+        first = senders.first[senders.bodies.index(body)]
+        return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
 
 
 def own_factors(

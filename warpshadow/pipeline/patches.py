@@ -120,6 +120,7 @@ class Senders:
         sides: Side of a face that each source lies on, int32 of shape [source].
         barycentrics: And where on it, float32 of shape [source, 3].
         patch_of_source: The patch that it belongs to, int32 of shape [source].
+        body_of_patch: The body that it belongs to, by number, of shape [patch].
         mean: The matrix of means over sources, [patch, source].
     """
 
@@ -139,6 +140,7 @@ class Senders:
         self.areas = _joined(areas, np.float32)
         self.patch_of_source = _joined(owners, np.int32)
         weights = _joined([each.sources.weights for each in patches], np.float32)
+        self.body_of_patch = np.repeat(bodies, np.diff(self.first))
         self._bodies = np.repeat(bodies, [len(each) for each in sides])
         self.mean = mean_over_sources(self.patch_of_source, weights, int(self.first[-1]), device=assembly.device)
 

@@ -79,10 +79,11 @@ class Rays(Method):
 
     @functools.cached_property
     def _bounces(self) -> "KeptBounces":
-        from warpshadow.pipeline.kept_bounces import KeptBounces
+        from warpshadow.pipeline.kept_bounces import OWN_BOUNCES, KeptBounces
         from warpshadow.pipeline.patches import ScenePatches
 
-        return KeptBounces(ScenePatches(self.assembly), self.assembly.scene.bounces, progress=self.progress)
+        given = ScenePatches(self.assembly), self.assembly.scene.bounces
+        return KeptBounces(*given, own_bounces=OWN_BOUNCES, progress=self.progress)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
