@@ -51,8 +51,10 @@ def progress_bar(total: int, what: str, unit: str, *, wanted: bool = True, stays
 
     outer = _shown.bar
     if wanted and outer is not None:
-        yield _Within(outer, what)
-        outer.set_postfix_str("", refresh=False)
+        try:
+            yield _Within(outer, what)
+        finally:
+            outer.set_postfix_str("", refresh=False)
         return
     delay = 0 if stays else _DELAY
     with tqdm(total=total, desc=what, unit=unit, delay=delay, leave=stays, disable=not wanted) as bar:

@@ -22,7 +22,7 @@ PART = 1 << 13
 
 
 class Group(NamedTuple):
-    """Receivers that the same spheres block: those of all bodies, or of those other than the receivers' own."""
+    """Receivers whose light the same spheres block: those of all bodies, or of all but the receivers' own."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3

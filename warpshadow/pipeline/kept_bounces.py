@@ -1,4 +1,4 @@
-"""Bounces where geometry stands still: rays once, then small matrices in each iteration. For the ray-traced method.
+"""Bounces where geometry stands still: rays once, then small matrices in each iteration, by any method that lights.
 
 Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
 With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces,

@@ -1,4 +1,4 @@
-"""Sparse matrices that are multiplied with colors: what patches get of sources, sites of patches, texels of nodes."""
+"""Sparse matrices that are multiplied with colors: what patches get of sources, sites of patches, patches of texels."""
 
 from __future__ import annotations
 
