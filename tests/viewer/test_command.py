@@ -1,5 +1,6 @@
 """`warpshadow view`: it serves until Ctrl+C, and says in one line what is wrong."""
 
+import functools
 import http.client
 import os
 import re
@@ -37,15 +38,21 @@ def test_it_serves_the_page_until_it_is_interrupted(scene):
     pytest.importorskip("viser", reason="viser is not installed")
     command = [*PROGRAM, "view", str(scene), "--port", "0", "--no-browser"]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as run:
-        line = run.stdout.readline()
-        url = re.match(r"(http://127\.0\.0\.1:\d+) ", line).group(1)
-        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
-        connection.request("GET", "/")
-        answer = connection.getresponse()
-        assert answer.status == 200 and b"<html" in answer.read()
-        run.send_signal(signal.SIGINT)
-        out, err = run.communicate(timeout=60)
+    # a process that was started in the background ignores interrupts, and so do its children unless they are told
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **streams, text=True, env=environment, preexec_fn=heed) as run:
+        try:
+            line = run.stdout.readline()
+            url = re.match(r"(http://127\.0\.0\.1:\d+) ", line).group(1)
+            connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
+            connection.request("GET", "/")
+            answer = connection.getresponse()
+            assert answer.status == 200 and b"<html" in answer.read()
+            run.send_signal(signal.SIGINT)
+            out, err = run.communicate(timeout=60)
+        finally:
+            run.kill()
     assert run.returncode == 0 and out == "" and "Traceback" not in err
 
 
