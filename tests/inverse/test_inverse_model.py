@@ -104,3 +104,17 @@ def test_small_images_of_moving_bodies_are_shaded_where_they_are_seen():
 def test_a_fit_of_light_alone_lowers_its_loss():
     result = fit(lit_problem(Light(3)), [Stage(20, 0.05)])
     assert result.losses[0][-1] < result.losses[0][0]
+
+
+def test_a_fit_has_grounds_block_as_its_scene_has_them():
+    """As planes, not by spheres; the found scene is then lit alike."""
+    scene = ws.Scene(
+        [ws.Body(ws.icosphere(0.4, 2), translation=(0, 0.5, 0), blockers=8), ws.Body(ws.plane(3.0, 8))],
+        ws.EnvironmentMap.constant(1.0, height=16),
+        ws.Camera.look_at((0, 1.5, 3), (0, 0.4, 0), size=(24, 24)),
+    )
+    image = ws.render(scene)
+    problem = Problem(scene, [Target(image)], [Pose(0)])
+    setting = problem.setting(CPU)
+    found = problem.found(problem.start(setting), setting).scene
+    np.testing.assert_allclose(ws.render(found), image, atol=1e-5)

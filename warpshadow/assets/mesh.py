@@ -20,6 +20,7 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.topology import Surface, join_faces
 from warpshadow.check import AnyPath
+from warpshadow.maths.plane import plane_normal
 
 
 class MeshError(ValueError):
@@ -106,6 +107,11 @@ class Mesh:
     def surface(self) -> Surface:
         """How its faces are joined."""
         return join_faces(self.positions, self.faces, self.uv_faces)
+
+    @functools.cached_property
+    def is_flat(self) -> bool:
+        """Whether it lies in a plane."""
+        return plane_normal(self.positions[self.surface.faces].astype(np.float64)) is not None
 
     def transformed(
         self,

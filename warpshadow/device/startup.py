@@ -13,6 +13,9 @@ def start_quietly() -> None:
 
     What else it prints on stderr meanwhile is printed after.
     """
+    if sys.stderr is None:  # as of a service
+        wp.init()
+        return
     sys.stderr.flush()
     terminal = os.dup(2)
     reader, writer = os.pipe()

@@ -16,6 +16,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.reflectance import Albedo, Texture
+from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
@@ -123,12 +124,21 @@ class Problem:
         scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
         if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
             spheres = scene_blockers(scene, device=str(device), progress=progress)
-            bodies = (replace(body, blockers=own) for body, own in zip(scene.bodies, spheres, strict=True))
+            bodies = list(scene.bodies)
+            for number in set(range(len(bodies))) - self._planes(scene):
+                bodies[number] = replace(bodies[number], blockers=spheres[number])
             scene = replace(scene, bodies=tuple(bodies))
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
         weights = np.stack([target.weights() for target in self.targets])[..., None]
         unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))
         return Setting(scene, cameras, unit or 1.0, device)
+
+    def _planes(self, scene: Scene) -> set[int]:
+        """Bodies that block light as planes, not by spheres, also in the scene that is found."""
+        if scene.visibility.method != "directional":
+            return set()
+        reshaped = {free.number for free in self.free if isinstance(free, (Deformation, Radii))}
+        return {number for number, body in enumerate(scene.bodies) if number not in reshaped and body.mesh.is_flat}
 
     def start(self, setting: Setting) -> dict[str, Values]:
         """Values of what is free, by its name, where the scene has them."""

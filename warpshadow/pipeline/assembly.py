@@ -11,7 +11,6 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, concatenate
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import SPHERE_METHODS, BodyLike, Scene
@@ -156,9 +155,7 @@ class Assembly:
     @functools.cached_property
     def is_flat(self) -> np.ndarray:
         """Bodies that lie in a plane, bool of shape [body]."""
-        meshes = [body.mesh for body in self.scene.bodies]
-        corners = [mesh.positions[mesh.surface.faces].astype(np.float64) for mesh in meshes]
-        return np.array([plane_normal(each) is not None for each in corners])
+        return np.array([body.mesh.is_flat for body in self.scene.bodies])
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:
