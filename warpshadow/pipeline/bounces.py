@@ -29,7 +29,6 @@ from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
-from warpshadow.stages.shading import shade
 
 
 class LitPart(NamedTuple):
@@ -166,20 +165,31 @@ class SphereBounces:
 
         Args:
             points: The receivers, among bodies that stand where the scene has them.
-            taken: What the method takes of the light, or of any where it is free.
-            light: The light, known or free.
+            taken: What the method takes of the light.
+            light: The light, known.
             materials: What the bodies reflect.
         """
-        sources, where = self._still.sources(points, materials), " of sources"
-        at_sources = points.kept("lit sources", sources, lambda: self._at(sources, points, materials))
-        if isinstance(light.value(), wp.array):
-            direct = Node("shading", _shade, points.transfers, light)
-            transfers = points.kept("transfer", sources, lambda: self._method.transfers(at_sources, where))
-            return self._still.in_free_light(direct, transfers, light, points, materials)
+        sources, at_sources = self._kept_sources(points, materials)
         direct = points.kept("direct", light, lambda: InParts(self._method, points, taken, light, joined))
-        make = functools.partial(InParts, self._method, at_sources, taken, light, joined, where=where)
+        make = functools.partial(InParts, self._method, at_sources, taken, light, joined, where=" of sources")
         lit = points.kept("direct at sources", (light, sources), make)
         return self._still.in_known_light(direct, lit, points, materials)
+
+    def kept_free_shading(self, direct: Node, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """The same in free light.
+
+        Args:
+            direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
+            points, light, materials: As above.
+        """
+        sources, at_sources = self._kept_sources(points, materials)
+        transfers = points.kept("transfer", sources, lambda: self._method.transfers(at_sources, " of sources"))
+        return self._still.in_free_light(direct, transfers, light, points, materials)
+
+    def _kept_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
+        """Node of the sources of bodies that stand still, and these as points that are lit."""
+        sources = self._still.sources(points, materials)
+        return sources, points.kept("lit sources", sources, lambda: self._at(sources, points, materials))
 
     @functools.cached_property
     def _still(self) -> KeptBounces:
@@ -189,8 +199,3 @@ class SphereBounces:
         """Sources, to be lit among the bodies among which points are."""
         given = self._method, materials, points.vertices, points.spheres, sources, points.call
         return LitPoints(*given, normals=points.normals, blocking=points.blocking)
-
-
-def _shade(transfers: list[wp.array], light: wp.array) -> wp.array:
-    """Light receivers by what groups of them see of free light. Differentiable: light."""
-    return joined([shade(transfer, light) for transfer in transfers])

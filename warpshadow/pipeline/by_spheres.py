@@ -38,6 +38,9 @@ class Bouncing(Protocol):
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still; what does not depend on light and materials is kept."""
 
+    def kept_free_shading(self, direct: Node, points: LitPoints, light: Source, materials: Materials) -> Node:
+        """The same in free light, given the direct shading."""
+
 
 class SphereMethod(Method):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
@@ -116,12 +119,11 @@ class SphereMethod(Method):
         return InParts(self, points, taken, light, joined)
 
     def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
-        """Shading of points in free light; where it bounces, found with the light as if that were known."""
-        if self.bounces is None:
-            return super().free_shading(points, light, materials)
-        if points.stands:
-            return self.bounces.kept_shading(points, self.taken_if_free, light, materials)
-        return self.bounces.shading(points, Node("", self._taken_if_given, light), light, materials)
+        """Shading of points in free light; where it bounces between what moves, found as if the light were known."""
+        if self.bounces is not None and not points.stands:
+            return self.bounces.shading(points, Node("", self._taken_if_given, light), light, materials)
+        direct = super().free_shading(points, light, materials)
+        return direct if self.bounces is None else self.bounces.kept_free_shading(direct, points, light, materials)
 
     def _taken_if_given(self, light: wp.array) -> Any:
         """What the method takes of free light that is given. Differentiable: light."""
