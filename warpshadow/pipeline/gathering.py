@@ -216,7 +216,7 @@ class Outgoing:
         place = self.senders.bodies.index(body)
         return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
 
-    def of_spheres(self, body: int | None, directions: np.ndarray) -> tuple[wp.array, wp.array, wp.array]:
+    def of_spheres(self, body: int | None) -> tuple[wp.array, wp.array, wp.array]:
         """Centers and radii of the spheres of bodies other than one, and what they send towards cells."""
         if body not in self._of_spheres:
             others = solid_bodies(self.stand_ins.assembly, but=body)
@@ -288,7 +288,7 @@ class Gathering:
         return flat_light(*given, cells.directions, skip=flats.number.get(group.body))
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
-        centers, radii, exitance = outgoing.of_spheres(group.body, cells.directions)
+        centers, radii, exitance = outgoing.of_spheres(group.body)
         if not radii.shape[1]:
             return None
         count = common_batch({"geometry": group.points, "light": exitance})
