@@ -13,7 +13,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.maths import sh
-from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.assembly import Assembly, Geometry
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.own_shadows import BY_SPHERES, Blocking, OwnShadows
 from warpshadow.pipeline.reflectance import Materials
@@ -141,6 +141,10 @@ class Method:
         self.visibility = assembly.scene.visibility
         self.light = Source("light", assembly.scene.light)
         self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
+
+    def flats_in(self, geometry: Geometry | None) -> tuple[int, ...]:
+        """Bodies that block as planes in a geometry, by default the scene's."""
+        return ()
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:

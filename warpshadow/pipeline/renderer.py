@@ -338,11 +338,7 @@ class Renderer:
         if geometry is not None and geometry.rotations is not None:
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
             rotations = Source.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
-        return self._method.own_shadows.blocking(geometry, rotations)._replace(flats=self._flats(geometry))
-
-    def _flats(self, geometry: Geometry | None) -> tuple[int, ...]:
-        """Bodies that block as planes in a geometry, by default the scene's."""
-        return self._method.flats_in(geometry) if isinstance(self._method, SphereMethod) else ()
+        return self._method.own_shadows.blocking(geometry, rotations)._replace(flats=self._method.flats_in(geometry))
 
     def _call(self, view: LitPoints | None = None) -> Call:
         """A call, which knows what was computed of a view."""
@@ -367,7 +363,7 @@ class Renderer:
             vertices = Source("vertices", geometry.positions)
             spheres = Source("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda given: given, receivers)
-        blocking = BY_SPHERES._replace(flats=self._flats(geometry))
+        blocking = BY_SPHERES._replace(flats=self._method.flats_in(geometry))
         return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), blocking=blocking)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
