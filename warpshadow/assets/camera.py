@@ -241,9 +241,10 @@ class Camera:
             degrees: The angle.
             about: A point of the line [scene units], shape [3].
         """
+        from scipy.spatial.transform import Rotation
+
         middle = check.array("about", about, (3,))
-        angle = np.radians(check.number("degrees", degrees))
-        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        turn = Rotation.from_rotvec([0, check.number("degrees", degrees), 0], degrees=True).as_matrix()
         rotation = self.rotation @ turn.T
         translation = self.translation + (self.rotation - rotation) @ middle
         return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)

@@ -153,9 +153,12 @@ def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: flo
     if isinstance(light, EnvironmentMap):
         light = light.rotated(rotation) if rotation else light
         return light.scaled(scale) if scale != 1 else light
-    angle = np.radians(rotation)
-    about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    turned: np.ndarray = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light if rotation else light
+    if not rotation:
+        return scale * light
+    from scipy.spatial.transform import Rotation
+
+    about_y = Rotation.from_rotvec([0, rotation, 0], degrees=True).as_matrix()
+    turned: np.ndarray = sh.rotation_matrix(sh.order_of("sh", light), about_y) @ light
     return scale * turned
 
 
