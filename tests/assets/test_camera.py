@@ -1,5 +1,6 @@
 """Cameras: hand-computed pixels, constructors against each other, errors, and the clip-space kernel."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -273,9 +274,32 @@ def test_from_opengl_names_the_argument_it_refuses():
         Camera.from_opengl(np.eye(4), perspective, fov_y=40.0)
 
 
-def test_resizing_to_a_fraction_of_a_pixel_is_refused():
-    with pytest.raises(ValueError, match="^factor: got"):
-        Camera.look_at((0, 0, 5), (0, 0, 0), size=(5, 4)).resized(0.5)
+@pytest.mark.parametrize(
+    ("size", "factor", "expected"),
+    [
+        ((960, 540), 1 / 8, (120, 68)),
+        ((959, 541), 1 / 4, (240, 135)),
+        ((5, 4), 1e-3, (1, 1)),
+        ((384, 255), 1 / 3, (128, 85)),
+    ],
+)
+def test_a_camera_is_resized_to_whole_pixels_and_sees_the_same(size, factor, expected):
+    camera = dataclasses.replace(
+        Camera.look_at((1, 2, 3), (0, 0, 0), size=size),
+        intrinsics=[[700, 1, 0.4 * size[0]], [0, 690, 0.6 * size[1]], [0, 0, 1]],
+    )
+    resized = camera.resized(factor)
+    assert (resized.width, resized.height) == expected
+    np.testing.assert_allclose(resized.clip_matrix(), camera.clip_matrix(), atol=1e-12)
+
+
+def test_a_stretched_camera_sees_points_at_the_same_parts_of_its_image():
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), size=(64, 48))
+    stretched = camera.stretched(31, 90)
+    points = np.random.default_rng(0).normal(0, 0.5, (20, 3))
+    np.testing.assert_allclose(stretched.project(points) / (31, 90), camera.project(points) / (64, 48), atol=1e-12)
+    with pytest.raises(ValueError, match="^size .height.: got"):
+        camera.stretched(4, 0)
 
 
 def to_device(values, dtype, device, requires_grad=False):

@@ -275,7 +275,6 @@ def test_an_unknown_key_of_any_table_names_the_nearest_known_key(refused, text, 
         (MINIMAL + "loss = 3\n", ["[free]", "unknown key 'loss'"]),
         (MINIMAL + '[optimizer]\nname = "adamw"\n', ["[optimizer]", "did you mean 'adam'"]),
         (MINIMAL + '[optimizer]\nname = "sgd"\nbetas = [0, 1]\n', ["[optimizer]", "unknown key 'betas'"]),
-        (MINIMAL + "[[stage]]\nscale = 0.3\n", ["stages[0]", "factor: got 0.3", "whole numbers"]),
         (MINIMAL + "x =", ["not valid TOML"]),
     ],
 )

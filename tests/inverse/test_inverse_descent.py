@@ -32,6 +32,7 @@ from warpshadow.inverse import (
     fit,
 )
 from warpshadow.inverse.descent import WINDOW
+from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages
 from warpshadow.torch import rotation_matrices
 
@@ -139,13 +140,20 @@ def test_where_the_last_step_led_counts():
     assert not np.array_equal(fit(problem, [Stage(1)]).images(), fit(problem, [Stage(1)]).images_at_start())
 
 
-def test_a_size_that_is_not_whole_is_refused_at_once_with_its_stage():
-    loss = Recorded()
-    problem = small_problem(loss=loss)
-    message = r"stages\[1\]: .*24 x 24 pixels 2\.4.* x 2\.4.*whole numbers"
-    with pytest.raises(ValueError, match=message):
-        fit(problem, [Stage(1000), Stage(1, scale=0.1)])
-    assert "seen" not in loss.__dict__  # at once
+def test_a_stage_of_a_part_of_a_pixel_rounds_and_corrects_its_camera():
+    """The scene explains its own image at sizes that are no whole part of it; by intrinsics times the scale, worse."""
+    scene = dataclasses.replace(small_scene(size=(61, 47)), supersampling=4)
+    problem = Problem(scene, Target(ws.render(scene)), Pose(0))
+    setting = problem.setting(torch.device("cpu"))
+    for scale in (1 / 2, 0.3, 1 / 4):
+        model = Model(problem, setting, Stage(scale=scale))
+        image, target = model.images(problem.start(setting))[0].detach().numpy(), model.targets[0].numpy()
+        assert image.shape == target.shape == (round(47 * scale), round(61 * scale), 4)
+        intrinsics = np.diag([scale, scale, 1]) @ scene.camera.intrinsics
+        uncorrected = ws.render(
+            dataclasses.replace(scene, camera=dataclasses.replace(model.cameras[0], intrinsics=intrinsics))
+        )
+        assert np.abs(image - target).mean() < 0.5 * np.abs(uncorrected - target).mean()
 
 
 def test_a_softness_that_directions_do_not_allow_is_refused_at_once_with_its_stage():

@@ -118,6 +118,17 @@ def test_coarse_images_are_means_of_what_counts_and_coarse_weights_how_much_that
     assert not images[0].numpy()[~counts].any()
 
 
+@pytest.mark.parametrize("scale", [0.5, 0.3, 0.01])
+def test_coarse_pixels_count_what_they_overlap_by_its_area(scale):
+    image = noise(7, 10, 3)
+    images, weights = stacked([Target(image)], scale, CPU)
+    height, width = max(1, round(7 * scale)), max(1, round(10 * scale))
+    finer = np.repeat(np.repeat(image, height, axis=0), width, axis=1)  # of which coarse pixels are whole parts
+    expected = finer.reshape(height, 7, width, 10, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(images[0].numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(weights[0].numpy(), 1, atol=1e-6)
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])
 def test_masked_pixels_have_no_influence_whatever_is_in_them(scale):
     mask = noise(8, 8, seed=3).round()

@@ -250,16 +250,15 @@ class Camera:
         return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
 
     def resized(self, factor: float) -> Camera:
-        """The same view on an image ``factor`` times as wide and high (supersampling: 2, 3, ...)."""
+        """The same view on an image ``factor`` times as wide and high, rounded to whole pixels, at least one."""
         factor = check.positive("factor", factor)
-        width, height = self.width * factor, self.height * factor
-        if max(abs(width - round(width)), abs(height - round(height))) > 1e-6:  # a third of 384, in floating point
-            raise ValueError(
-                f"factor: got {factor}, which makes {self.width} x {self.height} pixels {width} x {height}; "
-                "expected whole numbers"
-            )
-        intrinsics = np.diag([factor, factor, 1.0]) @ self.intrinsics
-        return Camera(intrinsics, self.rotation, self.translation, round(width), round(height), self.near)
+        return self.stretched(*(max(1, round(count * factor)) for count in (self.width, self.height)))
+
+    def stretched(self, width: int, height: int) -> Camera:
+        """The same view on an image of another size [pixels]; of other proportions, pixels are not square."""
+        width, height = check.image_size((width, height))
+        intrinsics = np.diag([width / self.width, height / self.height, 1.0]) @ self.intrinsics
+        return Camera(intrinsics, self.rotation, self.translation, width, height, self.near)
 
     def clip_matrix(self) -> np.ndarray:
         """World to clip space (convention: see the module), float64, shape [4, 4]."""

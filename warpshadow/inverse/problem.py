@@ -172,8 +172,7 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
             f"targets: got an image of {width} × {height} pixels, expected the proportions of the scene's camera, "
             f"{camera.width} × {camera.height}, or a camera of its own"
         )
-    intrinsics = np.diag([width / camera.width, height / camera.height, 1]) @ camera.intrinsics
-    return replace(camera, intrinsics=intrinsics, width=width, height=height)
+    return camera.stretched(width, height)
 
 
 def _digest(value: object, digest: hashlib._Hash) -> None:

@@ -23,7 +23,7 @@ class Stage:
     Args:
         iterations: At most so many, for each candidate.
         learning_rate: At the start; it falls along a cosine to a tenth.
-        scale: Size of the images as a part of the targets'.
+        scale: Size of the images as a part of the targets'; rounded to whole pixels, and the view stays the same.
         softness: κ of directional visibility; by default the scene's. Softer shadows reach farther.
         directions: Number of cells of directional visibility; by default the scene's.
         supersampling: Samples a pixel across and down; by default the scene's.
@@ -71,12 +71,11 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
     """Raise ValueError for what the last stage of a long fit would stumble over."""
     if not stages:
         raise ValueError("stages: got none, expected one or more")
-    visibility, camera = problem.visibility, problem.cameras()[0]
+    visibility = problem.visibility
     for number, stage in enumerate(stages):
         check.instance(f"stages[{number}]", stage, Stage, "a Stage, such as Stage(iterations=200)")
         try:
             stage.visibility(visibility)
-            camera.resized(stage.scale)
         except ValueError as error:
             raise ValueError(f"stages[{number}]: {error}") from error
 
@@ -120,8 +119,6 @@ def _soft(problem: Problem, softness: float) -> dict[str, Any]:
 
 
 def _scale(problem: Problem, size: int) -> float:
-    """The part 1 / n of the targets' size whose shorter side is nearest to a number of pixels, and whole."""
-    height, width, _ = problem.targets[0].image.shape
-    common = math.gcd(height, width)
-    factors = [n for n in range(1, common + 1) if common % n == 0]
-    return 1 / min(factors, key=lambda n: abs(math.log(min(height, width) / n / size)))
+    """The part 1 / n of the targets' size whose shorter side is about a number of pixels."""
+    shorter = min(problem.targets[0].image.shape[:2])
+    return 1 / max(1, round(shorter / size))

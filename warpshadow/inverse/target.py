@@ -102,15 +102,22 @@ def read_mask(path: AnyPath) -> np.ndarray:
 
 
 def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images [view, height, width, channel] and weights [view, height, width] at a size, by averages over areas."""
+    """Images [view, height, width, channel] and weights [view, height, width] at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]
-    height, width = round(images.shape[1] * scale), round(images.shape[2] * scale)
+    down, across = (_area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
 
     def resized(pixels: np.ndarray) -> torch.Tensor:
-        planes = torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2)
-        return torch.nn.functional.interpolate(planes, (height, width), mode="area").permute(0, 2, 3, 1)
+        return torch.einsum("ih,vhwc,jw->vijc", down, torch.from_numpy(pixels).to(device), across)
 
     weight = resized(weights)
     image = resized(images * weights) / torch.where(weight > 0, weight, 1)  # what is masked out bleeds into nothing
     return image.contiguous(), weight[..., 0].contiguous()
+
+
+def _area_means(count: int, fewer: int) -> torch.Tensor:
+    """Averages of a row of pixels by area, [fewer, count]; ``fewer`` need not be a part of ``count``."""
+    edges, coarse_edges = np.arange(count + 1), np.arange(fewer + 1) * (count / fewer)
+    ends = np.minimum(edges[1:], coarse_edges[1:, None])
+    starts = np.maximum(edges[:-1], coarse_edges[:-1, None])
+    return torch.from_numpy((np.maximum(ends - starts, 0) * (fewer / count)).astype(np.float32))

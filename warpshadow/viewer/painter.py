@@ -132,7 +132,7 @@ class Painter:
         look = Look.of(self.scene)
         quality = Quality(128**2, cells=64, rays=16, supersampling=1, is_moving=True)
         _, renderer = self._renderer(look, quality)
-        sized = _resized(camera, page.size(quality.pixels))
+        sized = camera.stretched(*page.size(quality.pixels))
         matrix = wp.array([sized.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         small = renderer.with_cameras([sized])
         return round(auto_exposure(small.draw(view=small.view(clip_matrices=matrix)).numpy()[0]), 1)
@@ -297,13 +297,6 @@ def distances(renderer: Renderer, view: View) -> np.ndarray:
 def _step(count: int) -> int:
     """Every so many pixels a depth is sent."""
     return max(1, int(np.ceil(np.sqrt(count / _DEPTH_PIXELS))))
-
-
-def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view on an image of another size, stretched."""
-    factors = np.array([size[0] / camera.width, size[1] / camera.height])
-    intrinsics = np.diag([*factors, 1.0]) @ camera.intrinsics
-    return Camera(intrinsics, camera.rotation, camera.translation, *size, camera.near)
 
 
 def own_page(scene: Scene, scale: float) -> PageCamera:
