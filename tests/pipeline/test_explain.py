@@ -12,6 +12,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device.batch import expand
+from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import assembly, node
 from warpshadow.pipeline import directional as directional_method
 from warpshadow.pipeline.assembly import Geometry
@@ -253,7 +254,9 @@ def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.nda
     if light is None:
         truth = trace_shading(mesh, points, normals, sample_map(renderer.scene.light.radiance, directions)).numpy()
     else:
-        truth = trace_transfer(mesh, points, normals, renderer.basis.functions, directions).numpy() @ light.numpy()[0]
+        transfer = trace_transfer(mesh, points, normals, renderer.basis.functions, directions).numpy()
+        parts = renderer.basis.functions(fibonacci(directions)).mean(axis=0)  # of the sphere, which are to be the same
+        truth = transfer @ (light.numpy()[0] / (len(parts) * parts)[:, None])
     return [shading, truth]
 
 

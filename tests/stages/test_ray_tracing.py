@@ -458,16 +458,32 @@ def test_cells_add_up_to_shading_whoever_is_traced_together(device):
 
 
 def test_cells_of_unit_light_are_transfer_to_them(device):
+    """Each cell has its part of the sphere, 4π/Q, over π, however many rays belong to it."""
     ball = icosphere(1.0, 3)
     mesh = warp_mesh(Mesh(ball.positions + [0, 1.5, 0], ball.faces), device)
-    points = wp.array(np.random.default_rng(SEED).uniform(-2, 2, (30, 3)) * [1, 0, 1], dtype=wp.vec3, device=device)
-    normals = wp.array(np.tile([0.0, 1.0, 0.0], (30, 1)), dtype=wp.vec3, device=device)
+    places = np.random.default_rng(SEED).uniform(-2, 2, (30, 3)) * [1, 0, 1]
+    up = np.tile([0.0, 1.0, 0.0], (30, 1))
+    points, normals = (wp.array(values, dtype=wp.vec3, device=device) for values in (places, up))
     directions = fibonacci(32)
-    samples = cell_samples(even_samples(512), directions, device=device)
+    samples = cell_samples(even_samples(512, directions), directions, device=device)
     numbers = wp.zeros(30, dtype=wp.int32, device=device)
     light = trace_cells(mesh, points, normals, numbers, samples).numpy()[:, 0]
-    expected = trace_transfer(mesh, points, normals, CellBasis(directions).functions, 512).numpy()
+
+    rays = samples.directions.numpy()[0].astype(np.float64)
+    belongs = np.eye(32)[np.argmax(rays @ directions.T, axis=1)]
+    seen = trace(mesh, places[None], up[None], rays, device)[0]
+    expected = (seen * np.maximum(rays[:, 1], 0)) @ belongs * 4 / 32 / belongs.sum(axis=0)
     assert np.abs(light - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("count", [16, 128, 200, 1024])
+def test_even_samples_give_each_cell_its_part_of_the_sphere(count):
+    directions = fibonacci(128)
+    drawn = even_samples(count, directions)
+    assert len(drawn.directions[0]) >= max(count, 128)
+    cells = cell_samples(drawn, directions, device="cpu").cells.numpy()
+    per_cell = np.bincount(cells[0], weights=drawn.radiance[0, :, 0], minlength=128)
+    np.testing.assert_allclose(per_cell, 4 * np.pi / 128, rtol=1e-12)
 
 
 def test_past_no_mesh_nothing_is_traced(device):

@@ -146,7 +146,7 @@ class Directional(SphereMethod):
 
     @functools.cached_property
     def _even_samples(self) -> CellSamples:
-        samples = even_samples(self.visibility.samples)
+        samples = even_samples(self.visibility.samples, self._directions)
         return cell_samples(samples, self._directions, device=self.assembly.device)
 
 

