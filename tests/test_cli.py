@@ -153,12 +153,47 @@ def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     assert frames.shape == (4, 12, 16, 3) and np.abs(frames[1] - frames[0]).mean() > 3
 
 
+def test_a_camera_path_is_a_video_through_its_keyframes(scene, tmp_path):
+    from PIL import Image, ImageSequence
+
+    keyframes = [ws.Keyframe(0, (0, 2, 4), (0, 0.5, 0)), ws.Keyframe(0.2, (4, 2, 0), (0, 0.5, 0))]
+    ws.CameraPath(keyframes, fps=10).write(tmp_path / "path.toml")
+    options = "--camera-path", tmp_path / "path.toml", "--background", "white"
+    result = run("render", scene, "-o", tmp_path / "walk.gif", *options)
+    assert result.exit_code == 0 and "walk.gif: 3 frames" in result.stdout
+    with Image.open(tmp_path / "walk.gif") as file:
+        assert file.info["duration"] == 100
+        frames = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(file)]
+    loaded = ws.load_scene(scene)
+    last = dataclasses.replace(loaded, camera=ws.Camera.look_at((4, 2, 0), (0, 0.5, 0), size=(16, 12)))
+    first = ws.Picture(ws.render(loaded), background="white")
+    pictures = first, ws.Picture(ws.render(last), exposure=first.exposure, background="white")
+    for frame, picture in zip(frames[::2], pictures, strict=True):
+        assert np.abs(frame - picture.pixels).max() <= 2  # 256 colors for 192 pixels
+
+
+def test_render_also_writes_layers(scene, tmp_path):
+    import OpenEXR
+
+    result = run("render", scene, "-o", tmp_path / "out.exr", "--layers", "--png", tmp_path / "out.png")
+    assert result.exit_code == 0, result.output
+    layers = ws.Renderer(ws.load_scene(scene)).layers().channels()
+    with OpenEXR.File(str(tmp_path / "out.exr"), separate_channels=True) as file:
+        channels = file.channels()
+        assert set(channels) == {*"RGBA", *layers}
+        for name, layer in layers.items():
+            np.testing.assert_array_equal(channels[name].pixels, layer)
+    np.testing.assert_array_equal(ws.read_image(tmp_path / "out.exr"), ws.render(ws.load_scene(scene)))
+
+
 @pytest.mark.parametrize(
     ("output", "options", "part"),
     [
         ("turn.exr", ("--turntable", 4), "got extension '.exr', expected .mp4 or .gif or .webp"),
-        ("turn.gif", (), "videos take --turntable FRAMES"),
+        ("turn.gif", (), "videos take --turntable FRAMES or --camera-path FILE"),
         ("turn.gif", ("--turntable", 4, "--png", "out.png"), "--png: got it beside --turntable"),
+        ("turn.gif", ("--turntable", 4, "--layers"), "--layers: got it beside --turntable"),
+        ("turn.gif", ("--camera-path", "no.toml"), "no.toml: no such camera path"),
     ],
 )
 def test_a_turntable_is_a_video_and_a_video_a_turntable(scene, tmp_path, output, options, part):
@@ -672,10 +707,10 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_behind(scene, tmp_path, full
     files_before = {path.name for path in tmp_path.iterdir()}
     write = ws.write_image
 
-    def write_with_the_disk_full(path, pixels):
+    def write_with_the_disk_full(path, pixels, **layers):
         if path.name == name:
             full_disk()
-        write(path, pixels)
+        write(path, pixels, **layers)
 
     monkeypatch.setattr("warpshadow.assets.image.write_image", write_with_the_disk_full)
     result = run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / "out.png")

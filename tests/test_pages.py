@@ -180,8 +180,10 @@ def scene_file():
 
 
 def test_the_scene_file_is_one(folder):
-    scene, automatic = scene_file()
+    scene, path, automatic = scene_file()
     Path("scene.toml").write_text(scene, "utf-8")
+    Path("path.toml").write_text(path, "utf-8")
+    assert ws.CameraPath.read("path.toml").frame_count == 73
     loaded = ws.load_scene("scene.toml")
     assert len(loaded.bodies) == 2
     assert dataclasses.asdict(loaded.visibility) == dataclasses.asdict(ws.Visibility())  # as it says, all are defaults
@@ -247,9 +249,9 @@ def test_snippets_run_as_they_stand(folder, monkeypatch, capsys):
     error = np.abs(names["image"].detach().numpy() - image).mean()
     assert error < 0.1 * image.mean()  # its fit, which begins in the dark, has found light and texture
     ws.write_image("photo.exr", image.reshape(64, 4, 64, 4, 4).mean(axis=(1, 3)))
-    for page in ("pipeline", "inverse"):
+    for page in ("scene", "pipeline", "inverse"):
         for snippet in blocks(ROOT / "warpshadow" / page / "README.md", "python"):
             exec(snippet, names)
     assert "receivers" in capsys.readouterr().out  # what explain says
-    assert Path("explained.exr").exists()
+    assert Path("layers.exr").exists() and Path("explained.exr").exists()
     assert Path("found", "scene.toml").exists()

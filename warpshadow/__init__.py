@@ -18,6 +18,8 @@ from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.layers import Layers
+from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
@@ -30,11 +32,14 @@ __version__ = "0.1.0"
 __all__ = [
     "Body",
     "Camera",
+    "CameraPath",
     "CellBasis",
     "EnvironmentMap",
     "Geometry",
     "HarmonicBasis",
     "ImageError",
+    "Keyframe",
+    "Layers",
     "Mesh",
     "MeshError",
     "Picture",

@@ -16,6 +16,7 @@ import warp as wp
 
 from warpshadow import Tuning, __version__, quiet
 from warpshadow.assets import files
+from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.scene.scene import Scene
@@ -95,7 +96,8 @@ def render(
         typer.Option(
             "-o",
             "--output",
-            help="Image to write: .exr, linear float32 RGBA, alpha = coverage; of --turntable: .mp4, .gif, .webp.",
+            help="Image to write: .exr, linear float32 RGBA, alpha = coverage; with --turntable or --camera-path a "
+            "video: .mp4, .gif, .webp.",
         ),
     ],
     png: Annotated[
@@ -114,6 +116,20 @@ def render(
     turntable: Annotated[
         Optional[int], typer.Option(help="Write a video of so many frames in which the camera goes around.", min=1)
     ] = None,
+    camera_path: Annotated[
+        Optional[Path],
+        typer.Option(
+            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists."
+        ),
+    ] = None,
+    layers: Annotated[
+        bool,
+        typer.Option(
+            "--layers",
+            help="Also write depth (Z), normals (N.X, N.Y, N.Z), numbers of bodies (body) and their masks (mask.0, …) "
+            "as channels of the image.",
+        ),
+    ] = False,
     method: Annotated[
         Optional[Literal["directional", "log-sh", "none", "ray-traced", "auto"]],
         typer.Option(
@@ -138,20 +154,28 @@ def render(
     """Render a scene file to an image with soft shadows."""
     from warpshadow.assets.image import write_image
     from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.scene.camera_path import CameraPath
     from warpshadow.scene.files import load_scene
     from warpshadow.scene.scene import AUTO
     from warpshadow.tuning.tune import describe, resolved
 
     with _clear_errors():
-        if turntable is None:
+        video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
+        path = None if camera_path is None else CameraPath.read(camera_path)
+        if video is None:
             is_picture, is_video = (output.suffix.lower() in suffixes for suffixes in (SUFFIXES, VIDEO_SUFFIXES))
-            remedy = f"; pictures are written by --png {output}" if is_picture else "; videos take --turntable FRAMES"
+            remedy = (
+                f"; pictures are written by --png {output}"
+                if is_picture
+                else "; videos take --turntable FRAMES or --camera-path FILE"
+            )
             _check_output(output, ".exr", instead=remedy if is_picture or is_video else "")
         else:
             _check_output(output, *VIDEO_SUFFIXES)
             check_video(output)
-            if png is not None:
-                raise ValueError("--png: got it beside --turntable, expected one of them")
+            for option, value in (("--png", png), ("--layers", layers or None), ("--camera-path", camera_path)):
+                if value is not None and option != video:
+                    raise ValueError(f"{option}: got it beside {video}, expected one of them")
         if png is not None:
             _check_output(png, *SUFFIXES)
         plain = None if background in ("transparent", "environment") else background
@@ -166,13 +190,16 @@ def render(
         if parsed.visibility.method == AUTO:
             typer.echo(f"auto: {describe(loaded)}")
         start = time.perf_counter()
-        if turntable is not None:
-            write_video(output, _turntable(loaded, turntable, where, exposure, tone, background))
-            typer.echo(f"{output}: {turntable} frames, {time.perf_counter() - start:.2f} s")
+        if video is not None:
+            cameras = path.cameras(loaded.camera) if path is not None else _turntable(loaded, turntable or 1)
+            frames = _frames(loaded, cameras, where, exposure, tone, background)
+            write_video(output, frames, fps=24.0 if path is None else path.fps)
+            typer.echo(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s")
             return
-        image = Renderer(loaded, device=where, progress=True).render()
+        renderer = Renderer(loaded, device=where, progress=True)
+        image = renderer.render()
         seconds = time.perf_counter() - start
-        write_image(output, image)
+        write_image(output, image, layers=renderer.layers().channels() if layers else None)
         typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
         if png is not None:
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
@@ -187,20 +214,25 @@ def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
     return None if background == "transparent" else background
 
 
-def _turntable(
-    scene: Scene, count: int, device: wp.Device, exposure: float | None, tone: str, background: str
-) -> Iterator[Picture]:
-    """Pictures from all around what a camera would frame, by default at the exposure of the first."""
+def _turntable(scene: Scene, count: int) -> list[Camera]:
+    """Cameras all around what a camera would frame."""
     from warpshadow.assets.camera import framed_points
-    from warpshadow.device.progress import progress_bar
-    from warpshadow.pipeline.renderer import Renderer
 
     points = framed_points(scene)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return [scene.camera.turned(360 * number / count, middle) for number in range(count)]
+
+
+def _frames(
+    scene: Scene, cameras: list[Camera], device: wp.Device, exposure: float | None, tone: str, background: str
+) -> Iterator[Picture]:
+    """Pictures from cameras, by default at the exposure of the first."""
+    from warpshadow.device.progress import progress_bar
+    from warpshadow.pipeline.renderer import Renderer
+
     renderer = Renderer(scene, device=device, progress=True)
-    with progress_bar(count, "rendering", "frame") as bar:
-        for number in range(count):
-            camera = scene.camera.turned(360 * number / count, middle)
+    with progress_bar(len(cameras), "rendering", "frame") as bar:
+        for camera in cameras:
             matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44, device=device)
             image = renderer.draw(view=renderer.view(clip_matrices=matrices)).numpy()[0]
             behind = _behind(replace(scene, camera=camera), background)

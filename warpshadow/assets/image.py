@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +63,7 @@ def read_rgb(path: AnyPath, *, part: str | int | None = None) -> np.ndarray:
     return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
 
 
-def write_image(path: AnyPath, pixels: np.ndarray | Picture) -> None:
+def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[str, np.ndarray] | None = None) -> None:
     """Write an image of linear values; the file appears complete or not at all.
 
     Args:
@@ -71,6 +71,8 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture) -> None:
         pixels: Shape [height, width], or [height, width, channel] with 1 (gray), 3 (RGB) or 4 channels: RGB and
             coverage, premultiplied, as :func:`warpshadow.render` returns them. A .png or .jpg file of four channels is
             a :class:`Picture` at its automatic exposure; others keep their values, clipped to [0, 1]. Or a Picture.
+        layers: Further channels of an .exr file by their names, each of shape [height, width]:
+            ``Renderer(scene).layers().channels()``.
 
     Raises:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
@@ -81,6 +83,7 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture) -> None:
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(suffixes)}")
     if isinstance(pixels, Picture):
+        _no_layers(path, layers)
         pixels.write(path)
         return
     pixels = check.pixels("pixels", pixels, expected="linear values [height, width, channel]", error=ImageError)
@@ -90,15 +93,34 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture) -> None:
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] not in (1, 3, 4):
         raise ImageError(f"{path}: got pixels of shape {shape}, expected [height, width] or [height, width, 1, 3 or 4]")
     if path.suffix.lower() != ".exr":
+        _no_layers(path, layers)
         with check.located(str(path), ImageError):
             picture = Picture(pixels, exposure=None if pixels.shape[2] == 4 else 0.0)
         picture.write(path)
         return
+    channels = _checked_layers(layers or {}, pixels)
     try:
         with files.whole(path) as unfinished:
-            _write_exr(unfinished, pixels)
+            _write_exr(unfinished, pixels, channels)
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
+
+
+def _no_layers(path: Path, layers: object) -> None:
+    if layers is not None:
+        raise ImageError(f"{path}: got layers, which only .exr files have")
+
+
+def _checked_layers(layers: Mapping[str, np.ndarray], pixels: np.ndarray) -> dict[str, np.ndarray]:
+    """Further channels as float32, beside those of an image."""
+    channels = {}
+    for name, values in layers.items():
+        if not isinstance(name, str) or not name or name in _CHANNELS[pixels.shape[2]]:
+            raise ImageError(f"layers: got the name {name!r}, expected one that no other channel has")
+        with check.located("layers", ImageError):
+            channels[name] = check.numbers(name, values, expected="an array [height, width]")
+            check.shape(name, channels[name].shape, pixels.shape[:2])
+    return channels
 
 
 def _check_size(width: int, height: int, max_pixels: int) -> None:
@@ -164,12 +186,15 @@ def _find_channels(names: list[str]) -> list[str]:
     )
 
 
-def _write_exr(path: Path, pixels: np.ndarray) -> None:
+_CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
+
+
+def _write_exr(path: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray]) -> None:
     import OpenEXR
 
-    name = {1: "Y", 3: "RGB", 4: "RGBA"}[pixels.shape[2]]
+    name = _CHANNELS[pixels.shape[2]]
     pixels = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels}).write(str(path))
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels, **layers}).write(str(path))
 
 
 # ----------------------------------------------------------------------------------------------- PNG and JPEG

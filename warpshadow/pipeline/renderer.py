@@ -31,6 +31,7 @@ from warpshadow.pipeline.choice_of_receivers import (
 )
 from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.layers import Layers, find_layers
 from warpshadow.pipeline.lighting import Light, LitPoints, joined
 from warpshadow.pipeline.log_sh import LogSH
 from warpshadow.pipeline.node import Call, Clock, Node, Source
@@ -553,6 +554,23 @@ class Renderer:
         with unrecorded():
             images = self.draw(light).numpy().copy()
         return images if self.has_camera_batch else images[0]
+
+    @one_at_a_time
+    def layers(self, view: View | None = None) -> Layers:
+        """Find depth, normals, numbers of bodies and masks: what an image shows beside color.
+
+        Args:
+            view: From :meth:`view`, by default the scene's own.
+
+        Returns:
+            Arrays with a leading dimension of images where a view or cameras were given. Not differentiable:
+            :func:`warpshadow.stages.interpolate.interpolate` makes differentiable ones of a view's fragments.
+        """
+        has_batch = self.has_camera_batch or view is not None
+        camera = self.cameras[0]
+        with unrecorded():
+            layers = find_layers(self._own(view), (camera.width, camera.height), across=self.scene.supersampling)
+        return layers if has_batch else Layers(*(each[0] for each in layers))
 
     # ------------------------------------------------------------------------------------------ what runs
 
