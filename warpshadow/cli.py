@@ -20,7 +20,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.scene.scene import Scene
-from warpshadow.viewer import HOST, PORT, serve
+from warpshadow.viewer import HOST, PORT, FitViewer, serve
 
 app = typer.Typer(
     add_completion=False,
@@ -344,6 +344,11 @@ def fit(
         bool, typer.Option(help="Show target, image and difference in FOLDER/preview.png while the fit runs.")
     ] = True,
     checkpoint_seconds: Annotated[float, typer.Option(help="Time between checkpoints.", min=0.0)] = 10.0,
+    view: Annotated[
+        bool, typer.Option("--view", help="Open a page that shows the fit, and on which it is paused and stopped.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="Port of the page, or the next one that is free.", min=0, max=65535)] = PORT,
+    browser: Annotated[bool, typer.Option(help="Open a browser with --view.")] = True,
     device: Device = "cpu",
 ) -> None:
     """Explain images by what a scene leaves free; run again, it goes on where it was interrupted.
@@ -361,13 +366,20 @@ def fit(
         output.mkdir(exist_ok=True)
         if has_begun:
             typer.echo(f"going on from {output / _CHECKPOINT}")
+        viewer = FitViewer(port=port) if view else None
+        if viewer is not None:
+            typer.echo(viewer.url)
+            viewer.open(browser)
         result = loaded.run(
             device=str(where),
             checkpoint=output / _CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
             preview=output / _PREVIEW if preview else None,
+            view=False if viewer is None else viewer,
             progress=True,
         )
+        if result.reason == "stopped":
+            raise KeyboardInterrupt  # which the page's button stands for
         report = Report(result)
         has_diverged = result.reason not in ("converged", "finished")
         ending = "diverged" if has_diverged else result.reason

@@ -18,6 +18,7 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import write_result
 from warpshadow.inverse.schedule import Stage, deformation_stages, pose_stages
 from warpshadow.inverse.target import Target
+from warpshadow.viewer import FitViewer
 
 __all__ = [
     "Albedo",
@@ -27,6 +28,7 @@ __all__ = [
     "Exposure",
     "Fit",
     "FitFileError",
+    "FitViewer",
     "FitWarning",
     "Free",
     "Light",

@@ -26,8 +26,10 @@ from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage, check_stages
+from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.scene import Scene
+from warpshadow.viewer import FitViewer
 
 WINDOW = 25
 """Iterations over which a loss must fall for its stage to go on."""
@@ -46,7 +48,8 @@ class Result:
         setting: Its scene at the start and its units.
         values: Of what is free, by its name: those of the least loss in the last stage.
         losses: Loss of each iteration before its step, a list for each candidate of each stage.
-        reason: Why the fit ended: "converged", "finished" (all iterations done), or what became non-finite.
+        reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or what
+            became non-finite.
         seconds: Median time of an iteration of the last stage [s].
     """
 
@@ -137,6 +140,7 @@ class _Descent:
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""
         self.model = make_model(self.problem, self.setting, self.stages[self.stage])
+        self.images: torch.Tensor | None = None  # of the last iteration, if it took any
         self._begin_run(self.candidates[0])
         self.losses.append([])
 
@@ -240,6 +244,10 @@ class _Descent:
             return best._replace(failure=str(error))
         return _Run(last, _copied(self.values), None) if last < best.loss else best
 
+    def best_so_far(self) -> dict[str, Values]:
+        """The best values of the stage that it is in."""
+        return min([*self.ended, self._ended_run()], key=lambda run: run.loss).best
+
     def _step(self) -> None:
         """Evaluate the loss and take a step."""
         stage = self.stages[self.stage]
@@ -255,6 +263,7 @@ class _Descent:
                 if not self.losses[0] and not evaluated:
                     raise  # what was wrong from the beginning
                 raise _Diverged(str(error)) from error
+            self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
             _check_finite({f"the gradient of {name}": tensor.grad for name, tensor in self.tensors.items()})
@@ -304,6 +313,7 @@ def fit(
     checkpoint_seconds: float = 10.0,
     preview: AnyPath | None = None,
     preview_seconds: float = 2.0,
+    view: bool | FitViewer = False,
     progress: bool = True,
 ) -> Result:
     """Fit what a problem leaves free.
@@ -321,6 +331,9 @@ def fit(
         checkpoint_seconds: Time between checkpoints [s].
         preview: PNG that shows targets, images and their difference while the fit runs.
         preview_seconds: Time between previews [s].
+        view: Open a page in the browser that shows targets, images, their difference and the losses, and on which the
+            fit can be paused and stopped; it is closed when the fit ends. Or a :class:`FitViewer`, which stays open. A
+            fit that was stopped goes on from its checkpoint.
         progress: Show progress, that of sphere fits included.
 
     Returns:
@@ -345,17 +358,21 @@ def fit(
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")
-    with checkpoints.alone(checkpoint):
+    with checkpoints.alone(checkpoint), watching(view, progress=progress) as watch:
         descent = _Descent(problem, stages, optimizer, tolerance, seed, where, progress)
-        durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress)
-    if all(run.failure for run in descent.ended):
+        durations = _descend(descent, checkpoint, checkpoint_seconds, preview, preview_seconds, progress, watch)
+        reason = descent.reason or "stopped"
+        if watch is not None:
+            watch.end(descent, reason)
+    if descent.reason is not None and all(run.failure for run in descent.ended):
         warnings.warn(
             f"the fit stopped in stage {descent.stage + 1}: {descent.reason}; the best values before it are kept",
             FitWarning,
             stacklevel=2,
         )
     seconds = statistics.median(durations) if durations else math.nan
-    return Result(problem, descent.setting, descent.best, descent.losses, descent.reason or "", seconds)
+    values = descent.best if descent.reason else descent.best_so_far()
+    return Result(problem, descent.setting, values, descent.losses, reason, seconds)
 
 
 def _descend(
@@ -365,8 +382,9 @@ def _descend(
     preview: AnyPath | None,
     preview_seconds: float,
     progress: bool,
+    watch: Watch | None,
 ) -> list[float]:
-    """Go on from a checkpoint, to the end; returns the times of the last iterations [s]."""
+    """Go on from a checkpoint, to the end or until it is stopped; returns the times of the last iterations [s]."""
     state = None if checkpoint is None else checkpoints.load(checkpoint)
     if state is None:
         descent.begin_stage()
@@ -396,6 +414,8 @@ def _descend(
             bar.set_description_str("fitting", refresh=False)
             bar.set_postfix_str(f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}", refresh=False)
             bar.update()
+            if watch is not None and not watch.goes_on(descent, save):
+                break
             start = time.perf_counter()
     save()
     return durations

@@ -11,9 +11,21 @@ from warpshadow.check import AnyPath
 
 
 def write_preview(path: AnyPath, targets: torch.Tensor, images: torch.Tensor) -> None:
-    """Write a picture of targets, images and how they differ (gray is alike), a row for each view."""
+    """Write a picture of targets, images and how they differ; see :func:`side_by_side`."""
+    write_image(path, side_by_side(targets, images))
+
+
+def side_by_side(targets: torch.Tensor, images: torch.Tensor) -> np.ndarray:
+    """Targets, images and how they differ (gray is alike), a row for each view: linear RGB of a picture, 0 to 1.
+
+    Args:
+        targets, images: Linear RGB, [view, height, width, 3 or more].
+
+    Returns:
+        Shape [view · height, 3 · width, 3].
+    """
     wanted, got = targets[..., :3].cpu().numpy(), images[..., :3].cpu().numpy()
     white = 2.0 ** -auto_exposure(wanted)
     difference = srgb_to_linear(np.clip(0.5 + 0.5 * (got - wanted) / white, 0, 1))  # in steps that look even
     parts = zip(wanted / white, got / white, difference, strict=True)
-    write_image(path, np.concatenate([np.concatenate(view, axis=1) for view in parts], axis=0))
+    return np.concatenate([np.concatenate(view, axis=1) for view in parts], axis=0)

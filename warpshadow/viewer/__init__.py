@@ -1,5 +1,5 @@
-"""A viewer in the browser: turn a scene under its light with the mouse (README.md)."""
+"""A viewer in the browser: turn a scene under its light with the mouse, and watch a fit (README.md)."""
 
-from warpshadow.viewer.viewing import HOST, PORT, Viewer, serve, view
+from warpshadow.viewer.viewing import HOST, PORT, FitViewer, Viewer, serve, view
 
-__all__ = ["HOST", "PORT", "Viewer", "serve", "view"]
+__all__ = ["HOST", "PORT", "FitViewer", "Viewer", "serve", "view"]

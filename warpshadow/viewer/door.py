@@ -7,6 +7,10 @@ uses its private attributes; tests/viewer/test_site.py notices if they change.
 
 from __future__ import annotations
 
+import contextlib
+import io
+import socket
+import warnings
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,25 +18,45 @@ from urllib.parse import urlsplit
 import viser
 from viser import _messages as messages
 
+from warpshadow import check
+
 OWN_NAMES = ("localhost", "127.0.0.1", "::1")
 """What only this machine calls itself."""
 
 
 class Server(viser.ViserServer):
-    """viser's server without tunnels, uploads and pages of others."""
+    """viser's server without tunnels, uploads and pages of others.
+
+    Args:
+        host: Address to serve at; others than this machine's own let everybody in who can reach it.
+        port: Port, or the next that is free.
+
+    Attributes:
+        url: Where its page is.
+    """
 
     def __init__(self, host: str, port: int):
-        super().__init__(host=host, port=port, label="warpshadow", verbose=False)
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a page may close at any time
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
+            super().__init__(host=host, port=port, label="warpshadow", verbose=False)
+        name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
+        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.get_port()}"
         is_local = host in OWN_NAMES
         self._websock_server.on_client_connect(_guard(self, is_local))
         self._refuse_uploads(self._websock_server)
+        self.on_client_connect(self._refuse_uploads_of)
+        self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+
+    def close(self) -> None:
+        """Let all pages go, and serve no more."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Open no tunnel."""
         return None
 
-    def refuse_uploads_of(self, client: viser.ClientHandle) -> None:
-        """Take no files from a client."""
+    async def _refuse_uploads_of(self, client: viser.ClientHandle) -> None:
         self._refuse_uploads(client._websock_connection)
 
     @staticmethod
@@ -65,3 +89,22 @@ def is_own(origin: str | None, host: str, *, is_local: bool) -> bool:
     if is_local and urlsplit(f"//{host}").hostname not in OWN_NAMES:
         return False
     return origin is None or urlsplit(origin).netloc == host
+
+
+def check_address(host: object, port: object) -> None:
+    """Raise ValueError unless one can serve there; warn where others can come in."""
+    if check.whole("port", port, least=0) > 65535:
+        raise ValueError(f"port: got {port}, expected at most 65535")
+    expected = "an address or a name of this machine, such as '127.0.0.1', or '0.0.0.0' for all that it has"
+    check.instance("host", host, str, expected)
+    assert isinstance(host, str)
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()  # type: ignore[arg-type]
+    except (OSError, UnicodeError) as cause:
+        raise ValueError(f"host: got {host!r} ({cause}), expected {expected}") from cause
+    if host not in OWN_NAMES:
+        warnings.warn(
+            f"host: got {host!r}: everybody who can reach this address sees the scene and can change what is shown",
+            stacklevel=4,
+        )

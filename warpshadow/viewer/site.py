@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import html
-import io
-import socket
 import time
-import warnings
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,10 +12,9 @@ import numpy as np
 import viser
 import warp as wp
 
-from warpshadow import check
 from warpshadow.scene.scene import AUTO, Scene
 from warpshadow.tuning.tune import resolved
-from warpshadow.viewer.door import OWN_NAMES, Server
+from warpshadow.viewer.door import Server, check_address
 from warpshadow.viewer.look import Look
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PageCamera, rotation, upward
@@ -57,18 +53,14 @@ class Site:
         progress: bool = True,
         path: Path | None = None,
     ):
-        _check_address(host, port)
+        check_address(host, port)
         if scene.visibility.method == AUTO:
             scene = resolved(scene, device=device, progress=progress)
         self.painter = Painter(scene, device=device, progress=progress)
         self.loop = Loop(self.painter.paint, Look.of(scene, self.painter.natural_stops()))
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a page may close at any time
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
-            self._server = Server(host, port)
-        name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
-        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self._server.get_port()}"
+        self._server = Server(host, port)
+        self.url = self._server.url
         self._start_where_the_scene_looks()
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._panel = Panel(self._server, self.loop, self.painter, path)
         self._pages: dict[int, _ViserPage] = {}
         self._server.on_client_connect(self._let_in)
@@ -77,8 +69,7 @@ class Site:
     def close(self) -> None:
         """Close all pages and the server."""
         self.loop.close()
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        self._server.close()
 
     def _start_where_the_scene_looks(self) -> None:
         scene, scale = self.painter.scene, self.painter.page_scale
@@ -95,7 +86,6 @@ class Site:
         first.fov = float(np.radians(page.fov_y))
 
     async def _let_in(self, client: viser.ClientHandle) -> None:
-        self._server.refuse_uploads_of(client)
         page = self._pages[client.client_id] = _ViserPage(client)
         self.loop.join(client.client_id, page)
         self._moved(client)
@@ -179,22 +169,3 @@ class _ViserPage:
 
     def _write(self, content: str) -> None:
         self._status.content = f'<div style="padding:0.4em 1em;font-size:0.8em;line-height:1.4">{content}</div>'
-
-
-def _check_address(host: object, port: object) -> None:
-    """Raise ValueError unless one can serve there; warn where others can come in."""
-    if check.whole("port", port, least=0) > 65535:
-        raise ValueError(f"port: got {port}, expected at most 65535")
-    expected = "an address or a name of this machine, such as '127.0.0.1', or '0.0.0.0' for all that it has"
-    check.instance("host", host, str, expected)
-    assert isinstance(host, str)
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        socket.create_server(address[:2], family=family).close()  # type: ignore[arg-type]
-    except (OSError, UnicodeError) as cause:
-        raise ValueError(f"host: got {host!r} ({cause}), expected {expected}") from cause
-    if host not in OWN_NAMES:
-        warnings.warn(
-            f"host: got {host!r}: everybody who can reach this address sees the scene and can change what is shown",
-            stacklevel=4,
-        )

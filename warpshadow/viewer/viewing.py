@@ -7,7 +7,7 @@ import contextlib
 import html
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import warp as wp
@@ -56,6 +56,39 @@ class Viewer:
 
     def __repr__(self) -> str:
         return f"Viewer({self.url})"
+
+
+class FitViewer(Viewer):
+    """The page of a fit, which shows pictures and losses, and pauses and stops it; a notebook shows it.
+
+    Needs viser: ``pip install "warpshadow[viewer]"``.
+
+    Args:
+        host: Address to serve at. The default is for this machine alone; at others everybody who can reach them sees
+            the fit, and can stop it.
+        port: Port, or the next one that is free.
+
+    Raises:
+        ImportError: without viser.
+    """
+
+    def __init__(self, *, host: str = HOST, port: int = PORT):
+        with _viser():
+            from warpshadow.viewer.fit_page import FitPage
+        self.page = FitPage(host, port)
+        super().__init__(self.page.url, self.page.close)
+
+    def __repr__(self) -> str:
+        return f"FitViewer({self.url})"
+
+
+@contextlib.contextmanager
+def _viser() -> Iterator[None]:
+    """Say what to install where an import fails."""
+    try:
+        yield
+    except ImportError as cause:
+        raise ImportError(f'the viewer needs viser ({cause}); pip install "warpshadow[viewer]"') from cause
 
 
 def view(
@@ -107,9 +140,7 @@ def serve(
         scene, host, port, device, progress: As there.
         path: The scene's file, which is saved with what was changed in it; None where it has none.
     """
-    try:
+    with _viser():
         from warpshadow.viewer.site import Site
-    except ImportError as cause:
-        raise ImportError(f'the viewer needs viser ({cause}); pip install "warpshadow[viewer]"') from cause
     site = Site(scene, host=host, port=port, device=device, progress=progress, path=path)
     return Viewer(site.url, site.close)

@@ -1,0 +1,160 @@
+"""A fit in the browser: what its page shows while it runs, and that it does what the page asks for.
+
+All of it runs in the fit's own thread, between two iterations: pictures are made of images that the fit has anyway, as
+often as a small part of its time allows, and only while a browser looks.
+"""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from warpshadow import check
+from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.model import Model
+from warpshadow.inverse.preview import side_by_side
+from warpshadow.inverse.schedule import Stage
+from warpshadow.viewer import FitViewer
+from warpshadow.viewer.painter import picture
+
+_SECONDS = 0.5
+"""Between two pictures, at least."""
+
+_SHARE = 0.02
+"""Of the fit's time that pictures may take; encoding and sending in other threads come on top."""
+
+_ACROSS = 768
+"""Pixels of a picture, about."""
+
+
+class Watched(Protocol):
+    """What is shown of a fit under way."""
+
+    stages: tuple[Stage, ...]
+    stage: int
+    losses: list[list[float]]
+    model: Model
+    values: dict[str, Values]
+    images: torch.Tensor | None  # of the last iteration, if it took any
+
+
+class Watch:
+    """Shows a fit on a page, and does what the page asks for.
+
+    Args:
+        viewer: Has the page.
+    """
+
+    def __init__(self, viewer: FitViewer):
+        self._page = viewer.page
+        self._next = 0.0  # time of the next picture
+        self._has_failed = False
+
+    def goes_on(self, fit: Watched, save: Callable[[], None]) -> bool:
+        """Show how far a fit is, wait while it is to pause, and say whether it goes on.
+
+        Args:
+            fit: The fit.
+            save: Writes a checkpoint.
+        """
+        page = self._page
+        if page.pauses:
+            save()
+            self._show(fit, "waits")
+            while page.pauses:
+                page.wait(0.5)
+        if time.perf_counter() >= self._next:
+            self._next = time.perf_counter() + _SECONDS
+            if page.is_watched:
+                self._show(fit, "runs")
+        return not page.stops
+
+    def end(self, fit: Watched, reason: str) -> None:
+        """Show how a fit ended."""
+        self._show(fit, reason)
+        with self._kept_from_the_fit():
+            self._page.end(f"{reason} after {sum(map(len, fit.losses))} iterations")
+
+    def _show(self, fit: Watched, note: str) -> None:
+        start = time.perf_counter()
+        with self._kept_from_the_fit():
+            words = [note, f"stage {fit.stage + 1} of {len(fit.stages)}", f"{sum(map(len, fit.losses))} iterations"]
+            last = next((run[-1] for run in reversed(fit.losses) if run), None)
+            words += [] if last is None else [f"loss {last:.3e}"]
+            losses = by_stage(fit.losses, fit.stages)
+            self._page.show(" · ".join(words), losses, fit.stage, fit.stages[fit.stage].candidates)
+            self._page.show_pictures(pictures(fit))
+            self._page.fail(None)
+        now = time.perf_counter()
+        self._next = now + max(_SECONDS, (now - start) / _SHARE)
+
+    @contextlib.contextmanager
+    def _kept_from_the_fit(self) -> Iterator[None]:
+        """Say on the page what goes wrong there, and once in a warning, and leave the fit alone."""
+        try:
+            yield
+        except Exception as error:
+            message = f"{type(error).__name__}: {error}"
+            if not self._has_failed:
+                self._has_failed = True
+                warnings.warn(f"the view of the fit failed ({message}); the fit goes on", stacklevel=2)
+            with contextlib.suppress(Exception):
+                self._page.fail(message)
+
+
+def by_stage(losses: Sequence[list[float]], stages: Sequence[Stage]) -> list[list[list[float]]]:
+    """Losses of a fit's descents, which stand one after another, for each stage."""
+    runs = iter(losses)
+    return [list(islice(runs, stage.candidates)) for stage in stages]
+
+
+def pictures(fit: Watched) -> np.ndarray:
+    """Target, image and difference, a row for each view: uint8 of shape [height, width, 3], of some 768 columns."""
+    images = fit.images
+    if images is None:
+        with torch.no_grad():
+            images = fit.model.images(fit.values)
+    width = 3 * images.shape[2]
+    step, factor = max(1, width // _ACROSS), max(1, _ACROSS // width)
+    shown = side_by_side(fit.model.targets[:, ::step, ::step], images[:, ::step, ::step])
+    shown = shown.repeat(factor, axis=0).repeat(factor, axis=1).astype(np.float32)
+    opaque = np.ones((*shown.shape[:2], 1), np.float32)
+    return picture(np.concatenate([shown, opaque], axis=-1), 0.0, np.zeros(3))
+
+
+@contextlib.contextmanager
+def watching(view: bool | FitViewer, *, progress: bool) -> Iterator[Watch | None]:
+    """Watch a fit if that is asked for; a page that was made here is closed at the end.
+
+    Args:
+        view: Whether to open a page, or the one to show the fit on.
+        progress: Say where the page is.
+    """
+    if isinstance(view, FitViewer):
+        yield Watch(view)
+        return
+    check.flag("view", view)
+    if not view:
+        yield None
+        return
+    viewer = FitViewer()
+    try:
+        if progress:
+            print(viewer.url)
+        if hasattr(builtins, "__IPYTHON__"):
+            from IPython.display import display
+
+            display(viewer)
+        else:
+            viewer.open()
+        yield Watch(viewer)
+    finally:
+        viewer.close()
