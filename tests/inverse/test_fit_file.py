@@ -80,6 +80,7 @@ def test_everything_that_can_be_free_is_read(load, tmp_path):
         text + "camera = {focal = true}\n[[free.albedo]]\nbody = 0\nper_vertex = true\n"
         '[[free.pose]]\nbody = 0\nrotation = "6d"\nscale = true\n[[free.pose]]\nbody = 1\n'
         "[[free.texture]]\nbody = 1\nsize = [16, 8]\nsmoothness = 1\n"
+        "total_variation = 0.1\npalette = 2\ncolors = 3\n"
         "[[free.deformation]]\nbody = 0\nrigidity = 3\ncount = 5\n[[free.radii]]\nbody = 0\npersistence = 0.5\n"
     )
     assert fit.problem.free == (
@@ -87,7 +88,7 @@ def test_everything_that_can_be_free_is_read(load, tmp_path):
         inverse.Exposure(),
         inverse.CameraPose(focal=True),
         inverse.Albedo(0, per_vertex=True),
-        inverse.Texture(1, size=(16, 8), smoothness=1.0),
+        inverse.Texture(1, (16, 8), smoothness=1.0, total_variation=0.1, palette=2.0, colors=3),
         inverse.Pose(0, rotation="6d", scale=True),
         inverse.Pose(1),
         inverse.Deformation(0, rigidity=3.0, count=5),
@@ -310,6 +311,9 @@ NOT_TRUE_OR_FALSE = ("1", '"yes"', "[true]")
         ("[[free.pose]]\nbody = 0", "scale", NOT_TRUE_OR_FALSE),
         ("[[free.texture]]\nbody = 0", "size", ("3", "[3]", "[3, 4.5]", "[true, 3]")),
         ("[[free.texture]]\nbody = 0", "smoothness", (*NOT_A_NUMBER, "-1")),
+        ("[[free.texture]]\nbody = 0", "total_variation", (*NOT_A_NUMBER, "-1")),
+        ("[[free.texture]]\nbody = 0", "palette", (*NOT_A_NUMBER, "-1")),
+        ("[[free.texture]]\nbody = 0", "colors", (*NOT_WHOLE, "1")),
         ("[[free.deformation]]", "body", NOT_WHOLE),
     ],
 )

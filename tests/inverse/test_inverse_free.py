@@ -275,6 +275,66 @@ def test_a_texture_starts_from_a_color_and_at_another_size(scene):
     assert np.allclose(halved, ground.texture.reshape(3, 2, 5, 3).mean(axis=1), atol=1e-6)
 
 
+def energy_of(texture: Texture, texels: np.ndarray, **values: np.ndarray) -> float:
+    tensors = {key: torch.from_numpy(np.asarray(value)) for key, value in {"texels": texels, **values}.items()}
+    energy = texture.energy(tensors, None)
+    return 0.0 if energy is None else float(energy)
+
+
+def test_variation_is_the_length_of_edges_times_their_height_however_soft():
+    """A step, and the same rise over five texels; squares of differences, which hate edges, would tell them apart."""
+    step, ramp = np.zeros((6, 12, 3)), np.zeros((6, 12, 3))
+    step[:, 6:] = (0.3, 0.4, 0.0)
+    ramp[:] = np.clip((np.arange(12)[:, None] - 3) / 5, 0, 1) * (0.3, 0.4, 0.0)
+    for texels in (step, ramp, step.transpose(1, 0, 2)):
+        assert energy_of(Texture(GROUND, total_variation=2.0), texels) == pytest.approx(2 * 6 * 0.5 / 72, rel=0.02)
+    assert energy_of(Texture(GROUND, smoothness=1.0), step) > 4 * energy_of(Texture(GROUND, smoothness=1.0), ramp)
+    assert energy_of(Texture(GROUND, total_variation=2.0), step[:1]) > 0  # of a single row, too
+
+
+def test_a_palette_asks_for_the_distance_to_the_nearest_color():
+    rng = np.random.default_rng(3)
+    texels, colors = rng.uniform(0, 1, (5, 7, 3)), rng.uniform(0, 1, (3, 3))
+    squares = [min(((texel - color) ** 2).sum() for color in colors) for texel in texels.reshape(-1, 3)]
+    assert energy_of(Texture(GROUND, palette=2.0, colors=3), texels, palette=colors) == pytest.approx(
+        2 * np.mean(squares), rel=1e-6
+    )
+
+
+def test_a_palette_starts_as_the_texture_has_it_and_as_grays_where_that_is_plain(scene):
+    ball, ground = scene.bodies
+    tiles = np.where(np.indices((8, 8)).sum(axis=0)[..., None] % 2, [0.9, 0.8, 0.7], [0.1, 0.0, 0.1]).astype(np.float32)
+    for texture, expected in ((tiles, [[0.1, 0, 0.1], [0.9, 0.8, 0.7]]), (None, [[0.25] * 3, [0.75] * 3])):
+        setting = setting_of(
+            dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=texture, albedo=(0.5,) * 3)))
+        )
+        start = Texture(GROUND, palette=1.0).start(setting)
+        assert np.allclose(start["palette"].numpy(), expected, atol=1e-6)
+        assert set(Texture(GROUND).start(setting)) == {"texels"}
+
+
+@pytest.mark.parametrize(
+    ("options", "tolerance"), [({"palette": 1.0}, 0.002), ({"total_variation": 0.05}, 0.015), ({}, None)]
+)
+def test_what_textures_are_likely_to_be_tells_a_shadow_from_paint(options, tolerance):
+    """Two tiles that reach into a shadow: it darkens as they say, where a texture of any kind is as good without."""
+    tiles = np.where(np.arange(12) < 6, 0.2, 0.8)[:, None]
+    is_shaded = torch.arange(12)[:, None, None] < 6
+    seen = torch.where(is_shaded, 0.85, 1.0) * torch.from_numpy(tiles)
+    texture = Texture(GROUND, **options)
+    values = {"texels": torch.full((12, 12, 3), 0.5, dtype=torch.float64), "palette": torch.tensor([[0.25], [0.75]])}
+    shadow = torch.ones((), dtype=torch.float64)
+    leaves = [leaf.requires_grad_() for leaf in (*values.values(), shadow)]
+    optimizer = torch.optim.Adam(leaves, lr=0.02)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss = (values["texels"] * torch.where(is_shaded, shadow, 1.0) - seen).square().sum(dim=-1).mean()
+        (loss + (texture.energy(values, None) or 0)).backward()
+        optimizer.step()
+    error = abs(shadow.item() - 0.85)
+    assert error > 0.03 if tolerance is None else error < tolerance
+
+
 def test_a_texture_is_found_where_light_bounces(scene):
     problem, setting, values = prepared(dataclasses.replace(scene, bounces=1), [Texture(GROUND)])
     found = problem.found(values, setting).scene
@@ -310,6 +370,8 @@ GRADIENTS = {
     "albedo": ([Albedo(BALL)], 0.05),
     "albedo of vertices": ([Albedo(BALL, per_vertex=True)], 0.05),
     "texture": ([Texture(GROUND, smoothness=1.0)], 0.05),
+    "texture of few edges": ([Texture(GROUND, total_variation=1.0)], 0.001),
+    "texture of few colors": ([Texture(GROUND, palette=1.0, colors=3)], 0.001),
     "pose": ([Pose(BALL, scale=True)], 0.005),
     "pose by quaternion": ([Pose(BALL, "quaternion")], 0.005),
     "pose by columns": ([Pose(BALL, "6d")], 0.005),

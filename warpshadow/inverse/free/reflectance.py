@@ -15,6 +15,11 @@ from warpshadow.pipeline.renderer import Renderer
 from warpshadow.scene.scene import Scene, Visibility
 from warpshadow.stages.textures.seen import fill_unseen
 
+_SHORT = 1e-3
+"""Length of a difference of reflectances below which its variation is smooth: lengths have no derivative at 0."""
+_PLAIN = 1e-3
+"""Deviation below which texels are of one color."""
+
 
 @dataclass(frozen=True)
 class Albedo(FreeOfBody):
@@ -67,16 +72,24 @@ class Albedo(FreeOfBody):
 class Texture(FreeOfBody):
     """The reflectance of a body as an image, which needs uvs.
 
+    A texture that may be anything explains every shadow. What it is likely to be is said by three weights:
+
     Args:
         body: The body, its number or name.
         size: Height and width [texels]; by default those of the body's texture, or 256 × 256.
-        smoothness: Weight of the mean square of differences between neighboring texels.
+        smoothness: Weight of the mean square of differences between neighboring texels: no edges.
+        total_variation: Weight of the mean length of these differences [Rudin et al. 1992]: few edges, and sharp ones.
+        palette: Weight of the mean square distance of texels to the nearest of a few colors, which are free, too.
+        colors: Number of these colors.
     """
 
     key: ClassVar[str] = "texture"
 
     size: tuple[int, int] | None = None
     smoothness: float = 0.0
+    total_variation: float = 0.0
+    palette: float = 0.0
+    colors: int = 2
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,7 +98,9 @@ class Texture(FreeOfBody):
             if not is_pair or not all(check.is_integer(count) and count > 0 for count in self.size):
                 raise ValueError(f"size: got {self.size!r}, expected height and width in whole texels, (256, 256)")
             object.__setattr__(self, "size", tuple(self.size))
-        check.nonnegative("smoothness", self.smoothness)
+        for name in ("smoothness", "total_variation", "palette"):
+            check.nonnegative(name, getattr(self, name))
+        check.whole("colors", self.colors, least=2)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that cannot have a texture."""
@@ -104,23 +119,42 @@ class Texture(FreeOfBody):
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
         planes = setting.tensor(image).permute(2, 0, 1)[None]
         mode = "area" if size[0] <= image.shape[0] else "bilinear"
-        return {"texels": torch.nn.functional.interpolate(planes, size, mode=mode)[0].permute(1, 2, 0).contiguous()}
+        texels = torch.nn.functional.interpolate(planes, size, mode=mode)[0].permute(1, 2, 0).contiguous()
+        return {"texels": texels} | ({"palette": self._first_colors(texels)} if self.palette else {})
+
+    def _first_colors(self, texels: torch.Tensor) -> torch.Tensor:
+        """Colors of a palette, [color, 3]: quantiles of the texels by brightness; grays where those are one."""
+        flat = texels.reshape(-1, 3)
+        shares = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
+        if flat.std(dim=0).max() < _PLAIN:
+            return shares[:, None].expand(-1, 3).contiguous()
+        ranked = flat[flat.sum(dim=1).argsort()]
+        return ranked[(shares * len(flat)).long()]
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Cover the body."""
         world.textures[self.number] = values["texels"]
 
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Differences of neighbors."""
-        if not self.smoothness:
-            return None
+        """What is unlikely of a texture."""
         texels = values["texels"]
-        down, across = (texels.diff(dim=dim).square().sum() for dim in (0, 1))  # sums: a single row has no mean down
-        return self.smoothness * (down + across) / texels.numel()
+        energies = []
+        if self.smoothness or self.total_variation:
+            squares = [texels.diff(dim=dim).square() for dim in (0, 1)]
+        if self.smoothness:  # sums: a single row has no mean down
+            energies.append(self.smoothness * (squares[0].sum() + squares[1].sum()) / texels.numel())
+        if self.total_variation:
+            lengths = [(square.sum(dim=-1) + _SHORT**2).sqrt() - _SHORT for square in squares]
+            energies.append(self.total_variation * (lengths[0].sum() + lengths[1].sum()) / texels[..., 0].numel())
+        if self.palette:
+            gaps = (texels[:, :, None] - values["palette"]).square().sum(dim=-1)
+            energies.append(self.palette * gaps.min(dim=-1).values.mean())
+        return torch.stack(energies).sum() if energies else None
 
     def project(self, values: Values) -> None:
         """Reflectances are in [0, 1]."""
-        values["texels"].clamp_(0, 1)
+        for colors in values.values():
+            colors.clamp_(0, 1)
 
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
