@@ -9,7 +9,8 @@ import warp as wp
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.maths.directions import fibonacci
+from warpshadow.device.batch import expand_rows
+from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Seen
@@ -103,9 +104,21 @@ class Directional(SphereMethod):
         if flats is None or past_solid is None or not points.size:
             return seen
         facing = group.normals if group.kept_rows is None else None
-        given = points, past_solid, flats.frames, flats.flats, taken.directions
-        past_all = passing_flats(*given, facing=facing, skip=flats.skip)
-        return seen._replace(past_all=past_all, past_solid=past_solid)
+
+        def past(transmittance: wp.array, directions: np.ndarray, radius: float | None = None) -> wp.array:
+            given = points, transmittance, flats.frames, flats.flats, directions
+            return passing_flats(*given, radius=radius, facing=facing, skip=flats.skip)
+
+        if taken.narrow is None:
+            return seen._replace(past_all=past(past_solid, taken.directions), past_solid=past_solid)
+        directions, places, scale = taken.narrow
+        all_pass = wp.full((*points.shape, len(places)), 1.0, wp.float32, device=points.device)
+        narrow_pass = wp.full((*points.shape, len(directions)), 1.0, wp.float32, device=points.device)
+        past_narrow = past(narrow_pass, directions, scale * cell_radius(len(directions)))
+        shares = put_narrow(past(all_pass, taken.directions), past_narrow, places)
+        return seen._replace(
+            past_all=multiply_transmittances(expand_rows(past_solid, len(shares)), shares), past_solid=past_solid
+        )
 
     def _past_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""

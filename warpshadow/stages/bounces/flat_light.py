@@ -22,6 +22,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.flats.cells import (
     FlatScene,
     Met,
@@ -425,7 +426,7 @@ def flat_light(
     texels = multiply(flats.texels_of_patches, radiosity)
     scratch = Scratch((_ROWS * flats.count,), wp.vec3)
     variables = [points, normals, transmittance, frames, texels]
-    scene, cells = flat_scene(flats, len(directions), skip), constant(directions, wp.vec3, points.device)
+    scene, cells = flat_scene(flats, cell_radius(len(directions)), skip), constant(directions, wp.vec3, points.device)
     inputs = [*variables, scene, cells]
     return differentiable(
         lambda light: launch(

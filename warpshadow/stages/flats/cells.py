@@ -23,7 +23,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.flats.prepared import FlatGrid, Flats
 
 
@@ -57,12 +56,12 @@ def check_flats(
         check.choice("skip", skip, range(flats.count))
 
 
-def flat_scene(flats: Flats, cell_count: int, skip: int | None) -> FlatScene:
-    """Flats as seen in so many cells by receivers that are part of one, or of none."""
+def flat_scene(flats: Flats, radius: float, skip: int | None) -> FlatScene:
+    """Flats as seen in cells of a radius [rad] by receivers that are part of one, or of none."""
     scene = FlatScene()
     scene.grids, scene.levels, scene.level_scales = flats.grids, flats.levels, flats.level_scales
     scene.covered, scene.skip = flats.covered, -1 if skip is None else skip
-    scene.radius = cell_radius(cell_count)
+    scene.radius = radius
     scene.per_radius = 1 / scene.radius
     return scene
 

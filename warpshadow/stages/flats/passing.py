@@ -13,6 +13,7 @@ from warpshadow.device.batch import common_batch, expand, expand_rows, instance_
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
+from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.flats.cells import (
     FlatScene,
     Met,
@@ -201,6 +202,7 @@ def passing_flats(
     flats: Flats,
     directions: np.ndarray,
     *,
+    radius: float | None = None,
     facing: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
@@ -212,6 +214,7 @@ def passing_flats(
         frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`Flats.frames`; the batch may be 1.
         flats: The flats.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
+        radius: Of the cells [rad], how soft edges and horizons are; by default that of so many even ones.
         facing: Normals, vec3 of shape [batch, receiver]: cells below the horizon then keep what they have.
         skip: Number of the flat that the receivers are part of, which blocks none of their light; None for none.
 
@@ -226,7 +229,8 @@ def passing_flats(
     if not named:
         return transmittance
     points, passing = expand(points, instances), expand_rows(transmittance, instances)
-    scene, cells = flat_scene(flats, len(directions), skip), constant(directions, wp.vec3, points.device)
+    scene = flat_scene(flats, cell_radius(len(directions)) if radius is None else radius, skip)
+    cells = constant(directions, wp.vec3, points.device)
     for f in named:
         passing = _past(points, facing, passing, frames, scene, f, cells)
     return passing
