@@ -265,9 +265,9 @@ def test_light_of_flats(double, flats, check):
 
 def test_what_passes_flats(double, flats, check):
     directions = double("maths.directions").fibonacci(16)
-    passing_flats = double("stages.flats.passing").passing_flats
+    passing = double("stages.flats.passing")
     given = (wp.vec3d, flat_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    check(lambda *scene: passing_flats(*scene, flats, directions), *given)
+    check(lambda p, t, f: passing.past_coverage(t, passing.flat_coverage(p, f, flats, directions)), *given)
 
 
 def test_what_patches_show(double, flats, check, device):

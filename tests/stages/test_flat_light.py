@@ -9,13 +9,17 @@ from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.bounces.flat_light import flat_light
 from warpshadow.stages.bounces.patches import find_flat_patches
-from warpshadow.stages.flats.passing import passing_flats
+from warpshadow.stages.flats.passing import flat_coverage, past_coverage
 from warpshadow.stages.flats.prepared import FlatBody, Flats
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 FLOAT32 = 2e-5
 DIRECTIONS = fibonacci(64)
+
+
+def passing_flats(points, transmittance, frames, flats, directions, **options):
+    return past_coverage(transmittance, flat_coverage(points, frames, flats, directions, **options))
 
 
 # ---------------------------------------------------------------------------------------------------- the twin
@@ -115,13 +119,13 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
 
 
 def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=None):
-    radius, result = cell_radius(len(directions)), np.array(transmittance, float)
+    radius, covered = cell_radius(len(directions)), np.zeros(np.shape(transmittance))
     black = [np.zeros((2, *grid.covered.shape, 3)) for grid in grids]
     for receiver, point in enumerate(points):
         for q, omega in enumerate(directions):
             for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip):
-                result[receiver, q] *= 1 - h * blocks[f]
-    return result
+                covered[receiver, q] += h * blocks[f]
+    return transmittance * np.maximum(0, 1 - covered)
 
 
 # ---------------------------------------------------------------------------------------------------- scenes
@@ -429,7 +433,7 @@ def test_no_other_flat_leaves_all_as_it_is(device):
     setting = Setting(device, names=("ground",))
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     frames = setting.flats.frames(vertices)
-    assert passing_flats(points, transmittance, frames, setting.flats, DIRECTIONS, skip=0) is transmittance
+    assert flat_coverage(points, frames, setting.flats, DIRECTIONS, skip=0) is None
     light = flat_light(points, normals, transmittance, frames, radiosity, setting.flats, DIRECTIONS, skip=0)
     assert not light.numpy().any()
 

@@ -9,7 +9,6 @@ import warp as wp
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.batch import expand_rows
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
@@ -19,7 +18,7 @@ from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import Blocking, OwnLookup
 from warpshadow.pipeline.static import Rows, Static
 from warpshadow.spheres import Spheres
-from warpshadow.stages.flats.passing import passing_flats
+from warpshadow.stages.flats.passing import flat_coverage, past_coverage
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
@@ -104,21 +103,16 @@ class Directional(SphereMethod):
         if flats is None or past_solid is None or not points.size:
             return seen
         facing = group.normals if group.kept_rows is None else None
-
-        def past(transmittance: wp.array, directions: np.ndarray, radius: float | None = None) -> wp.array:
-            given = points, transmittance, flats.frames, flats.flats, directions
-            return passing_flats(*given, radius=radius, facing=facing, skip=flats.skip)
-
-        if taken.narrow is None:
-            return seen._replace(past_all=past(past_solid, taken.directions), past_solid=past_solid)
-        directions, places, scale = taken.narrow
-        all_pass = wp.full((*points.shape, len(places)), 1.0, wp.float32, device=points.device)
-        narrow_pass = wp.full((*points.shape, len(directions)), 1.0, wp.float32, device=points.device)
-        past_narrow = past(narrow_pass, directions, scale * cell_radius(len(directions)))
-        shares = put_narrow(past(all_pass, taken.directions), past_narrow, places)
-        return seen._replace(
-            past_all=multiply_transmittances(expand_rows(past_solid, len(shares)), shares), past_solid=past_solid
-        )
+        cover = functools.partial(flat_coverage, points, flats.frames, flats.flats, facing=facing, skip=flats.skip)
+        covered = cover(taken.directions)
+        if covered is None:
+            return seen
+        if taken.narrow is not None:
+            directions, places, scale = taken.narrow
+            narrow = cover(directions, radius=scale * cell_radius(len(directions)))
+            assert narrow is not None
+            covered = put_narrow(covered, narrow, places)
+        return seen._replace(past_all=past_coverage(past_solid, covered), past_solid=past_solid)
 
     def _past_own(self, group: Group) -> wp.array | None:
         """What receivers see past their own body."""

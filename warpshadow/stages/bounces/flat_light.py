@@ -413,8 +413,9 @@ def flat_light(
 
     Differentiable: points, normals, transmittance, frames, radiosity.
     """
-    check_flats(flats, points, transmittance, frames, directions, skip)
+    check_flats(flats, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
+    check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     instances = common_batch(
         {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames, "radiosity": radiosity}
     )

@@ -42,7 +42,6 @@ class FlatScene:
 def check_flats(
     flats: Flats,
     points: wp.array,
-    transmittance: wp.array,
     frames: wp.array,
     directions: np.ndarray,
     skip: int | None,
@@ -50,7 +49,6 @@ def check_flats(
     """Raise ValueError for what does not fit together."""
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
-    check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     check.shape("frames", frames.shape, ("batch", 3 * flats.count))
     if skip is not None:
         check.choice("skip", skip, range(flats.count))
