@@ -21,6 +21,7 @@ from warpshadow.pipeline.assembly import Assembly, Geometry
 from warpshadow.pipeline.node import Source
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.own_shadows.buried import find_buried, find_lenders
 from warpshadow.stages.own_shadows.lobes import Turned, find_turned, project_rows
 from warpshadow.stages.own_shadows.lookup import Lookup, Supports, find_lookups, find_supports
 from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, cuts_of, find_sites
@@ -28,7 +29,7 @@ from warpshadow.stages.own_shadows.trace import RAYS, RUN, OwnRows, ray_count, t
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers, Span
 
-VERSION = 2
+VERSION = 3
 """Part of the key of cached rows: raise it whenever they would come out differently."""
 
 
@@ -220,7 +221,9 @@ class OwnShadows:
                 normals = self._normals(body)
                 places = np.tile(sites.positions, (len(normals) // len(sites.normals), 1))
                 with unrecorded():
-                    return trace_rows(whole, places, normals, count, progress=self._progress)
+                    rows = trace_rows(whole, places, normals, count, progress=self._progress)
+                    is_buried = find_buried(whole, places, normals, len(sites.positions), rows)
+                    return rows.lent(find_lenders(sites, is_buried))
 
             self._rows[body] = remembered(
                 cache_path("own_shadows", key.hexdigest()),

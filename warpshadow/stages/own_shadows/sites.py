@@ -45,6 +45,18 @@ class Sites(NamedTuple):
     corners: np.ndarray
     cuts: int
 
+    @property
+    def edges(self) -> np.ndarray:
+        """Pairs of sites that are next to each other on a face, int of shape [pair, 2]; some stand there twice."""
+        steps = [(i, j) for j in range(self.cuts) for i in range(self.cuts - j)]
+        near, along_u, along_v = (
+            self.corners[:, [_point_number(i + di, j + dj, self.cuts) for i, j in steps]].ravel()
+            for di, dj in ((0, 0), (1, 0), (0, 1))
+        )
+        return np.concatenate(
+            [np.stack(pair, axis=1) for pair in ((near, along_u), (along_u, along_v), (along_v, near))]
+        )
+
 
 def cuts_of(face_count: int) -> int:
     """Pieces n that edges are cut into, so that faces make up at least :data:`SMALL_FACES`."""
@@ -108,7 +120,7 @@ def _place_vertices(
 @wp.func
 def _point_number(i: int, j: int, cuts: int):
     """Number of a point of a face's lattice."""
-    return j * (cuts + 1) - j * (j - 1) / 2 + i
+    return j * (cuts + 1) - j * (j - 1) // 2 + i
 
 
 @wp.kernel

@@ -57,6 +57,11 @@ class OwnRows(NamedTuple):
         """Rays of a site."""
         return 32 * self.bits.shape[1]
 
+    def lent(self, lenders: np.ndarray) -> "OwnRows":
+        """Rows that have what others see; numbers of rows, [row]."""
+        device = self.bits.device
+        return OwnRows(*(wp.array(array.numpy()[lenders], device=device) for array in self))
+
 
 def ray_count(row_count: int) -> int:
     """Rays of a site of a body with so many rows, a power of two."""

@@ -1,0 +1,93 @@
+"""Buried sites: points of a body that lie inside another part of it, as the root of a handle does in a cup.
+
+They are dark, but faces lead from them to where light is, and would darken it. So a buried site sees what the nearest
+site beside it sees that is not buried, as texels of light maps do.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.maths.directions import fibonacci
+from warpshadow.stages.own_shadows.sites import Sites
+from warpshadow.stages.own_shadows.trace import OwnRows
+from warpshadow.stages.ray_tracing import nearest
+
+_RAYS = 64
+"""Directions that tell on which side faces are met."""
+
+
+@wp.kernel(enable_backward=False)
+def _find_buried(
+    # in
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    site_count: int,
+    directions: wp.array(dtype=wp.vec3),
+    bits: wp.array2d(dtype=wp.uint32),
+    # out
+    is_buried: wp.array(dtype=wp.bool),
+):
+    """A thread owns a row."""
+    row = wp.tid()
+    for word in range(bits.shape[1]):
+        if bits[row, word] != wp.uint32(0):
+            is_buried[row] = False
+            return
+    outer = int(0)
+    inner = int(0)
+    for ray in range(directions.shape[0]):
+        if wp.dot(normals[row], directions[ray]) > 0.0:
+            hit = nearest(mesh, points[row], normals[row], directions[ray])
+            if hit.face >= 0:
+                if hit.is_back == (row >= site_count):
+                    outer += 1
+                else:
+                    inner += 1
+    is_buried[row] = inner > outer
+
+
+def find_buried(mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, site_count: int, rows: OwnRows) -> np.ndarray:
+    """Find the rows of sites that no ray escapes from, and whose rays mostly meet faces on their other side.
+
+    Args:
+        mesh: The mesh, in the frame of the points.
+        points: Sites, and their backs if they have any, [row, 3].
+        normals: Unit normals [row, 3].
+        site_count: Number of sites.
+        rows: What they see.
+
+    Returns:
+        Bool of shape [row].
+    """
+    device = mesh.points.device
+    places, facing, directions = (
+        wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
+    )
+    is_buried = wp.empty(len(points), dtype=wp.bool, device=device)
+    inputs = [mesh.id, places, facing, site_count, directions, rows.bits]
+    launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
+    return is_buried.numpy()
+
+
+def find_lenders(sites: Sites, is_buried: np.ndarray) -> np.ndarray:
+    """Find of which row each row has what it sees: of its own, or of the nearest beside it if it is buried.
+
+    Args:
+        sites: The sites.
+        is_buried: Bool of shape [row]: the sites, and their backs if they have any.
+
+    Returns:
+        Numbers of rows, int of shape [row]. A buried row with none beside it keeps its own.
+    """
+    lenders = np.arange(len(is_buried))
+    site_count = len(sites.positions)
+    pairs = np.concatenate([sites.edges, sites.edges[:, ::-1]])
+    lengths = np.linalg.norm(sites.positions[pairs[:, 0]] - sites.positions[pairs[:, 1]], axis=1)
+    pairs = pairs[np.argsort(-lengths, kind="stable")]  # of several, the last is assigned
+    for first in range(0, len(is_buried), site_count):
+        buried, lender = (pairs + first).T
+        lends = is_buried[buried] & ~is_buried[lender]
+        lenders[buried[lends]] = lender[lends]
+    return lenders
