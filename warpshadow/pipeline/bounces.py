@@ -14,6 +14,7 @@ there it goes on when it has bounced often enough between bodies.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -29,6 +30,15 @@ from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
+from warpshadow.stages.receivers import Receivers
+
+
+class SeenPart(NamedTuple):
+    """Some receivers, and what they see whatever its light is."""
+
+    transfer: wp.array  # of direct light, [batch, receiver, coefficient]
+    group: Group
+    cells: SeenCells
 
 
 class LitPart(NamedTuple):
@@ -39,14 +49,47 @@ class LitPart(NamedTuple):
     cells: SeenCells
 
 
-class LitParts(InParts):
-    """Direct light, in parts; what they see is kept with it, for light that bounces."""
+class SeenParts(InParts):
+    """What receivers see of direct light and of light that bounces, in parts."""
 
-    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> Any:
-        """Light a part directly."""
+    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array]) -> SeenPart:
+        """What a part sees."""
         seen = self.see(call, part, taken)
-        direct = self.light(call, part, seen, taken)
-        return LitPart(direct, part, see_cells(self.method, part, seen, taken, spheres))
+        return SeenPart(self.light(call, part, seen, taken), part, see_cells(self.method, part, seen, taken, spheres))
+
+
+class LitParts(Node):
+    """Direct light, in parts.
+
+    Args:
+        seen: What they see.
+        taken: What the method takes of the light.
+        words: Number of receivers, in words.
+        where: Put after the name of its stage.
+        others: More that it depends on.
+        beside: As for :class:`Node`.
+    """
+
+    def __init__(
+        self,
+        seen: SeenParts,
+        taken: Node,
+        words: str | Callable[[], str],
+        where: str = "",
+        others: tuple[Node, ...] = (),
+        beside: tuple[Node, ...] = (),
+    ):
+        self._seen = seen
+        self._shade = Node(f"shading{where}", seen.method.light_part, seen, taken, items=words, keeps=False)
+        super().__init__("", None, taken, *others, beside=(seen, self._shade, *beside))
+
+    def compute(self, call: Call) -> Any:
+        """Light all parts."""
+        (taken,) = self.values(call)
+        return [self._light(call, part, taken) for part in self._seen.value(call)]
+
+    def _light(self, call: Call, part: SeenPart, taken: Any) -> LitPart:
+        return LitPart(self._shade.run(call, part.transfer, part.group, taken), part.group, part.cells)
 
 
 class Radiosity(Node):
@@ -58,9 +101,9 @@ class Radiosity(Node):
         stand_ins: StandIns,
         own_factors: OwnFactors,
         gathering: Gathering,
-        sources: Node,
         lit: Node,
         albedo: Node,
+        shown: Node,
         spheres: Source,
         frames: Node,
     ):
@@ -71,13 +114,12 @@ class Radiosity(Node):
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=words, keeps=False)
         self._own = Node("own light of patches", patch_radiosity, albedo, lit, items=words, idle=idle, keeps=False)
         beside = self._reflect, self._own, *gathering.stages
-        super().__init__("", None, sources, lit, albedo, spheres, frames, beside=beside)
+        super().__init__("", None, lit, albedo, shown, spheres, frames, beside=beside)
 
     def compute(self, call: Call) -> Outgoing:
         """Reflect direct light, then light that has bounced once, and so on; what bodies send themselves for longer."""
-        sources, lit, albedo, spheres, frames = self.values(call)
+        lit, albedo, shown, spheres, frames = self.values(call)
         senders, count = self._stand_ins.senders, self._count
-        shown = self._stand_ins.shown(sources, [part.cells for part in lit], spheres, frames)
         between = None if self._own.idle else self._own_factors.between_patches(senders, [part.group for part in lit])
 
         def sent(radiosity: wp.array) -> Outgoing:
@@ -99,25 +141,30 @@ class Radiosity(Node):
 
 
 class BouncedShading(LitParts):
-    """Shading of receivers, direct and bounced."""
+    """Shading of receivers, direct and bounced.
+
+    Args:
+        seen: What they see; one part after another where nothing of it is kept.
+        taken: What the method takes of the light.
+        words: Number of receivers, in words.
+        radiosity: What patches send.
+        gathering: What receivers get of that.
+    """
 
     def __init__(
-        self,
-        method: SphereMethod,
-        points: LitPoints,
-        taken: Node,
-        light: Source,
-        radiosity: Radiosity,
-        gathering: Gathering,
+        self, seen: SeenParts, taken: Node, words: Callable[[], str], radiosity: Radiosity, gathering: Gathering
     ):
         self._gathering = gathering
-        super().__init__(method, points, taken, light, joined, extra=(radiosity,), beside=gathering.stages)
+        super().__init__(seen, taken, words, others=(radiosity,), beside=gathering.stages)
 
-    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array], *extra: Any) -> wp.array:
-        """Light a part, directly and by what patches send."""
-        (outgoing,) = extra
-        direct, group, cells = super().find(call, part, taken, spheres)
-        return total_light([direct, *self._gathering.run(call, group, cells, outgoing)])
+    def compute(self, call: Call) -> wp.array:
+        """Light all parts, directly and by what patches send."""
+        taken, outgoing = self.values(call)
+        parts = self._seen.value(call) if self._seen.keeps else self._seen.parts(call)
+        return joined([self._bounced(call, self._light(call, part, taken), outgoing) for part in parts])
+
+    def _bounced(self, call: Call, part: LitPart, outgoing: Outgoing) -> wp.array:
+        return total_light([part.direct, *self._gathering.run(call, part.group, part.cells, outgoing)])
 
 
 class SphereBounces:
@@ -136,29 +183,56 @@ class SphereBounces:
     def shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
+        What points see in a light is kept where colors vary; where they do not, the shading is.
+
         Args:
             points: The receivers.
             taken: What the method takes of the light.
-            light: The light.
+            light: The light, known.
             materials: What the bodies reflect.
         """
+        return self._shading(points, taken, taken, light, materials, is_free=False)
+
+    def free_shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
+        """The same in free light; what points see in any such light is kept."""
+        return self._shading(points, taken, self._method.taken_if_free, light, materials, is_free=True)
+
+    def _shading(
+        self, points: LitPoints, taken: Node, seen_in: Any, light: Source, materials: Materials, *, is_free: bool
+    ) -> Node:
+        """Shading of points, given what the method takes of the light, and of that what they see depends on."""
         method, senders = self._method, self._patches.senders(materials)
         if not senders.bodies:
             idle = Node("bounces", None, idle="every body is black")
             return InParts(method, points, taken, light, joined, beside=(idle,))
         stand_ins = self._stand_ins.setdefault(senders, StandIns(senders, method.visibility.merging))
         gathering = functools.partial(Gathering, method.visibility, senders, self._own_factors)
-        flats, words, where = stand_ins.flats, f"{len(senders.sides):,} sources", " of sources"
-        frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
-        sources = Node("sources", senders.sources, points.vertices, points.normals, items=words)
-        lit = LitParts(method, self._at(sources, points, materials), taken, light, list, where=where)
+        flats, spheres, where = stand_ins.flats, points.spheres, " of sources"
+        words, point_words = f"{len(senders.sides):,} sources", functools.partial(receiver_words, points)
+        key, is_kept = None if is_free else light, is_free or materials is not points.materials
+        see = functools.partial(SeenParts, method, taken=seen_in, light=light, finish=list, is_shaded=False)
+        seen = points.kept("seen", (key, is_kept), lambda: see(points, keeps=is_kept))
+
+        def show(sources: Receivers, seen: list[SeenPart], *given: Any) -> wp.array:
+            return stand_ins.shown(sources, [part.cells for part in seen], *given)
+
+        def at_sources() -> tuple[SeenParts, Node, Node]:
+            """What sources see, where flat bodies are, and what patches show of their area towards cells."""
+            make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals, items=words)
+            sources = points.kept("sources", senders, make)
+            seen = see(self._at(sources, points, points.materials), where=where)
+            frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
+            return seen, frames, Node("", show, sources, seen, spheres, frames)
+
+        seen_by_sources, frames, shown = points.kept("seen by sources", (key, senders), at_sources)
+        lit = LitParts(seen_by_sources, taken, words, where)
         albedo = self._patches.albedo(materials, senders.bodies)
         why_not = "light bounces once" if self._count == 1 else ""
-        at_sources = gathering((lit, albedo, frames), words, where, why_not, only_others=True)
-        given = self._count, stand_ins, self._own_factors, at_sources, sources, lit, albedo, points.spheres, frames
+        of_sources = gathering((lit, albedo, frames), words, where, why_not, only_others=True)
+        given = self._count, stand_ins, self._own_factors, of_sources, lit, albedo, shown, spheres, frames
         radiosity = Radiosity(*given)
-        at_points = gathering((points.receivers_node, radiosity), functools.partial(receiver_words, points))
-        return BouncedShading(method, points, taken, light, radiosity, at_points)
+        at_points = gathering((points.receivers_node, radiosity), point_words)
+        return BouncedShading(seen, taken, point_words, radiosity, at_points)
 
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,6 +34,9 @@ class Bouncing(Protocol):
 
     def shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
         """Shading of points, direct and bounced, given what the method takes of the light."""
+
+    def free_shading(self, points: LitPoints, taken: Node, light: Source, materials: Materials) -> Node:
+        """The same in free light."""
 
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still; what does not depend on light and materials is kept."""
@@ -121,7 +124,7 @@ class SphereMethod(Method):
     def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
         """Shading of points in free light; where it bounces between what moves, found as if the light were known."""
         if self.bounces is not None and not points.stands:
-            return self.bounces.shading(points, Node("", self._taken_if_given, light), light, materials)
+            return self.bounces.free_shading(points, Node("", self._taken_if_given, light), light, materials)
         direct = super().free_shading(points, light, materials)
         return direct if self.bounces is None else self.bounces.kept_free_shading(direct, points, light, materials)
 
@@ -155,7 +158,7 @@ class InParts(Node):
         finish: What is made of the list of those of all parts.
         keeps: As for :class:`Node`.
         where: Put after the names of its stages, where others have those names.
-        extra: More that parts depend on.
+        is_shaded: Whether parts are shaded in known light; else they end with transfer vectors, too.
         beside: As for :class:`Node`.
     """
 
@@ -169,7 +172,7 @@ class InParts(Node):
         *,
         keeps: bool = True,
         where: str = "",
-        extra: tuple[Node, ...] = (),
+        is_shaded: bool = True,
         beside: tuple[Node, ...] = (),
     ):
         self.method, self._grouping = method, Grouping(points, method.flats)
@@ -210,29 +213,42 @@ class InParts(Node):
             keeps=False,
         )
         self._shading = None
-        if light is not None:
+        if light is not None and is_shaded:
             given = self._transfer, taken
             self._shading = result = Node(f"shading{where}", method.light_part, *given, items=words, keeps=False)
         shadows = _static_shadows(method, points, light)
         kept_rows = shadows if shadows.function else None
         looked_up: Node | dict = own_shadows if own_shadows.function else {}
-        given = receivers, spheres, taken, kept_rows, looked_up, frames, *extra
-        super().__init__("", None, *given, beside=(own_shadows, shadows, result, *beside), keeps=keeps)
+        super().__init__(
+            "",
+            None,
+            receivers,
+            spheres,
+            taken,
+            kept_rows,
+            looked_up,
+            frames,
+            beside=(own_shadows, shadows, result, *beside),
+            keeps=keeps,
+        )
 
     def compute(self, call: Call) -> Any:
+        """Find it for all parts."""
+        return self._finish(list(self.parts(call)))
+
+    def parts(self, call: Call) -> Iterator[Any]:
         """Find it for one part after another."""
-        receivers, spheres, taken, kept_rows, looked_up, frames, *extra = self.values(call)
+        receivers, spheres, taken, kept_rows, looked_up, frames = self.values(call)
         groups = self._grouping.groups(call, receivers, spheres, kept_rows, looked_up, frames)
-        total, results = len(receivers.still) + receivers.points.shape[1], []
+        total = len(receivers.still) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", wanted=self._progress) as bar:
             for group in groups:
                 for part in group.parts():
-                    results.append(self.find(call, part, taken, spheres, *extra))
+                    yield self.find(call, part, taken, spheres)
                     bar.update(part.points.shape[1])
-        return self._finish(results)
 
-    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array], *_: Any) -> Any:
-        """Find it for a part, given what the method takes of the light, all spheres, and values of what is extra."""
+    def find(self, call: Call, part: Group, taken: Any, spheres: tuple[wp.array, wp.array]) -> Any:
+        """Find it for a part, given what the method takes of the light, and all spheres."""
         return self.light(call, part, self.see(call, part, taken), taken)
 
     def see(self, call: Call, part: Group, taken: Any) -> Seen:

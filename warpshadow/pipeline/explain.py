@@ -108,7 +108,7 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
         if reason:
             asked.add(node)
         own = _decision(node, call, reason)
-        is_idle = reason and not own and node.known(call) is None  # what is idle asks for what it passes on
+        is_idle = not own and node.known(call) is None  # what is idle asks for what it passes on
         for each in node.before:
             visit(each, reason if is_idle else own)
         decisions[node] = own
