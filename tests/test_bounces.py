@@ -1,6 +1,7 @@
 """Light that bounces, as a whole: energy, what runs, and gradients of images against central differences of them."""
 
 import dataclasses
+import functools
 import json
 import subprocess
 import sys
@@ -30,7 +31,7 @@ from test_end_to_end import (
 
 import warpshadow as ws
 from warpshadow.pipeline import bounces as pipeline_bounces
-from warpshadow.pipeline import groups, kept_bounces
+from warpshadow.pipeline import groups, kept_bounces, patches
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 METHODS = ("directional", "log-sh")
@@ -53,6 +54,12 @@ def bounced(method: str, camera: ws.Camera, bounces: int = 2, *, blockers: int =
     scene = scene_of(method, camera, **visibility)
     ground = dataclasses.replace(scene.bodies[1], blockers=blockers)
     return dataclasses.replace(scene, bounces=bounces, bodies=(scene.bodies[0], ground))
+
+
+@functools.cache
+def on_both(method: str) -> TorchRenderer:
+    """A renderer of that, whose form factors are found once."""
+    return TorchRenderer(bounced(method, ON_BOTH))
 
 
 def balls(centers: list[tuple[float, float, float]], radii: list[float], **options) -> ws.Body:
@@ -164,8 +171,9 @@ def test_a_colored_ground_colors_what_stands_on_it():
 def test_without_bounces_nothing_of_them_is_imported():
     script = (
         "import json, sys, warpshadow as ws;"
-        "bodies = [ws.Body(ws.icosphere(1.0, 1), blockers=ws.Spheres([(0, 0, 0)], [1])), ws.Body(ws.plane(4.0, 2))];"
-        "scene = ws.Scene(bodies, ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 2, 4), (0, 0, 0)));"
+        "ball = ws.Body(ws.icosphere(1.0, 1), blockers=ws.Spheres([(0, 0, 0)], [1]), translation=(0, 1, 0));"
+        "camera = ws.Camera.look_at((0, 2, 4), (0, 0, 0), size=(16, 16));"
+        "scene = ws.Scene([ball, ws.Body(ws.plane(4.0, 2))], ws.EnvironmentMap.constant(1.0), camera);"
         "ws.render(scene);"
         "print(json.dumps([name for name in sys.modules if 'bounces' in name]))"
     )
@@ -258,12 +266,13 @@ def test_it_says_how_often_light_bounces(method):
 def test_reflectance_above_1_is_warned_of_where_light_bounces(name):
     scene = bounced("directional", ON_BOTH, directions=32)
     above = torch.full((4, 4, 3) if name == "textures" else (3,), 1.5)
-    with pytest.warns(UserWarning, match=rf"{name}\[1\]: got values above 1, with which light grows"):
-        TorchRenderer(scene)(**{name: {"plane": above}})
+    renderer = TorchRenderer(scene)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        TorchRenderer(scene)(**{name: {"plane": above.clamp(max=1.0)}})
+        renderer(**{name: {"plane": above.clamp(max=1.0)}})
         TorchRenderer(dataclasses.replace(scene, bounces=0))(**{name: {"plane": above}})
+    with pytest.warns(UserWarning, match=rf"{name}\[1\]: got values above 1, with which light grows"):
+        renderer(**{name: {"plane": above}})
 
 
 # ---------------------------------------------------------------------------------------------- gradients
@@ -356,7 +365,7 @@ class Given:
 @pytest.mark.parametrize("name", ["light", "albedo", "colors", "texture"])
 @pytest.mark.parametrize("method", METHODS)
 def test_light_and_reflectance_have_the_gradient_of_an_image_with_bounces(method, name, stands):
-    image_of = Given(TorchRenderer(bounced(method, ON_BOTH)), name, stands=stands)
+    image_of = Given(on_both(method), name, stands=stands)
     directions = np.random.default_rng(5).normal(size=(4, len(image_of.start)))
     got, expected = gradient_and_differences(image_of, directions, 1e-2, slice(4))
     assert relative_error(got, expected) < 1e-4
@@ -423,7 +432,7 @@ def test_one_instance_of_anything_serves_all_with_bounces(name):
 @pytest.mark.parametrize("method", METHODS)
 def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monkeypatch):
     """Rays find form factors once, for nearly the image by spheres; nothing of geometry is computed again."""
-    image_of = Given(TorchRenderer(bounced(method, ON_BOTH)), name)
+    image_of = Given(on_both(method), name)
     renderer = image_of.renderer
     values = image_of.start.reshape(image_of.shape)
     given = {"light": values} if name == "light" else {"albedo": list(values)}
@@ -443,6 +452,47 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
     with torch.no_grad():
         assert torch.equal(image_of(image_of.start), kept)
         assert not torch.equal(image_of(0.5 * image_of.start), kept)
+
+
+def image_and_gradient(renderer: TorchRenderer, name: str, values: torch.Tensor, geometry) -> tuple[torch.Tensor, ...]:
+    """The image of a geometry in free light, or with free colors, and the gradient of its squares to these."""
+    values = values.clone().requires_grad_()
+    image = renderer(**{name: values if name == "light" else [values, None]}, geometry=geometry)
+    image.square().sum().backward()
+    return image.detach(), values.grad
+
+
+@pytest.mark.parametrize(("method", "name"), [("directional", "light"), ("directional", "albedo"), ("log-sh", "light")])
+def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, name, monkeypatch):
+    """Other light and colors meet what is kept: images and gradients are those of a new renderer, to the bit."""
+    scene = bounced(method, ON_BOTH, blockers=1, directions=32, order=4)
+    renderer, fresh = TorchRenderer(scene), TorchRenderer(scene)
+    geometry = renderer.placed(*renderer.scene_poses())
+    start = torch.full((renderer.basis.size, 3) if name == "light" else (1, 3), 0.4)
+    image_and_gradient(renderer, name, start, geometry)
+
+    def refuse(*_, **__):
+        raise AssertionError("it is seen again")
+
+    with monkeypatch.context() as patch:
+        for function in ("see", "past_flats", "transfer", "look_up"):
+            patch.setattr(type(renderer.warp._method), function, refuse)
+        patch.setattr(pipeline_bounces, "see_cells", refuse)
+        patch.setattr(patches, "receivers_on_faces", refuse)
+        found = image_and_gradient(renderer, name, 2 * start, geometry)
+        explained = renderer.explain(**{name: 2 * start if name == "light" else [2 * start, None]}, geometry=geometry)
+    assert all(map(torch.equal, found, image_and_gradient(fresh, name, 2 * start, geometry)))
+    for stage in ("sources", "visibility of sources", "transfer of sources", "visibility", "transfer"):
+        assert explained[stage].forward.why.startswith("kept: "), stage
+    assert explained["shading"].forward and explained["flat light"].forward
+    moved = geometry.map(lambda array: array.clone())
+    moved.positions[:, :5] += 0.1
+    moved.radii[:] *= 0.8
+    again, anew = (image_and_gradient(each, name, start, moved) for each in (renderer, TorchRenderer(scene)))
+    assert all(map(torch.equal, again, anew)) and not torch.equal(again[0], found[0])
+    moved.radii[:] *= 0.8  # in place
+    again, anew = (image_and_gradient(each, name, start, moved) for each in (renderer, TorchRenderer(scene)))
+    assert all(map(torch.equal, again, anew))
 
 
 def test_transfer_vectors_are_refused_where_light_bounces():

@@ -109,7 +109,10 @@ def test_a_fit_of_light_alone_lowers_its_loss():
 def test_a_fit_has_grounds_block_as_its_scene_has_them():
     """As planes, not by spheres; the found scene is then lit alike."""
     scene = ws.Scene(
-        [ws.Body(ws.icosphere(0.4, 2), translation=(0, 0.5, 0), blockers=8), ws.Body(ws.plane(3.0, 8))],
+        [
+            ws.Body(ws.icosphere(0.4, 2), translation=(0, 0.5, 0), blockers=ws.Spheres([[0, 0, 0]], [0.4])),
+            ws.Body(ws.plane(3.0, 8)),
+        ],
         ws.EnvironmentMap.constant(1.0, height=16),
         ws.Camera.look_at((0, 1.5, 3), (0, 0.4, 0), size=(24, 24)),
     )

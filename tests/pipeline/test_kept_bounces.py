@@ -24,10 +24,21 @@ def ball_on_ground(*, bounces: int = 2, size: int = 20) -> ws.Scene:
     rng = np.random.default_rng(SEED)
     ball = ws.icosphere(0.5, 3)
     bodies = [
-        ws.Body(ball, albedo=rng.uniform(0.2, 0.9, ball.positions.shape), translation=(0, 0.5, 0), name="ball"),
+        ws.Body(
+            ball,
+            albedo=rng.uniform(0.2, 0.9, ball.positions.shape),
+            blockers=ws.Spheres([[0, 0, 0]], [0.5]),
+            translation=(0, 0.5, 0),
+            name="ball",
+        ),
         ws.Body(ws.plane(4.0, 8), texture=rng.uniform(0.2, 0.9, (8, 8, 3)), name="ground"),
         ws.Body(
-            ws.plane(1.5, 2), albedo=(0.9, 0.3, 0.2), rotation=(0, 0, -80), translation=(-0.9, 0.7, 0), name="wall"
+            ws.plane(1.5, 2),
+            albedo=(0.9, 0.3, 0.2),
+            blockers=ws.Spheres([[0, 0, 0]], [0.1]),
+            rotation=(0, 0, -80),
+            translation=(-0.9, 0.7, 0),
+            name="wall",
         ),
     ]
     sky = np.full((16, 32, 3), 0.5, np.float32)

@@ -16,7 +16,10 @@ from warpshadow.stages.sparse import SparseMatrix
 
 def scene_of(mesh: ws.Mesh) -> ws.Scene:
     camera = ws.Camera.look_at((0.5, 3, 4), (0, 0, 0), size=(16, 16))
-    bodies = [ws.Body(mesh, blockers=8), ws.Body(ws.plane(4.0, 4), translation=(0, -1.2, 0))]
+    bodies = [
+        ws.Body(mesh, blockers=ws.Spheres([[0, -0.3, 0]], [0.7])),
+        ws.Body(ws.plane(4.0, 4), translation=(0, -1.2, 0)),
+    ]
     return ws.Scene(bodies, ws.EnvironmentMap.constant(1.0, height=16), camera, ws.Visibility(directions=32), bounces=2)
 
 

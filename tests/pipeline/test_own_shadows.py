@@ -149,7 +149,7 @@ def test_a_geometry_without_rotations_is_shadowed_by_spheres_and_explained():
 
 def test_bodies_that_are_flat_or_cast_no_shadow_are_not_traced(monkeypatch):
     monkeypatch.setattr(own_shadows, "trace_rows", None)
-    floor, ball = ws.Body(ws.plane(4.0, 8)), ws.Body(ws.icosphere(0.5, 2), blockers=0)
+    floor, ball = ws.Body(ws.plane(4.0, 8), translation=(0, -1, 0)), ws.Body(ws.icosphere(0.5, 2), blockers=0)
     scene = dataclasses.replace(scene_of(), bodies=(floor, ball))
     ws.render(scene)
 
@@ -204,8 +204,7 @@ def test_static_bodies_keep_their_lobes(moving):
     np.testing.assert_allclose(*images, atol=1e-4)
 
 
-def test_a_mesh_of_too_many_vertices_has_fewer_rays_and_says_so(monkeypatch, tmp_path):
-    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+def test_a_mesh_of_too_many_vertices_has_fewer_rays_and_says_so(monkeypatch):
     monkeypatch.setattr(trace, "MOST_MEMORY", 2**18)
     with pytest.warns(UserWarning, match=r"642 points have 1024 rays each for the body's shadow on itself"):
         error = error_of(scene_of())
