@@ -386,6 +386,8 @@ def fit(
         pace = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
         typer.echo(f"{ending} after {sum(map(len, result.losses))} iterations{pace}")
         typer.echo(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after")
+        if result.light is not None:
+            typer.echo(f"{result.light}")
         typer.echo(f"{output}: {', '.join(path.name for path in report.write(output))}")
     if has_diverged:
         typer.secho(f"error: {result.reason}; {output} has the best values before that", fg="red", err=True)

@@ -104,6 +104,17 @@ def test_light_in_harmonics_is_also_written_as_a_map(tmp_path):
     np.testing.assert_allclose(image, sh.reconstruct_map(result.scene.light, 64), atol=1e-5)
 
 
+def test_free_light_is_drawn_and_the_summary_says_how_much_of_it_is_a_guess(tmp_path):
+    result = run(Light(3))
+    write_result(result, tmp_path)
+    summary = toml_tables.read(tmp_path / "summary.toml", "summary")
+    assert 0.0 < summary["light"]["undetermined"] == round(result.light.undetermined_share, 4) < 0.5
+    np.testing.assert_allclose(ws.read_image(tmp_path / "light.png").shape, (256, 512, 3))
+    write_result(run(Albedo(0)), tmp_path / "other")
+    assert not (tmp_path / "other" / "light.png").exists()
+    assert "light" not in toml_tables.read(tmp_path / "other" / "summary.toml", "summary")
+
+
 def test_the_summary_says_how_the_fit_ended(tmp_path):
     result = run(Albedo(0), Exposure())
     report = Report(result)

@@ -108,7 +108,7 @@ def pictures(page):
 def iterations(page):
     """The most that a page was told."""
     said = [str(message.get("updates", {}).get("content")) for message in page.heard]
-    return max((int(count) for note in said for count in re.findall(r"(\d+) iterations · loss", note)), default=0)
+    return max((int(count) for note in said for count in re.findall(r"iteration (\d+) · loss", note)), default=0)
 
 
 def test_a_page_shows_pictures_losses_and_candidates_and_the_fit_is_as_without_it(viewer, page):
@@ -132,7 +132,7 @@ def waiting(viewer, page, tmp_path):
     press(page, "Pause")
     page.until(lambda message: "Go on" in str(message))
     running = Running(viewer, checkpoint=tmp_path / "fit", checkpoint_seconds=1e9)
-    page.until(lambda message: "waits · stage 1 of 2 · 1 iterations" in str(message))
+    page.until(lambda message: "waits · stage 1 of 2 · iteration 1 " in str(message))
     return running
 
 

@@ -7,6 +7,7 @@ to a :class:`Result`, whose scene can be rendered, relit and written. Needs torc
 from warpshadow.inverse.checkpoint import CheckpointError
 from warpshadow.inverse.descent import FitWarning, Result, fit, short_adam
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
+from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
@@ -30,6 +31,7 @@ __all__ = [
     "FitFileError",
     "FitViewer",
     "FitWarning",
+    "FoundLight",
     "Free",
     "Light",
     "Loss",

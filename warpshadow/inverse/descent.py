@@ -21,6 +21,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.found_light import FoundLight, found_light
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
@@ -69,6 +70,13 @@ class Result:
     def scene(self) -> Scene:
         """The scene that explains the targets."""
         return self.found.scene
+
+    @functools.cached_property
+    def light(self) -> FoundLight | None:
+        """The light that was found, and which directions of it the images determined; None where it was not free."""
+        if self.problem.basis is None:
+            return None
+        return found_light(self.scene.light, self.problem, self.setting, self.values)
 
     @property
     def cameras(self) -> list[Camera]:

@@ -55,8 +55,9 @@ class Report:
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it,
                 to be rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended,
-                and of each view the camera and the exposure, which a scene does not have); parameters.npz (all values,
-                as the fit holds them); before.png and after.png beside target.png; and loss.png where matplotlib is
+                and of each view the camera and the exposure, which a scene does not have); light.png of free light,
+                striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
+                before.png and after.png beside target.png; and loss.png where matplotlib is
                 installed.
 
         Returns:
@@ -91,7 +92,9 @@ class Report:
             {"exposure": factor} | camera_table(camera)
             for camera, factor in zip(found.cameras, found.exposures, strict=True)
         ]
-        return {"fit": fit, "view": views}
+        light = self.result.light
+        known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
+        return {"fit": fit, **known, "view": views}
 
     def _write_pictures(self, folder: Path) -> list[Path]:
         """Targets, and images before and after, the views side by side, at one exposure."""
@@ -101,7 +104,11 @@ class Report:
         for name, images in pictures.items():
             side_by_side = np.concatenate(list(images[..., :3]), axis=1)
             Picture(side_by_side, exposure=exposure).write(folder / f"{name}.png")
-        return [folder / f"{name}.png" for name in pictures]
+        written = [folder / f"{name}.png" for name in pictures]
+        if self.result.light is not None:
+            self.result.light.picture().write(folder / "light.png")
+            written.append(folder / "light.png")
+        return written
 
 
 def _evaluated(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarray]:

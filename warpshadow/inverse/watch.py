@@ -86,7 +86,7 @@ class Watch:
     def _show(self, fit: Watched, note: str) -> None:
         start = time.perf_counter()
         with self._kept_from_the_fit():
-            words = [note, f"stage {fit.stage + 1} of {len(fit.stages)}", f"{sum(map(len, fit.losses))} iterations"]
+            words = [note, f"stage {fit.stage + 1} of {len(fit.stages)}", f"iteration {sum(map(len, fit.losses))}"]
             last = next((run[-1] for run in reversed(fit.losses) if run), None)
             words += [] if last is None else [f"loss {last:.3e}"]
             losses = by_stage(fit.losses, fit.stages)

@@ -92,7 +92,7 @@ class FitPage:
             candidates: How many descents it has.
         """
         self._note.content = _padded(html.escape(note))
-        self._plot.content = loss_plot(losses)
+        self._plot.content = _padded(loss_plot(losses))
         color = COLORS[stage % len(COLORS)]
         least = [min(run, default=np.inf) for run in losses[stage]]
         rows = []

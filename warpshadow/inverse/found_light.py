@@ -1,0 +1,116 @@
+"""The light that a fit found, and which directions of it the images determined.
+
+Light from below a ground reaches nothing that an image shows, so whatever a fit says of it is a guess. How much a
+direction matters is its exposure, the sum of what its light adds to all pixels,
+
+    e(ω) = Σ_p w_p ∂I_p / ∂L(ω),
+
+with the weights w of the targets' masks: a single adjoint gives it for all directions. It is about 0 where no light
+comes from, since no pixel loses by light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from warpshadow.assets.basis import CellBasis
+from warpshadow.assets.color import auto_exposure
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.picture import Picture
+from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.model import Model
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.schedule import Stage
+from warpshadow.inverse.world import Setting
+from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles, reconstruct_map
+
+ROWS = 64
+"""Of maps of found light."""
+
+FAINTEST = 0.05
+"""Exposure below which a direction is not determined, as a part of the mean over all directions: what noise in the
+images does to light from there is twenty times as much as on the average."""
+
+_CELLS = 512  # that directions are told apart by
+_SIDE = 96  # shorter side of the images that exposures are summed over [pixels]
+_ENLARGED, _STRIPE = 4, 6  # of its picture: pixels across one of the map; width of a stripe [pixels]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLight:
+    """Light that a fit found; notebooks draw it, with stripes where the images did not determine it.
+
+    Args:
+        radiance: Linear RGB as an equirectangular map, shape [height, 2·height, 3]; below 0 where spherical harmonics
+            are.
+        exposure: How much each direction matters to the images, 1 on the average over the sphere, [height, 2·height];
+            of cells of some 9°, each of which few rays stand for, so it varies by a third between them.
+    """
+
+    radiance: np.ndarray = field(repr=False)
+    exposure: np.ndarray = field(repr=False)
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Which directions the images determined, bool of shape [height, 2·height]."""
+        return self.exposure >= FAINTEST
+
+    @property
+    def undetermined_share(self) -> float:
+        """Part of the sphere that the images did not determine."""
+        return float(pixel_solid_angles(len(self.exposure)) @ (~self.determined).sum(axis=1) / (4 * np.pi))
+
+    def picture(self) -> Picture:
+        """The light at the automatic exposure of what is determined; gray stripes over the rest."""
+        bright = np.maximum(self.radiance, 0)
+        shown = bright[self.determined] if self.determined.any() else bright
+        linear = np.clip(bright * 2 ** auto_exposure(shown), 0, 1)
+        large, known = (each.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for each in (linear, self.determined))
+        rows, columns = np.indices(known.shape)
+        is_stripe = ~known & ((rows + columns) // _STRIPE % 2 == 0)
+        return Picture(np.where(is_stripe[..., None], 0.2, large), exposure=0.0)
+
+    def _repr_png_(self) -> bytes:
+        return self.picture()._repr_png_()
+
+    def __str__(self) -> str:
+        return f"{self.undetermined_share:.0%} of the sphere was not determined by the images"
+
+
+def found_light(
+    light: EnvironmentMap | np.ndarray, problem: Problem, setting: Setting, values: Mapping[str, Values]
+) -> FoundLight:
+    """What a fit found of the light.
+
+    Args:
+        light: The light that was found.
+        problem: In which light is free.
+        setting: Of the problem.
+        values: Of what is free, by its name.
+    """
+    radiance = light.radiance if isinstance(light, EnvironmentMap) else reconstruct_map(light, ROWS)
+    towards = equirectangular_directions(len(radiance))
+    cells = CellBasis(fibonacci(_CELLS)).functions(towards.reshape(-1, 3))
+    exposure = cells @ exposure_of_cells(problem, setting, values)
+    return FoundLight(radiance.astype(np.float32), exposure.reshape(towards.shape[:2]).astype(np.float32))
+
+
+def exposure_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
+    """How much light from each of 512 cells matters to the images, 1 on the average, shape [cell]."""
+    cells = Light(None, directions=_CELLS)
+    free = [cells if isinstance(each, Light) else each for each in problem.free]
+    by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)
+    height, width, _ = problem.targets[0].image.shape
+    model = Model(by_cells, setting, Stage(scale=min(1.0, _SIDE / min(height, width)), supersampling=1))
+    logs = torch.zeros(_CELLS, 3, device=setting.device, requires_grad=True)  # the derivative by them is that by light
+    images = model.images({**values, cells.name: {"log_radiance": logs}})
+    (model.weights[..., None] * images[..., :3]).sum().backward()
+    assert logs.grad is not None
+    exposure = np.maximum(logs.grad.sum(dim=1).cpu().numpy().astype(np.float64), 0)
+    return exposure / (exposure.mean() or 1.0)
