@@ -107,7 +107,7 @@ def test_the_adjoint_past_narrow_cells_is_that_of_the_twin(scene, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order, log", [(2, "cap"), (5, "cap"), (8, "cap"), (3, "eigen"), (8, "eigen")])
+@pytest.mark.parametrize("order, log", [(2, "cap"), (5, "cap"), (8, "cap"), (5, "eigen"), (8, "eigen")])
 def test_the_adjoint_of_accumulation_is_that_of_its_twin(order, log, scene, device):
     check(
         lambda p, n, c, r: log_sh.accumulate(p, n, c, r, order=order, log=log),
@@ -128,7 +128,7 @@ def test_the_adjoint_of_accumulation_without_a_horizon_is_that_of_its_twin(scene
     )
 
 
-@pytest.mark.parametrize("order, base", [(2, "quadratic"), (4, "linear"), (4, "quadratic"), (6, "quadratic")])
+@pytest.mark.parametrize("order, base", [(2, "quadratic"), (5, "linear"), (4, "quadratic"), (5, "quadratic")])
 @pytest.mark.parametrize("size", [0.1, 0.6, 2.2, 3.0, 20.0])
 def test_the_adjoint_of_the_exponential_is_that_of_its_twin(order, base, size, device):
     rows = np.random.default_rng(order).normal(size=(3, order**2))

@@ -45,7 +45,7 @@ WEIGHTS = 1e-4
 
 LOGS = ("eigen", "cap")
 BASES = tuple(exponential.THRESHOLDS)
-ORDERS = range(2, 9)
+ORDERS = (2, 5, 8)  # each has kernels of its own, which compile for a second or more
 
 pytestmark = [
     pytest.mark.usefixtures("poisoned_outputs"),
@@ -91,7 +91,7 @@ def test_transmittance_and_its_gradient_are_the_twins_in_hard_scenes(case, count
 @pytest.mark.slow
 @pytest.mark.parametrize("log", LOGS)
 @pytest.mark.parametrize("case", SCENES)
-def test_log_sh_visibility_and_its_gradient_are_the_twins_in_hard_scenes_at_every_order(case, log, device):
+def test_log_sh_visibility_and_its_gradient_are_the_twins_in_hard_scenes(case, log, device):
     scene = SCENES[case]
     for order in ORDERS:
         stage = stability.log_sh_stage(order, log)
@@ -170,7 +170,7 @@ def test_any_number_of_spheres_in_one_direction_is_bounded_with_finite_gradients
 
 @pytest.mark.parametrize("depth", [3, 30, 300, 10000])
 @pytest.mark.parametrize("base", BASES)
-@pytest.mark.parametrize("order", [2, 5, 8])
+@pytest.mark.parametrize("order", ORDERS)
 def test_held_squarings_and_their_gradients_are_the_twins(order, base, depth, device):
     points, _, centers, radii = twins.stacked_spheres(1)
     rows = depth * twins.log_sh(points, None, centers, radii, order, "eigen")
@@ -307,7 +307,7 @@ def scene_arrays(device):
 
 
 def accumulate(points, normals, centers, radii):
-    return log_sh.accumulate(points, normals, centers, radii, order=3)
+    return log_sh.accumulate(points, normals, centers, radii, order=5)
 
 
 def transmittance(points, normals, centers, radii):
@@ -315,7 +315,7 @@ def transmittance(points, normals, centers, radii):
 
 
 def multiply(points, normals, centers, radii):
-    return log_sh.multiply_spheres(points, centers, radii, order=3)
+    return log_sh.multiply_spheres(points, centers, radii)
 
 
 def spoil(array, value):

@@ -67,8 +67,8 @@ def test_a_fit_is_measured_and_one_that_fails_is_listed(ball_case):
     text = tables.table("pose", shared)
     assert f"| directional | {figures['pose MDE']:.3g} ± 0 |" in text
     assert f"- failed: {key}direct illumination: ValueError: it would not" in text
-    broken = dataclasses.replace(ball_case, stages=(inverse.Stage(scale=0.3),))
-    assert "stages[0]" in tables.solve(broken, "directional", None)["error"]
+    broken = dataclasses.replace(ball_case, stages=(inverse.Stage(softness=0.5),))
+    assert "stages[0]: softness" in tables.solve(broken, "log-SH eigen", None)["error"]
 
 
 def test_results_are_kept_at_once_and_with_those_of_other_processes(tmp_path):

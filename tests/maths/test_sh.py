@@ -303,7 +303,7 @@ def turn_and_multiply_kernel(order, lanes):
     return turn_and_multiply
 
 
-@pytest.mark.parametrize("order, lanes", [*((order, 16) for order in ORDERS), (2, 1), (5, 1), (8, 1)])
+@pytest.mark.parametrize("order, lanes", [(2, 16), (5, 16), (8, 16), (5, 1)])
 def test_kernel_functions_turn_add_and_multiply_like_numpy(order, lanes, device):
     count = 37  # no multiple of 16: the last group repeats its last row
     rng = np.random.default_rng(order)
