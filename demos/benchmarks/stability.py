@@ -8,6 +8,7 @@ whether all of them are finite. ``tests/test_stability.py`` asserts the same.
 """
 
 import argparse
+import dataclasses
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -369,6 +370,18 @@ def first_above(grid: Sequence[float], errors: Sequence[float], limit: float) ->
     return next((value for value, error in zip(grid, errors, strict=True) if error > limit), np.inf)
 
 
+def light_in_a_closed_room(visibility: ws.Visibility) -> float:
+    """Mean light of a uniform sky of 1 inside a room of six white planes, which should be dark."""
+    turns = ((0, 0, 0), (180, 0, 0), (90, 0, 0), (-90, 0, 0), (0, 0, 90), (0, 0, -90))
+    walls = []
+    for turn in turns:
+        wall = ws.Body(ws.plane(2.0, 8), rotation=turn, albedo=(1, 1, 1))
+        walls.append(dataclasses.replace(wall, translation=-wall.rotation_matrix()[:, 1]))
+    camera = ws.Camera.look_at((0.2, 0.1, 0.6), (0, -0.3, -1), fov_y=70, size=(24, 24))
+    image = ws.render(ws.Scene(walls, ws.EnvironmentMap.constant(1.0), camera, visibility, supersampling=1))
+    return float(image[..., :3].mean())
+
+
 def print_breakdown(overlap: dict[str, list[float]], thresholds: dict[str, list[float]]) -> None:
     print("\nwhere it breaks down")
     for log in ("eigen", "cap"):
@@ -396,6 +409,9 @@ def print_breakdown(overlap: dict[str, list[float]], thresholds: dict[str, list[
     sun = hard_lights()["a sun of one pixel"]
     radiance = twins.harmonics(8, ws.fibonacci(4096)) @ sun.sh(8)[:, 0]
     print(f"  a sun in SH of order 8: as low as {radiance.min() / radiance.max():.0%} of its peak elsewhere")
+    for visibility in (ws.Visibility(), ws.Visibility(directions=1024), ws.Visibility(method="log-sh")):
+        label = f"directional, {visibility.directions}" if visibility.method == "directional" else visibility.method
+        print(f"  a closed room, {label}: {light_in_a_closed_room(visibility):.1%} of the sky's light")
 
 
 def plot(overlap: dict[str, list[float]], thresholds: dict[str, list[float]], path: Path) -> None:
