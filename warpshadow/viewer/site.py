@@ -23,6 +23,10 @@ from warpshadow.viewer.panel import Panel
 
 _PATIENCE = 2.0  # seconds that a page has to take a picture before it is sent the next
 _STATUS_SECONDS = 0.25  # between two notes of how long pictures take
+_CORNER = (  # of the page: below the picture on the left, out of the mouse's way
+    "position:fixed;left:0.8em;bottom:0.8em;padding:0.2em 0.6em;font-size:12px;line-height:1.4;color:#ddd;"
+    "background:#0008;border-radius:4px;pointer-events:none"
+)
 _MOVING_JPEG, _RESTING_JPEG = 80, 95
 
 
@@ -168,4 +172,4 @@ class _ViserPage:
             self._write(f"{delay}<br>{width} × {height}, {frame.cells}, {1e3 * frame.seconds:.0f} ms{error}")
 
     def _write(self, content: str) -> None:
-        self._status.content = f'<div style="padding:0.4em 1em;font-size:0.8em;line-height:1.4">{content}</div>'
+        self._status.content = f'<div style="{_CORNER}">{content}</div>'
