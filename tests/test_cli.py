@@ -26,7 +26,7 @@ EIGHT_BITS = 0.006
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
 """What the command that is installed runs."""
 
-COMMANDS = ("render", "view", "tune", "fit", "spheres", "envmap", "warmup")
+COMMANDS = ("render", "insert", "view", "tune", "fit", "spheres", "envmap", "warmup")
 
 SCENE = """
 [camera]
@@ -686,6 +686,62 @@ def test_a_picture_of_spheres_needs_matplotlib_which_is_said_before_the_fit(tmp_
     ws.icosphere(1.0, 1).write(tmp_path / "ball.obj")
     arguments = ("spheres", tmp_path / "ball.obj", "--picture", tmp_path / "ball.png")
     fails(*arguments, parts=('needs the package matplotlib: pip install "warpshadow[plot]"',))
+
+
+# ---------------------------------------------------------------------------------------------- insert
+
+
+@pytest.fixture
+def catching(scene):
+    scene.write_text(SCENE.replace("blockers = 0", "blockers = 1") + "shadow_catcher = true\n")
+    ws.Spheres([(0, 0, 0)], [1.0]).write(scene.with_name("ball.npz"))
+    scene.write_text(scene.read_text().replace("blockers = 1", 'spheres = "ball.npz"'))
+    ws.write_image(scene.with_name("photo.png"), np.random.default_rng(0).uniform(size=(24, 32, 3)))
+    return scene
+
+
+@pytest.mark.parametrize("name", ["out.png", "out.jpg", "out.exr"])
+def test_insert_writes_what_python_makes(catching, tmp_path, name):
+    result = run("insert", catching, "--into", tmp_path / "photo.png", "-o", tmp_path / name, "--exposure", -0.5)
+    assert result.exit_code == 0, result.output
+    assert re.search(rf"{name}: 32 × 24, \d+\.\d\d s", result.stdout)
+    image = ws.insert(ws.load_scene(catching), tmp_path / "photo.png", exposure=-0.5)
+    ws.write_image(tmp_path / f"python_{name}", image)
+    assert (tmp_path / f"python_{name}").read_bytes() == (tmp_path / name).read_bytes()
+    photograph = ws.read_image(tmp_path / "photo.png")
+    darker = (image < 0.9 * photograph).all(axis=2)
+    assert 0.05 < darker.mean() < 0.8
+
+
+def test_render_shows_the_shadow_alone_of_a_catcher(catching, tmp_path):
+    result = run("render", catching, "-o", tmp_path / "out.exr", "--png", tmp_path / "out.png", "--background", "white")
+    assert result.exit_code == 0, result.output
+    image = ws.read_image(tmp_path / "out.exr")
+    np.testing.assert_array_equal(image, ws.render(ws.load_scene(catching)))
+    ball = ws.Renderer(ws.load_scene(catching)).layers().masks[0]
+    assert not image[ball == 0][:, :3].any() and image[ball == 0][:, 3].max() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("--into", "tall.png", "-o", "out.png"), "photograph: got 24 × 32 pixels, expected the proportions"),
+        (("--into", "no.png", "-o", "out.png"), "photograph: no such file"),
+        (("--into", "scene.toml", "-o", "out.png"), "photograph: "),
+        (("--into", "photo.png", "-o", "out.gif"), "got extension '.gif', expected .exr or .png"),
+        (("--into", "photo.png", "-o", "no/out.png"), "no"),
+    ],
+)
+def test_what_cannot_be_inserted_is_one_line(catching, tmp_path, monkeypatch, arguments, part):
+    monkeypatch.chdir(tmp_path)
+    ws.write_image("tall.png", np.zeros((32, 24, 3), np.float32))
+    fails("insert", catching, *arguments, parts=(part,))
+
+
+def test_a_scene_without_a_catcher_is_one_line(scene, tmp_path):
+    ws.write_image(tmp_path / "photo.png", np.zeros((12, 16, 3), np.float32))
+    arguments = "--into", tmp_path / "photo.png", "-o", tmp_path / "out.png"
+    fails("insert", scene, *arguments, parts=("got no body that is a shadow catcher", "shadow_catcher"))
 
 
 # ---------------------------------------------------------------------------------------------- a full disk

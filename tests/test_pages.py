@@ -180,10 +180,12 @@ def scene_file():
 
 
 def test_the_scene_file_is_one(folder):
-    scene, path, automatic = scene_file()
+    scene, path, inserted, automatic = scene_file()
     Path("scene.toml").write_text(scene, "utf-8")
     Path("path.toml").write_text(path, "utf-8")
+    Path("inserted.toml").write_text(inserted, "utf-8")
     assert ws.CameraPath.read("path.toml").frame_count == 73
+    assert ws.load_scene("inserted.toml").catchers == (1,)
     loaded = ws.load_scene("scene.toml")
     assert len(loaded.bodies) == 2
     assert dataclasses.asdict(loaded.visibility) == dataclasses.asdict(ws.Visibility())  # as it says, all are defaults

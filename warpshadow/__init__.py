@@ -23,7 +23,7 @@ from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
-from warpshadow.tuning.renderer import Renderer, render
+from warpshadow.tuning.renderer import Renderer, insert, render
 from warpshadow.tuning.tune import Tuning, tune
 from warpshadow.viewer import view
 
@@ -52,6 +52,7 @@ __all__ = [
     "fibonacci",
     "fit_spheres",
     "icosphere",
+    "insert",
     "linear_to_srgb",
     "load_mesh",
     "load_scene",

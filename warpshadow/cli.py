@@ -233,13 +233,44 @@ def _frames(
     renderer = Renderer(scene, device=device, progress=True)
     with progress_bar(len(cameras), "rendering", "frame") as bar:
         for camera in cameras:
-            matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44, device=device)
-            image = renderer.draw(view=renderer.view(clip_matrices=matrices)).numpy()[0]
+            image = renderer.with_cameras([camera]).render()[0]
             behind = _behind(replace(scene, camera=camera), background)
             picture = Picture(image, exposure=exposure, tone=tone, background=behind)
             exposure = picture.exposure
             yield picture
             bar.update()
+
+
+@app.command()
+def insert(
+    scene: Annotated[
+        Path,
+        typer.Argument(help="Scene file, TOML, with the photograph's camera; a body has shadow_catcher = true."),
+    ],
+    into: Annotated[Path, typer.Option(help="Photograph: .jpg, .png, or linear .exr, .hdr.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Image to write: .png or .jpg, or .exr, linear float32 RGB.")
+    ],
+    exposure: Annotated[float, typer.Option(help="Factor of the bodies' radiance in the photograph, in stops.")] = 0.0,
+    device: Device = "cpu",
+) -> None:
+    """Put the bodies of a scene into a photograph, with their shadows on what it shows.
+
+    Bodies with shadow_catcher = true stand for what the photograph shows; they are not drawn, but darken it, and where
+    light bounces tint it.
+    """
+    from warpshadow.assets.image import write_image
+    from warpshadow.scene.files import load_scene
+    from warpshadow.tuning.renderer import insert as insert_bodies
+
+    with _clear_errors():
+        _check_output(output, ".exr", *SUFFIXES)
+        loaded, where = load_scene(scene), _device(device)
+        start = time.perf_counter()
+        image = insert_bodies(loaded, into, exposure=exposure, device=where)
+        write_image(output, image)
+        height, width, _ = image.shape
+        typer.echo(f"{output}: {width} × {height}, {time.perf_counter() - start:.2f} s")
 
 
 @app.command()

@@ -164,6 +164,39 @@ class TorchRenderer(torch.nn.Module):
         return given.apply(draw)
 
     @one_at_a_time
+    def insert(
+        self,
+        photograph: torch.Tensor,
+        light: torch.Tensor | EnvironmentMap | None = None,
+        *,
+        albedo: PerBody[torch.Tensor] | None = None,
+        textures: PerBody[torch.Tensor] | None = None,
+        geometry: Geometry[torch.Tensor] | None = None,
+        clip_matrices: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Render the bodies in a photograph of what the scene's shadow catchers stand for.
+
+        Args:
+            photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
+                [height, width, 3] or [batch, height, width, 3].
+            light, albedo, textures, geometry, clip_matrices: As for :meth:`forward`.
+
+        Returns:
+            Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
+
+        Raises:
+            ValueError: where no body of the scene is a catcher.
+
+        Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
+        """
+        given = self._given(light, albedo, textures, geometry, clip_matrices)
+        camera = self.cameras[0]
+        given.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
+        return given.apply(
+            lambda arrays: self.warp.insert(arrays["photograph"], **self._inputs(given, arrays, light)),
+        )
+
+    @one_at_a_time
     def explain(
         self,
         light: torch.Tensor | EnvironmentMap | None = None,

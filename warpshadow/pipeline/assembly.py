@@ -14,6 +14,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import SPHERE_METHODS, BodyLike, Scene
+from warpshadow.spheres import Spheres
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 
@@ -106,6 +107,7 @@ class Assembly:
         self.device = wp.get_device(device)
         self._progress = progress
         self._faces_of: dict[tuple[int, int], wp.array] = {}
+        self._take_spheres: Callable[[], list[Spheres]] | None = None
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
         surfaces = [mesh.surface for mesh in meshes]
@@ -166,6 +168,8 @@ class Assembly:
     @one_at_a_time
     def _spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
+        if self._take_spheres is not None:
+            return self._take_spheres()
         return scene_blockers(self.scene, device=self.device, progress=self._progress)
 
     @property
@@ -248,6 +252,30 @@ class Assembly:
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,
+        )
+
+    def take_spheres(self, other: "Assembly", bodies: Sequence[int]) -> None:
+        """Have the spheres that some bodies of another assembly have, which are this one's, once they are asked for.
+
+        Which spheres stand in for a ground depends on what stands on it.
+        """
+        self._take_spheres = lambda: [other._spheres[number] for number in bodies]
+
+    def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:
+        """The geometry of some bodies, rising, as that of a scene of these alone. Differentiable in it."""
+
+        def items(array: wp.array, starts: np.ndarray) -> wp.array:
+            runs = self.runs(starts, bodies)
+            return concatenate([array[:, first:end] for first, end in runs], [end - first for first, end in runs])
+
+        centers, radii = self.spheres_of(bodies, (geometry.centers, geometry.radii))
+        every, turned = np.arange(len(self.scene.bodies) + 1), geometry.rotations
+        return Geometry(
+            items(geometry.positions, self.first_vertex),
+            centers,
+            radii,
+            rotations=None if turned is None else items(turned, every),
+            deformed=tuple(bodies.index(body) for body in geometry.deformed if body in bodies),
         )
 
     def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:

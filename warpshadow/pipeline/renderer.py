@@ -6,6 +6,7 @@ What a call leaves out, and why, :meth:`Renderer.explain` says.
 import functools
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -52,6 +53,9 @@ METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-trac
 """How light is blocked."""
 
 Own = TypeVar("Own", bound="Renderer")
+
+_OF_CAMERAS = ("_own_view", "_without_others")
+"""What is kept of a renderer's cameras."""
 
 
 class Renderer:
@@ -148,12 +152,14 @@ class Renderer:
         """
         other = object.__new__(type(self))
         matrices = [camera.clip_matrix() for camera in _alike(cameras)]
-        vars(other).update({name: value for name, value in vars(self).items() if name != "_own_view"})
+        vars(other).update({name: value for name, value in vars(self).items() if name not in _OF_CAMERAS})
         other._arguments = self._arguments | {"cameras": cameras}
         other.cameras, other.has_camera_batch = tuple(cameras), True
         other._cameras = Source("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=other.device))
         other._scene_view = other._last_view = other._last_cameras = None
         other._has_warned = True
+        if "_without_others" in vars(self):
+            vars(other)["_without_others"] = self._without_others.with_cameras(cameras)
         return other
 
     def moved(self: Own, device: wp.DeviceLike) -> Own:
@@ -552,8 +558,92 @@ class Renderer:
             [camera, height, width, 4] where cameras were given; the background is 0.
         """
         with unrecorded():
-            images = self.draw(light).numpy().copy()
+            images = self._over_nothing(light) if self.scene.catchers else self.draw(light).numpy().copy()
         return images if self.has_camera_batch else images[0]
+
+    def _over_nothing(self, light: Light | None) -> np.ndarray:
+        """Images in which catchers are shadows: coverage that is the mean of what they take of a white photograph."""
+        black, white = (
+            self.insert(wp.full((1, *self._size), wp.vec3(value), dtype=wp.vec3, device=self.device), light).numpy()
+            for value in (0.0, 1.0)
+        )
+        coverage = np.clip(1 - (white - black).mean(axis=-1, keepdims=True), 0, 1)
+        return np.concatenate([black, coverage], axis=-1)
+
+    @one_at_a_time
+    def insert(
+        self,
+        photograph: wp.array,
+        light: Light | None = None,
+        *,
+        albedo: PerBody[wp.array] | None = None,
+        textures: PerBody[wp.array] | None = None,
+        geometry: Geometry[wp.array] | None = None,
+        clip_matrices: wp.array | None = None,
+    ) -> wp.array:
+        """Draw images of the bodies in a photograph of what the shadow catchers are.
+
+        Args:
+            photograph: Linear RGB, of radiance in the units of the light, vec3 of shape [batch, height, width].
+            light: As for :meth:`draw`.
+            albedo: As for :meth:`draw`; a catcher's matters where light bounces.
+            textures: As for :meth:`draw`.
+            geometry: As for :meth:`view`; but bodies that do not move have no kept rows.
+            clip_matrices: As for :meth:`view`.
+                Batches of 1 serve every instance of the others.
+
+        Returns:
+            Linear RGB, vec3 of shape [batch, height, width].
+
+        Raises:
+            ValueError: where no body of the scene is a catcher.
+
+        Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.photograph`.
+        """
+        catchers = self.scene.catchers
+        if not catchers:
+            raise ValueError(
+                "scene: got no body that is a shadow catcher, expected one or more: Body(…, shadow_catcher=True)"
+            )
+        check.shape("photograph", photograph.shape, ("batch", *self._size))
+        check.finite_arrays({"photograph": photograph})
+        alone = None
+        if geometry is not None:
+            geometry = as_geometry("geometry", geometry)
+            if geometry.moving is None or set(geometry.moving) & set(catchers):
+                alone = self.assembly.part(geometry, catchers)
+            geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
+        colors, images = self._per_body(albedo, textures)
+        without = self._without_others
+        seen = without.view(alone, clip_matrices)
+        reflecting = [colors[number] for number in catchers], [images[number] for number in catchers]
+        view = self.view(geometry, clip_matrices)
+        if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
+            seen = seen.at_receivers_of(view)
+        received = seen.white(light, *reflecting).value(without._call(seen))
+        given = Source("photograph", photograph), Source("light without the others", received)
+        return view.in_photograph(*given, self._catches, light, colors, images).value(self._call(view))
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Height and width of images [pixels]."""
+        return self.cameras[0].height, self.cameras[0].width
+
+    @functools.cached_property
+    def _catches(self) -> wp.array:
+        """Whether each face is one of a catcher, bool of shape [face]."""
+        return wp.array(np.isin(self.assembly.body_of_face, self.scene.catchers), dtype=wp.bool, device=self.device)
+
+    @functools.cached_property
+    def _without_others(self) -> "Renderer":
+        """Renders the catchers alone, by the same receivers and spheres."""
+        bodies = tuple(self.scene.bodies[number] for number in self.scene.catchers)
+        scene = replace(self.scene, bodies=bodies)
+        given: dict[str, Any] = self._arguments | {"scene": scene, "cameras": self.cameras}
+        without = Renderer(**given)
+        without.assembly.take_spheres(self.assembly, self.scene.catchers)
+        without._has_warned = True
+        return without
 
     @one_at_a_time
     def layers(self, view: View | None = None) -> Layers:

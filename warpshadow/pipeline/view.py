@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import operator
 
 import numpy as np
 import warp as wp
@@ -15,6 +16,7 @@ from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
 from warpshadow.stages import film
 from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.photograph import Division, compose, divide_samples
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
@@ -124,26 +126,83 @@ class View(LitPoints):
 
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
-        words, clip, receivers, fragments = self._samples, self.clip_positions, self.receivers_node, self.fragments_node
+        words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         materials = self.materials.replaced(albedo, textures)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
-        samples_of = functools.partial(Node, items=words, keeps=False)
         if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
             found = (Node("reflectance", None, idle="found as samples are exposed"),)
             reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
-            white = self._exposed_white(lit)
-            faces = self.assembly.faces
-            samples = samples_of("exposure", expose_albedo, fragments, faces, *reflecting, white, beside=found)
-        elif clip.requires_grad:
-            samples = samples_of("exposure", _expose_moving, receivers, lit, reflected.samples, self.silhouettes, clip)
+            given = fragments, self.assembly.faces, *reflecting, self._exposed_white(lit)
+            samples = Node("exposure", expose_albedo, *given, items=words, keeps=False, beside=found)
         else:
-            samples = samples_of("exposure", _expose, receivers, lit, reflected.samples)
-        smooth = _smooth_moving if clip.requires_grad else smooth_silhouettes
-        smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, clip)
-        averaged = samples_of("averaging", film.average, smoothed, self._across)
-        if self._across == 1:
-            averaged = Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
+            samples = self._exposed(lit, reflected.samples)
+        averaged = self._averaged(samples, is_moving=clip.requires_grad)
         return averaged
+
+    def in_photograph(
+        self,
+        photograph: Source,
+        unshadowed: Source,
+        catches: wp.array,
+        light: Light | None = None,
+        albedo: Given = None,
+        textures: Given = None,
+    ) -> Node:
+        """The image in a photograph of what the catchers are: linear RGB, vec3 of shape [batch, height, width].
+
+        Args:
+            photograph: Linear RGB, vec3 of shape [batch, height, width].
+            unshadowed, catches: As for :func:`warpshadow.stages.photograph.divide_samples`.
+            light, albedo, textures: As for :meth:`image`.
+        """
+        materials = self.materials.replaced(albedo, textures)
+        lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
+
+        def divide(fragments: Fragments, *given: wp.array) -> Division:
+            return divide_samples(fragments.face_ids, catches, *given)
+
+        seen = Fixed(self.fragments_node), reflected.samples, unshadowed
+        division = Node("ratio", divide, *seen, items=self._samples, keeps=False)
+        drawn, inverse, rest = (Node("", operator.itemgetter(part), division, keeps=False) for part in range(3))
+        is_moving = self.clip_positions.requires_grad
+        films = [self._averaged(self._exposed(lit, each), is_moving=is_moving) for each in (drawn, inverse)]
+        return Node("photograph", compose, photograph, *films, self._averaged(rest), keeps=False)
+
+    def white(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
+        """What samples receive, and coverage, vec4 of shape [batch, height · across, width · across].
+
+        Albedo and textures matter where light bounces.
+        """
+        return self._exposed_white(self.shading(light, self.materials.replaced(albedo, textures)))
+
+    def at_receivers_of(self, other: "View") -> "View":
+        """The view with the receivers of another of the same cameras, among what blocks light in this one."""
+
+        def exchanged() -> View:
+            given = self.vertices, self.spheres, other.receivers_node, self.call, None, self.normals, self.blocking
+            view = copy.copy(self)
+            LitPoints.__init__(view, self.method, self.materials, *given)
+            view._white = view.receivers_node, view.receivers_node
+            return view
+
+        return other.kept("in another scene", self, exchanged)
+
+    def _exposed(self, lit: Node, reflected: Node) -> Node:
+        """Node of the samples."""
+        samples_of = functools.partial(Node, "exposure", items=self._samples, keeps=False)
+        if self.clip_positions.requires_grad:
+            moving = self.silhouettes, self.clip_positions
+            return samples_of(_expose_moving, self.receivers_node, lit, reflected, *moving)
+        return samples_of(_expose, self.receivers_node, lit, reflected)
+
+    def _averaged(self, samples: Node, *, is_moving: bool = False) -> Node:
+        """Node of the pixels of samples, or of samples and edge colors of what moves."""
+        samples_of = functools.partial(Node, items=self._samples, keeps=False)
+        smooth = _smooth_moving if is_moving else smooth_silhouettes
+        smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
+        if self._across == 1:
+            return Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
+        return samples_of("averaging", film.average, smoothed, self._across)
 
     def _exposed_white(self, lit: Node) -> Node:
         """Node of the samples if every surface were white; kept with the last shading."""

@@ -272,6 +272,8 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     place = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
     if body.self_shadows is not None:
         place["self_shadows"] = body.self_shadows
+    if body.shadow_catcher:
+        place["shadow_catcher"] = True
     return table | place | {"receivers": body.receivers}, written
 
 

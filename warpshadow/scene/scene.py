@@ -164,6 +164,10 @@ class Body:
         self_shadows: What shadows it casts on itself, "traced" or of its "spheres", as for :class:`Visibility`; None
             for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
+        shadow_catcher: Whether it stands for what a photograph shows: :func:`warpshadow.insert` does not draw it, and
+            has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
+            other bodies to that without them. In the image of :func:`warpshadow.render` its shadow is coverage alone.
+            ``draw``, torch's renderer, fits and the viewer show it as any other body.
     """
 
     mesh: Mesh
@@ -176,6 +180,7 @@ class Body:
     receivers: str
     name: str | None
     self_shadows: str | None
+    shadow_catcher: bool
 
     def __init__(
         self,
@@ -189,10 +194,11 @@ class Body:
         receivers: str = AUTO,
         name: str | None = None,
         self_shadows: str | None = None,
+        shadow_catcher: bool = False,
     ):
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
-        vars(self).update(self_shadows=self_shadows)
+        vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
         self._read_files()
         expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
@@ -460,6 +466,11 @@ class Scene:
             got = check.described(bodies)
             raise ValueError(f"{argument}: got {got}, expected a list of bodies, by numbers or names, such as [0]")
         return tuple(self.body_number(body, argument) for body in bodies)
+
+    @property
+    def catchers(self) -> tuple[int, ...]:
+        """Numbers of the bodies that stand for what a photograph shows."""
+        return tuple(number for number, body in enumerate(self.bodies) if body.shadow_catcher)
 
     def per_body(self, given: PerBody[Item] | None, argument: str) -> list[Item | None]:
         """What is given for each body, None for those for which nothing is.

@@ -1,0 +1,146 @@
+"""Photographs: bodies put into one, with the shadows that they cast on what it shows.
+
+Some bodies of the scene, the catchers, stand for what the photograph shows. They are not drawn. Where a sample sees one
+that receives the light S with all bodies and S₀ with catchers alone, the photograph P becomes [Debevec 1998, section 6,
+by a ratio in place of a difference, which asks for no albedo]
+
+    P (1 + (S − S₀) r),    r = S₀⁺ / (S₀⁺² + ε²)
+
+which is P S / S₀ where S₀ ≫ ε, by 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is 1/256 of the mean
+of S₀ over the samples that see catchers: what a photograph of 8 bits does not tell from black. The factor of P is
+averaged over the samples of a pixel and smoothed at silhouettes, P is not: what has no shadow stays as it is.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.launch import launch
+
+_FLOOR = 1.0 / 256.0
+
+
+@wp.func
+def _inverse(light: float, floor: float):
+    """r, from S₀ and ε."""
+    if floor <= 0.0:
+        return 0.0
+    relative = wp.max(light, 0.0) / floor
+    return relative / ((relative * relative + 1.0) * floor)
+
+
+@wp.kernel
+def _divide(
+    # in
+    face_ids: wp.array2d(dtype=wp.int32),
+    catches: wp.array(dtype=wp.bool),
+    reflected: wp.array2d(dtype=wp.vec3),
+    unshadowed: wp.array2d(dtype=wp.vec4),
+    floors: wp.array(dtype=float),
+    # out
+    drawn: wp.array2d(dtype=wp.vec3),
+    inverse: wp.array2d(dtype=wp.vec3),
+    rest: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a sample."""
+    batch, sample = wp.tid()
+    face = face_ids[instance_in(batch, face_ids.shape[0]), sample]
+    if face < 0:
+        drawn[batch, sample] = wp.vec3()
+        inverse[batch, sample] = wp.vec3()
+        rest[batch, sample] = wp.vec4(1.0, 1.0, 1.0, 1.0)
+    elif catches[face]:
+        light = unshadowed[instance_in(batch, unshadowed.shape[0]), sample]
+        floor = floors[instance_in(batch, floors.shape[0])]
+        a = _inverse(light[0], floor)
+        b = _inverse(light[1], floor)
+        c = _inverse(light[2], floor)
+        drawn[batch, sample] = wp.vec3()
+        inverse[batch, sample] = wp.vec3(a, b, c)
+        rest[batch, sample] = wp.vec4(1.0 - light[0] * a, 1.0 - light[1] * b, 1.0 - light[2] * c, 0.0)
+    else:
+        drawn[batch, sample] = reflected[instance_in(batch, reflected.shape[0]), sample]
+        inverse[batch, sample] = wp.vec3()
+        rest[batch, sample] = wp.vec4()
+
+
+class Division(NamedTuple):
+    """What samples reflect of what they receive, vec3 of shape [batch, height, width], and show beside that."""
+
+    drawn: wp.array
+    """Where they see a body that is drawn."""
+    inverse: wp.array
+    """r where they see a catcher, 0 elsewhere."""
+    rest: wp.array
+    """1 − S₀ r where they see a catcher, 1 where there is nothing; vec4."""
+
+
+def divide_samples(face_ids: wp.array, catches: wp.array, reflected: wp.array, unshadowed: wp.array) -> Division:
+    """Divide samples into those that show bodies and those that show the photograph, in the light or in shadow.
+
+    Args:
+        face_ids: Face that each sample sees, −1 for none, int32 of shape [batch, height, width].
+        catches: Whether a face is one of a catcher, bool of shape [face].
+        reflected: What the samples reflect, vec3 of shape [batch, height, width].
+        unshadowed: S₀, and 1 where a sample sees a catcher were there nothing else, vec4 likewise.
+            Any batch may be 1 and then serves every instance.
+
+    Differentiable: reflected, unshadowed (but for ε).
+    """
+    count, device = (
+        common_batch({"face_ids": face_ids, "reflected": reflected, "unshadowed": unshadowed}),
+        face_ids.device,
+    )
+    received = unshadowed.numpy()
+    covered = np.maximum(received[..., 3].sum(axis=(1, 2)), 1.0)
+    means = np.maximum(received[..., :3], 0).sum(axis=(1, 2, 3), dtype=np.float64) / (3 * covered)
+    floors = wp.array(_FLOOR * means, dtype=float, device=device)
+    size = count, face_ids[0].size
+    parts = [wp.empty(size, dtype=dtype, device=device) for dtype in (wp.vec3, wp.vec3, wp.vec4)]
+    launch(_divide, size, inputs=[rows(face_ids), catches, rows(reflected), rows(unshadowed), floors], outputs=parts)
+    return Division(*(part.reshape((count, *face_ids.shape[1:])) for part in parts))
+
+
+@wp.kernel
+def _compose(
+    # in
+    photograph: wp.array3d(dtype=wp.vec3),
+    drawn: wp.array3d(dtype=wp.vec4),
+    caught: wp.array3d(dtype=wp.vec4),
+    rest: wp.array3d(dtype=wp.vec4),
+    # out
+    composed: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a pixel."""
+    batch, row, column = wp.tid()
+    taken = photograph[instance_in(batch, photograph.shape[0]), row, column]
+    color = drawn[instance_in(batch, drawn.shape[0]), row, column]
+    a = caught[instance_in(batch, caught.shape[0]), row, column]
+    b = rest[instance_in(batch, rest.shape[0]), row, column]
+    factor = wp.vec3(a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    composed[batch, row, column] = wp.vec3(color[0], color[1], color[2]) + wp.cw_mul(taken, factor)
+
+
+def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
+    """Multiply a photograph by its ratio of light, and put bodies into it.
+
+    Args:
+        photograph: Linear RGB, vec3 of shape [batch, height, width].
+        drawn: The film of what samples reflect of what they receive, vec4 of shape [batch, height, width].
+        caught: That of ``inverse`` of what they receive, likewise.
+        rest: That of ``rest``, likewise.
+            Any batch may be 1 and then serves every instance.
+
+    Returns:
+        Linear RGB, vec3 of shape [batch, height, width].
+
+    Differentiable: all.
+    """
+    count = common_batch({"photograph": photograph, "drawn": drawn, "caught": caught, "rest": rest})
+    check.shape("photograph", photograph.shape, ("batch", *drawn.shape[1:]))
+    composed = wp.empty((count, *drawn.shape[1:]), dtype=wp.vec3, device=drawn.device)
+    launch(_compose, composed.shape, inputs=[photograph, drawn, caught, rest], outputs=[composed])
+    return composed
