@@ -10,8 +10,10 @@ import pytest
 import torch
 import warp as wp
 
+import warpshadow as ws
 from warpshadow import check
 from warpshadow.assets.mesh import MeshError
+from warpshadow.torch import TorchRenderer
 
 
 def test_a_known_choice_passes():
@@ -200,3 +202,25 @@ def test_a_string_in_an_expected_shape_stands_for_any_length():
 def test_a_wrong_shape_is_named_with_the_expected_one(got):
     with pytest.raises(ValueError, match=r"^positions: got shape \(.*\), expected \[2, vertex, 3\]$"):
         check.shape("positions", got, (2, "vertex", 3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ws.Camera(eye=(0, 0, 1)), r"Camera: unknown argument 'eye' \(write Camera.look_at\(eye, target"),
+        (lambda: ws.Body(ws.icosphere(), color=(1, 0, 0)), r"Body: unknown argument 'color' \(write albedo\)"),
+        (lambda: ws.Body(ws.icosphere(), scal=2), r"Body: unknown argument 'scal' \(did you mean 'scale'\?\)"),
+        (lambda: ws.render(None, bounces=2), r"render: unknown argument 'bounces' \(write Scene\(…, bounces=…\)\)"),
+    ],
+)
+def test_an_unknown_keyword_names_what_is_meant(call, message):
+    with pytest.raises(TypeError, match=f"^{message}"):
+        call()
+
+
+def test_a_warning_of_the_renderer_points_at_the_line_that_called_it():
+    scene = ws.Scene([ws.Body(ws.icosphere(), blockers=0)], np.ones((4, 3)), ws.Camera.look_at((0, 0, 5), (0, 0, 9)))
+    for render in (ws.render, lambda scene: TorchRenderer(scene)()):
+        with pytest.warns(UserWarning, match="the image shows nothing") as caught:
+            render(scene)
+        assert caught[0].filename == __file__

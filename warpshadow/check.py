@@ -1,21 +1,33 @@
-"""Argument checks: one clear error that names the argument, what it got and what it accepts."""
+"""Argument checks: one clear error that names the argument, what it got and what it accepts; and warnings."""
 
 import contextlib
 import difflib
+import functools
+import inspect
 import math
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import sys
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeGuard
+from types import FrameType
+from typing import ParamSpec, TypeGuard, TypeVar
 
 import numpy as np
 import warp as wp
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 AnyPath = str | os.PathLike[str]
 """A path as it may be given."""
 
 LARGEST = 1.0e18
 """The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
+
+_OWN_FOLDER = str(Path(__file__).parent)
+
+_PASSED_OVER = ("contextlib", "dataclasses", "functools", "torch")  # modules between a user's line and ours
 
 _LONGEST = 60  # characters of a value that messages quote
 
@@ -48,6 +60,30 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
             )
 
 
+def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Make the TypeError of a function for an unknown keyword name the argument that is meant.
+
+    Args:
+        instead: What to write in place of keywords that are likely; others are compared with the arguments' names.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        known = list(inspect.signature(function).parameters)
+        name = function.__qualname__.removesuffix(".__init__")
+
+        @functools.wraps(function)
+        def checked(*args: P.args, **given: P.kwargs) -> T:
+            for key in given:
+                if key not in known:
+                    meant = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
+                    raise TypeError(f"{name}: unknown argument {key!r}{meant}")
+            return function(*args, **given)
+
+        return checked
+
+    return decorate
+
+
 @contextlib.contextmanager
 def located(where: str, error: type[ValueError] = ValueError) -> Iterator[None]:
     """Begin the message of a mistake with where it is, and raise it as ``error``, or as FileNotFoundError if it is one.
@@ -60,6 +96,19 @@ def located(where: str, error: type[ValueError] = ValueError) -> Iterator[None]:
         raise FileNotFoundError(f"{where}: {cause}") from cause
     except (ValueError, TypeError) as cause:
         raise error(f"{where}: {cause}".replace(f"got {NOTHING!r},", "missing,")) from cause
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn, and point at the line from which the package was called."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and _is_passed_over(frame):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_passed_over(frame: FrameType) -> bool:
+    module = frame.f_globals.get("__name__", "").partition(".")[0]
+    return frame.f_code.co_filename.startswith(_OWN_FOLDER) or module in _PASSED_OVER
 
 
 def is_number(value: object) -> TypeGuard[float]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import sys
 import time
 import warnings
@@ -36,6 +37,8 @@ INTERRUPTED = 130
 # Files in the folder of a fit, beside its results.
 _CHECKPOINT = "checkpoint"
 _PREVIEW = "preview.png"
+
+_BACKGROUNDS = ("transparent", "environment")  # beside colors
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
@@ -178,11 +181,12 @@ def render(
                     raise ValueError(f"{option}: got it beside {video}, expected one of them")
         if png is not None:
             _check_output(png, *SUFFIXES)
-        plain = None if background in ("transparent", "environment") else background
+        plain = None if background in _BACKGROUNDS else background
         try:
             Picture(np.zeros((1, 1, 4)), exposure=exposure, background=plain)  # refused before the work
         except ValueError as error:
-            raise ValueError(f"--{error}") from error
+            others = f", or one of {', '.join(_BACKGROUNDS)}" if str(error).startswith("background") else ""
+            raise ValueError(f"--{error}{others}") from error
         given: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
         parsed = load_scene(scene, **{name: value for name, value in given.items() if value is not None})
         where = _device(device)
@@ -191,7 +195,7 @@ def render(
             typer.echo(f"auto: {describe(loaded)}")
         start = time.perf_counter()
         if video is not None:
-            cameras = path.cameras(loaded.camera) if path is not None else _turntable(loaded, turntable or 1)
+            cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
             frames = _frames(loaded, cameras, where, exposure, tone, background)
             write_video(output, frames, fps=24.0 if path is None else path.fps)
             typer.echo(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s")
@@ -212,15 +216,6 @@ def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
     if background == "environment":
         return scene.background()
     return None if background == "transparent" else background
-
-
-def _turntable(scene: Scene, count: int) -> list[Camera]:
-    """Cameras all around what a camera would frame."""
-    from warpshadow.assets.camera import framed_points
-
-    points = framed_points(scene)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return [scene.camera.turned(360 * number / count, middle) for number in range(count)]
 
 
 def _frames(
@@ -292,6 +287,8 @@ def view(
         typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
         viewer.open(browser)
         viewer.wait()
+    sys.stdout.flush()
+    os._exit(0)  # at once: Python's own end waits for what is being compiled or painted, and unloads all kernels
 
 
 @app.command()

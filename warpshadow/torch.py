@@ -234,12 +234,18 @@ class TorchRenderer(torch.nn.Module):
             if tensor is not None:
                 counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
                 shape = counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,)
-                given.add(f"albedo[{number}]", tensor, wp.vec3, shape)
+                given.add(f"albedo[{number}]", tensor, wp.vec3, shape, said=self._said("albedo", albedo, number))
         for number, tensor in enumerate(self.scene.per_body(textures, "textures")):
             if tensor is not None:
                 remedy = check.channels_last(np.shape(tensor))
-                given.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy)
+                said = self._said("textures", textures, number)
+                given.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, said=said)
         return given
+
+    def _said(self, argument: str, given: PerBody[torch.Tensor] | None, number: int) -> str:
+        """What messages call an item for a body: by the name of the body where that was given."""
+        keys = given if isinstance(given, Mapping) else ()
+        return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
 
     def _inputs(
         self,
@@ -291,7 +297,8 @@ class TorchRenderer(torch.nn.Module):
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
         given = _Arguments(self.device)
-        given.add("rotations", rotations, wp.mat33, (count,))
+        remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
+        given.add("rotations", rotations, wp.mat33, (count,), remedy)
         given.add("translations", translations, wp.vec3, (count,))
         given.add("scales", scales, wp.float32, (count,))
         given.expand()
@@ -441,11 +448,21 @@ class _Arguments:
         self._bodies: dict[str, dict[str, Any]] = {}  # of geometries, those that move and those that are deformed
 
     def add(
-        self, name: str, tensor: torch.Tensor, dtype: type, shape: tuple[int | str, ...], meaning: str = ""
+        self,
+        name: str,
+        tensor: torch.Tensor,
+        dtype: type,
+        shape: tuple[int | str, ...],
+        meaning: str = "",
+        *,
+        said: str | None = None,
     ) -> None:
-        """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it."""
+        """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it.
+
+        Messages about it call it ``said``, by default its name.
+        """
         shape = (*shape, *item_shape(dtype))
-        _check_tensor(name, tensor, self.device, shape, meaning)
+        _check_tensor(said or name, tensor, self.device, shape, meaning)
         has_batch = tensor.ndim > len(shape)
         self._has_batch |= has_batch
         self.names.append(name)

@@ -125,7 +125,7 @@ def test_a_turned_camera_sees_what_the_camera_sees_of_things_turned_with_it():
         ("shown: got what is a point or a line along", ws.Mesh([[1, 2, 3]], [[0, 0, 0]]), {}),
         ("shown: got what is a point", ws.Mesh([[0, 0, 0], [0, 0, 1]], [[0, 1, 1]]), {"direction": (0, 0, 2)}),
         ("direction: got [0.0, 0.0, 0.0]", ws.icosphere(), {"direction": (0, 0, 0)}),
-        ("up: got [0.0, 1.0, 0.0]", ws.icosphere(), {"direction": (0, 1, 0)}),
+        ("direction: got [0.0, 1.0, 0.0], parallel to up", ws.icosphere(), {"direction": (0, 1, 0)}),
         ("margin: got 1", ws.icosphere(), {"margin": 1}),
         ("fov_y: got 180", ws.icosphere(), {"fov_y": 180}),
         ("near: got 0", ws.icosphere(), {"near": 0}),
@@ -366,3 +366,32 @@ def test_composed_clip_matrices_are_those_of_the_cameras(device):
         compose_clip_matrices(*arrays[:2], to_device(parts[2][:2], wp.vec3, device), size=(40, 30))
     with pytest.raises(ValueError, match="^near: got 0"):
         compose_clip_matrices(*arrays, size=(40, 30), near=0)
+
+
+def tall_bar():
+    """A bar that is wide, and deep: seen from the front it looks narrow."""
+    return ws.icosphere(1.0, 3).transformed(scale=(0.5, 0.5, 2.0), translation=(3, 1, 0))
+
+
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_cameras_around_a_body_show_all_of_it_where_the_first_does(size):
+    bar = tall_bar()
+    framing = ws.Camera.framing(bar, direction=(0, 0.3, 1), size=size)
+    cameras = framing.around(bar, 8)
+    for number, camera in enumerate(cameras):
+        pixels = camera.project(bar.positions)
+        assert (pixels > 0).all() and (pixels < size).all()
+        turned = framing.turned(45 * number, (3, 1, 0))
+        np.testing.assert_allclose(camera.rotation, turned.rotation, atol=1e-12)
+        back = turned.rotation @ (camera.eye - turned.eye)
+        np.testing.assert_allclose(back, (0, 0, back[2]), atol=1e-5)
+        assert back[2] < 0
+    nearest = min(np.minimum(c.project(bar.positions), size - c.project(bar.positions)).min() for c in cameras)
+    assert 0 < nearest < 4  # no farther away than needed
+
+
+def test_a_camera_that_shows_a_part_stays_as_near_on_its_way_around():
+    bar = tall_bar()
+    near = ws.Camera.look_at((3, 1, 2.5), (3, 1, 0), fov_y=10)
+    for number, camera in enumerate(near.around(bar, 4)):
+        np.testing.assert_allclose(camera.eye, near.turned(90 * number, (3, 1, 0)).eye, atol=1e-6)

@@ -66,10 +66,9 @@ def test_a_block_that_fails_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_folder_is_named_by_the_file_that_was_asked_for(tmp_path):
-    with pytest.raises(FileNotFoundError, match="No such file") as raised, files.whole(tmp_path / "no" / "a.txt"):
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="/no: no such folder$"), files.whole(tmp_path / "no" / "a.txt"):
         pytest.fail("there is nothing to write to")
-    assert raised.value.filename == str(tmp_path / "no" / "a.txt")
 
 
 def test_a_file_can_be_written_where_a_folder_takes_files(tmp_path):

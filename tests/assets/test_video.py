@@ -59,6 +59,9 @@ def test_images_have_the_exposure_of_the_first(tmp_path):
         ("a.gif", [*frames(), np.ones((2, 2, 3), np.float32)], {}, r"frames\[3\]: got shape \(2, 2, 3\)"),
         ("a.gif", [*frames(), np.full((34, 51, 3), np.nan)], {}, r"frames\[3\]: image: got 5202 NaN"),
         ("a.gif", frames(), {"fps": 0}, "fps: got 0"),
+        ("a.gif", frames(), {"fps": 60}, "fps: got 60, expected 0.1 to 50 for .gif"),
+        ("a.webp", frames(), {"fps": 1e-9}, "fps: got 1e-09, expected 0.1 to 90"),
+        ("a.gif", np.ones((8, 8, 4)), {}, r"frames: got an array of shape \(8, 8, 4\), expected \[frame, height"),
     ],
 )
 def test_what_is_refused_leaves_the_old_file(tmp_path, name, given, options, message):
@@ -66,6 +69,22 @@ def test_what_is_refused_leaves_the_old_file(tmp_path, name, given, options, mes
     with pytest.raises(ValueError, match=message):
         ws.write_video(tmp_path / name, given, **options)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "old")]
+
+
+@pytest.mark.parametrize("fps", [7, 12, 24, 30, 48])
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_a_video_lasts_as_long_as_its_frames(tmp_path, suffix, fps):
+    """To half a step, 10 ms or 1 ms, where each frame alone would be off by as much."""
+    from PIL import Image, ImageSequence
+
+    path = tmp_path / f"a.{suffix}"
+    ws.write_video(path, np.random.default_rng(0).random((40, 8, 8, 3)), fps=fps)
+    with Image.open(path) as file:
+        frames = ImageSequence.Iterator(file)
+        durations = [frame.info["duration"] for frame in frames if frame.load() is not None]
+    assert len(durations) == 40
+    assert abs(sum(durations) - 40e3 / fps) <= (5 if suffix == "gif" else 0.5)
+    assert np.ptp(durations) <= (10 if suffix == "gif" else 1)
 
 
 def test_without_ffmpeg_an_mp4_is_refused_and_says_what_to_install(tmp_path, monkeypatch):

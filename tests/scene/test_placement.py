@@ -13,15 +13,20 @@ LIGHT = np.ones((4, 3))
 GROUND = ws.Body(ws.plane(20.0, 2), name="ground", translation=(0, -1, 0))
 
 
-def test_a_body_stands_on_the_ground_as_it_is_turned():
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 3, 2)])
+def test_a_body_stands_on_the_ground_as_it_is_turned(shape):
     body = ws.Body(
-        ws.icosphere(0.7, 2), rotation=(10, 200, 40), translation=(5, 6, 7), scale=2.0, albedo=(0.1, 0.2, 0.3)
+        ws.icosphere(0.7, 2).transformed(scale=shape, translation=(9, 9, 9)),
+        rotation=(10, 200, 40),
+        translation=(5, 6, 7),
+        scale=2.0,
+        albedo=(0.1, 0.2, 0.3),
     )
     for foot in ((0.0, 0.0, 0.0), (3.0, -1.0, 2.0)):
         standing = body.on_ground(foot)
         points = standing.world_mesh().positions
         low, high = points.min(axis=0), points.max(axis=0)
-        np.testing.assert_allclose([(low + high)[0] / 2, low[1], (low + high)[2] / 2], foot, atol=1e-6)
+        np.testing.assert_allclose([(low + high)[0] / 2, low[1], (low + high)[2] / 2], foot, atol=1e-5)
         assert standing.mesh is body.mesh and standing.scale == body.scale  # so its spheres stay
         np.testing.assert_array_equal(standing.rotation, body.rotation)
         np.testing.assert_array_equal(standing.albedo, body.albedo)
@@ -29,9 +34,21 @@ def test_a_body_stands_on_the_ground_as_it_is_turned():
 
 def test_a_body_is_scaled_to_a_size_as_it_is_put_on_the_ground():
     mesh = ws.icosphere(0.7, 2).transformed(scale=(1, 3, 2), translation=(9, 9, 9))
-    points = ws.Body(mesh, scale=5.0, rotation=(30, 0, 0)).on_ground(size=2.5).world_points()
-    assert np.ptp(points, axis=0).max() == pytest.approx(2.5)
-    assert points[:, 1].min() == pytest.approx(0.0, abs=1e-12)
+    for rotation in ((0, 0, 0), (90, 0, 0)):
+        points = ws.Body(mesh, scale=5.0, rotation=rotation).on_ground(size=2.5).world_points()
+        assert np.ptp(points, axis=0).max() == pytest.approx(2.5)
+        assert points[:, 1].min() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_body_that_is_turned_before_it_stands_has_the_same_size_and_place():
+    """So two that differ by a turn about the vertical through their middle stand in each other's place."""
+    mesh = ws.Mesh([(0, 0, 0), (2, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 1, 2), (0, 2, 3)])
+    straight, turned = (ws.Body(mesh, rotation=(0, angle, 0)).on_ground((3, 0, 1), size=5.0) for angle in (0, 25))
+    middle = np.mean(mesh.bounds, axis=0)
+    for body in (straight, turned):
+        assert body.scale == 2.5
+        stands = body.scale * body.rotation_matrix() @ middle + body.translation
+        np.testing.assert_allclose(stands, (3, 1.25, 1), atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "options"), [("size", {"size": 0}), ("foot", {"foot": (0, 1)})])

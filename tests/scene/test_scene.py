@@ -370,7 +370,7 @@ def test_a_missing_scene_file_is_named(tmp_path):
         ({"albedo": np.ones((11, 3))}, r"albedo: got shape \(11, 3\)"),
         ({"albedo": (np.nan, 0, 0)}, "albedo: got 1 NaN"),
         ({"texture": np.ones((2, 2, 3))}, "texture: got an image, but mesh 'icosphere' has no uvs"),
-        ({"albedo": "red"}, r"albedo: got 'red', expected 3 finite numbers, or an .npy file"),
+        ({"albedo": "red"}, r"albedo: got 'red', expected a linear color such as"),
         ({"albedo": (255, 100, 3)}, r"albedo: got values from 3.0 to 255.0, .*srgb_to_linear\(colors / 255\)"),
         ({"albedo": np.ones((12, 3), np.uint8)}, "albedo: got values of uint8"),
         ({"blockers": -1}, "blockers: got -1"),

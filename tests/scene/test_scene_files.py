@@ -322,7 +322,7 @@ def test_a_color_for_each_vertex_can_be_named(load, tmp_path):
         ('spheres = "colors.npy"\n', ["spheres: got", "colors.npy", "expected an .npz file"]),
         ('spheres = "other.npz"\n', ["spheres: got", "other.npz", "centers", "expected an .npz file"]),
         ('spheres = "bad.npz"\n', ["radii: got -1.0"]),
-        ('albedo = "red"\n', ["albedo: got 'red'", "3 finite numbers, or an .npy file"]),
+        ('albedo = "red"\n', ["albedo: got 'red'", "a linear color such as (0.8, 0.1, 0.1)", "or an .npy file"]),
         ('albedo = "colors.npy"\n', ["albedo: got shape (5, 3), expected [3] or [42, 3]"]),
         ('albedo = "text.npy"\n', ["albedo: got", "text.npy", "expected an .npy file"]),
         ('albedo = "objects.npy"\n', ["albedo: got", "objects.npy", "expected an .npy file"]),
@@ -343,3 +343,29 @@ def test_a_file_of_spheres_or_colors_that_is_none_is_refused(refused, tmp_path, 
 @pytest.mark.parametrize("line", ['spheres = "no.npz"', 'albedo = "no.npy"'])
 def test_a_missing_file_of_spheres_or_colors_is_named(refused, line):
     refused(TABLES + line, "1st [[body]]", "no such file", error=FileNotFoundError)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            TABLES.replace("[[body]]", "[body]") + "[body]\n",
+            "a table that comes several times has two brackets, [[body]]",
+        ),
+        (TABLES + "name = cow\n", 'text is in quotes, "…"'),
+        (TABLES + "color = [1, 0, 0]\n", "unknown key 'color' (did you mean 'albedo'?)"),
+        (
+            TABLES.replace("eye = [0, 1, 4]\ntarget = [0, 0, 0]\n", ""),
+            'eye: missing, expected eye and target, or framing = "auto"',
+        ),
+    ],
+)
+def test_a_newcomers_mistake_is_answered_with_what_to_write(refused, text, said):
+    refused(text, said)
+
+
+def test_a_mesh_in_place_of_a_scene_file_is_named(tmp_path):
+    path = tmp_path / "cow.obj"
+    ws.icosphere().write(path)
+    with pytest.raises(ws.SceneError, match=r'cow.obj: got a mesh, expected a scene file, .* mesh = "cow.obj"'):
+        ws.load_scene(path)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets import files
 
 Item = TypeVar("Item")
@@ -52,12 +52,12 @@ def remembered(
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                     return read(stored)
             except Exception as problem:  # whatever a damaged file raises: it can always be made again
-                warnings.warn(f"cached {what} {path} cannot be read ({problem}); it is made again", stacklevel=5)
+                check.warn(f"cached {what} {path} cannot be read ({problem}); it is made again")
         made = make()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with files.whole(path) as unfinished:
                 np.savez(unfinished, allow_pickle=False, **arrays(made))
         except OSError as problem:
-            warnings.warn(f"the {what} could not be cached in {path.parent} ({problem})", stacklevel=5)
+            check.warn(f"the {what} could not be cached in {path.parent} ({problem})")
     return made

@@ -13,7 +13,6 @@ Conventions (OpenCV, with pixel centers at +0.5):
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -29,6 +28,9 @@ _ROTATION_TOLERANCE = 1e-4
 
 # Fields of view below this [degrees] are rather π/2 radians or less.
 _NARROW = 1.6
+
+# Part of the image that stays free in turntables for which a camera has to go back.
+_AROUND = 0.05
 
 # Near plane of a framing camera, as a part of the depth of what is nearest.
 _NEAR = 0.01
@@ -69,6 +71,9 @@ class Camera:
     height: int
     near: float
 
+    @check.keywords(
+        **dict.fromkeys(("eye", "target", "up", "fov_y", "size"), "Camera.look_at(eye, target, fov_y=…, size=…)")
+    )
     def __init__(
         self,
         intrinsics: npt.ArrayLike,
@@ -160,6 +165,11 @@ class Camera:
         away = check.array("direction", direction, (3,))
         if not away.any():
             raise ValueError(f"direction: got {away.tolist()}, expected a direction, of any length but 0")
+        if _is_parallel(away, check.array("up", up, (3,))):
+            raise ValueError(
+                f"direction: got {away.tolist()}, parallel to up, expected another direction, or another up: "
+                "up=(0, 0, -1) for direction=(0, 1, 0), from above"
+            )
         if not (check.is_number(margin) and 0.0 <= margin < 1.0):
             raise ValueError(f"margin: got {check.described(margin)}, expected 0 or more and below 1")
         rotation = _looking_along(-away, up)
@@ -249,6 +259,38 @@ class Camera:
         translation = self.translation + (self.rotation - rotation) @ middle
         return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
 
+    def around(self, shown: Placed | Iterable[Placed] | HasBodies, count: int) -> list[Camera]:
+        """Cameras for a turntable: this one, turned about the vertical through the middle of what is shown.
+
+        If this one shows all of it, all do: they are so far away, along their views, that they do.
+
+        Args:
+            shown: A mesh, a body, several, or a scene; as for :meth:`framing`.
+            count: Number of cameras; they go around once, counter-clockwise seen from above.
+        """
+        points = framed_points(shown)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        angles = 360 * np.arange(check.whole("count", count, what="cameras")) / count
+        cameras = [self.turned(angle, middle) for angle in angles]
+        if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
+            return cameras
+        back = np.array([0.0, 0.0, max(0.0, *(each._missing_distance(points, margin=_AROUND) for each in cameras))])
+        return [
+            Camera(self.intrinsics, each.rotation, each.translation + back, self.width, self.height, self.near)
+            for each in cameras
+        ]
+
+    def _missing_distance(self, points: np.ndarray, margin: float = 0.0) -> float:
+        """How much farther away, along the view, it shows all points; below 0 if it does, and may be nearer."""
+        x, y, z = self.rotation @ points.T + self.translation[:, None]
+        (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
+        edges = (1 - margin) * np.array([cx, self.width - cx, cy, self.height - cy])  # pixels to the edges
+        if edges.min() <= 0:
+            return np.inf
+        u, v = fx * x + skew * y, fy * y  # pixels from the principal point, times depth
+        depths = np.stack([-u, u, -v, v]) / edges[:, None]  # at which a point is on an edge
+        return float((np.maximum(depths.max(axis=0), self.near) - z).max())
+
     def resized(self, factor: float) -> Camera:
         """The same view on an image ``factor`` times as wide and high, rounded to whole pixels, at least one."""
         factor = check.positive("factor", factor)
@@ -313,21 +355,27 @@ def framed_points(shown: Any) -> np.ndarray:
 def _looking_along(view: np.ndarray, up: npt.ArrayLike) -> np.ndarray:
     """Rotation from the world to a camera that looks along a direction of any length."""
     forward, top = view / np.linalg.norm(view), check.array("up", up, (3,))
+    if _is_parallel(forward, top):
+        raise ValueError(
+            f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}, such as "
+            "(0, 0, -1) for a view from above"
+        )
     right = np.cross(forward, top)
-    if np.linalg.norm(right) <= 1e-6 * np.linalg.norm(top):
-        raise ValueError(f"up: got {top.tolist()}, expected a direction not parallel to the view {forward.tolist()}")
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(forward, right), forward])
+
+
+def _is_parallel(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.linalg.norm(np.cross(one / np.linalg.norm(one), other)) <= 1e-6 * np.linalg.norm(other))
 
 
 def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
     if not (check.is_number(fov_y) and 0.0 < fov_y < 180.0):
         raise ValueError(f"fov_y: got {check.described(fov_y)}, expected degrees between 0 and 180")
     if fov_y < _NARROW:
-        warnings.warn(
+        check.warn(
             f"fov_y: got {fov_y:g} degrees, which is as narrow as a telescope's; if these are radians, they are "
             f"{np.degrees(fov_y):.4g} degrees",
-            stacklevel=3,
         )
     focal = 0.5 * height / np.tan(np.radians(0.5 * fov_y))
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -21,6 +21,8 @@ def whole(path: AnyPath) -> Iterator[Path]:
     Raises:
         OSError: where it cannot be written, such as on a full disk; of ``path``, whatever the file beside it is called.
     """
+    if not Path(path).parent.is_dir():
+        raise FileNotFoundError(f"{Path(path).parent}: no such folder")
     path = Path(os.path.realpath(path))  # a link stays, and what it names is written
     unfinished = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
     try:

@@ -221,7 +221,7 @@ def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndar
             codes = np.asarray(picture).astype(np.uint16)
         else:
             if is_16_bit:
-                warnings.warn(f"{path}: 16-bit color is read at 8 bits", stacklevel=3)
+                check.warn(f"{path}: 16-bit color is read at 8 bits")
             color = "L" if picture.mode in ("1", "L", "LA") else "RGB"
             codes = np.asarray(picture.convert({"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color))
     codes = codes.reshape(*codes.shape[:2], -1)

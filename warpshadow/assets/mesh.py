@@ -11,7 +11,7 @@ import functools
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -196,10 +196,18 @@ def _indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarr
     return np.array(faces, dtype=np.int32, order="C")
 
 
+class BaseColor(NamedTuple):
+    """A texture that a file of a mesh names or holds: the path of an image, or one of Pillow's; and a linear factor."""
+
+    image: Any
+    factor: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+
 class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
-    ``has_colors`` says that there are colors of vertices, which are not read.
+    ``has_colors`` says that there are colors of vertices, which are not read. ``pictures`` are those of its materials,
+    None for one that has none.
     """
 
     positions: np.ndarray
@@ -209,6 +217,7 @@ class MeshPart(NamedTuple):
     welded: int = 0
     remark: str = ""
     has_colors: bool = False
+    pictures: tuple[BaseColor | None, ...] = (None,)
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.mesh import Mesh, MeshError, MeshPart, moved_part, turned_over
+from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.image import read_rgb
+from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, moved_part, turned_over
 from warpshadow.check import AnyPath
 
 
@@ -22,7 +23,8 @@ def load_mesh(path: AnyPath) -> Mesh:
     to the first of the vertices that are duplicated only for their uvs (same position, and same normal where
     the file stores normals), so that a seam does not break the shading; without uvs they stay as they are.
     A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
-    uvs are kept only when every face has them. Colors, materials and textures are not read: they are a body's.
+    uvs are kept only when every face has them. Colors, materials and textures are not read: they are a body's, and
+    ``Body(path)`` takes the texture, too.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
@@ -37,8 +39,49 @@ def load_mesh(path: AnyPath) -> Mesh:
 
     Warns:
         Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and what was dropped: uvs
-        that some faces lack, and the colors of vertices in OBJ, PLY and glTF files.
+        that some faces lack, textures, and the colors of vertices in OBJ, PLY and glTF files.
     """
+    mesh, picture, remarks = _read(path)
+    if picture is not None:
+        remarks.append("its texture dropped, which Body(path) takes")
+    _remark(path, remarks)
+    return mesh
+
+
+def load_textured_mesh(path: AnyPath, *, wanted: bool = True) -> tuple[Mesh, np.ndarray | None]:
+    """Read a mesh as :func:`load_mesh` does, and the texture that the file names or holds.
+
+    A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
+    have the same one, and uvs. Those of USD are not read.
+
+    Args:
+        path: As there.
+        wanted: Whether the texture is to be read.
+
+    Returns:
+        The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
+
+    Warns:
+        As there; and of a texture that cannot be read.
+    """
+    mesh, picture, remarks = _read(path)
+    texture = None
+    if wanted and picture is not None:
+        try:
+            texture = _texels(picture)
+        except (OSError, ValueError) as error:
+            remarks.append(f"its texture dropped ({error})")
+    _remark(path, remarks)
+    return mesh, texture
+
+
+def _remark(path: AnyPath, remarks: list[str]) -> None:
+    if remarks:
+        check.warn(f"{path}: {', '.join(remarks)}")
+
+
+def _read(path: AnyPath) -> tuple[Mesh, BaseColor | None, list[str]]:
+    """A mesh, the picture that all its faces have, and remarks on what may surprise."""
     path = check.path("path", path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -46,18 +89,23 @@ def load_mesh(path: AnyPath) -> Mesh:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     try:
-        mesh, remarks = _concatenate(reader(path), path.stem)
+        return _concatenate(reader(path), path.stem)
     except (MeshError, ImportError) as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # the readers of other libraries raise anything on a damaged file
         raise MeshError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
-    if remarks:
-        warnings.warn(f"{path}: {', '.join(remarks)}", stacklevel=2)
-    return mesh
 
 
-def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, list[str]]:
-    """Join parts into one mesh and remark on what may surprise."""
+def _texels(picture: BaseColor) -> np.ndarray:
+    """A picture as linear RGB, float32 of shape [height, width, 3]."""
+    if isinstance(picture.image, Path):
+        return read_rgb(picture.image)
+    codes = np.asarray(picture.image.convert("RGB"))
+    return (srgb_to_linear(codes / 255) * picture.factor).astype(np.float32)
+
+
+def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, BaseColor | None, list[str]]:
+    """Join parts into one mesh, find the picture that all have, and remark on what may surprise."""
     vertex_count = sum(len(part.positions) for part in parts)
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -79,7 +127,11 @@ def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, list[str]]:
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
     if any(part.has_colors for part in parts):
         remarks.append("colors of vertices dropped, which Body(albedo=…) takes, linear, [vertex, 3]")
-    return mesh, remarks
+    pictures = [picture for part in parts for picture in part.pictures]
+    is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
+    if any(pictures) and not is_one:
+        remarks.append("textures dropped, since a body takes one that all its faces have")
+    return mesh, pictures[0] if is_one else None, remarks
 
 
 def _stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,6 +163,7 @@ def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
 def _read_obj(path: Path) -> list[MeshPart]:
     """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
     positions, uvs, corners, uv_corners, corner_counts, has_colors = [], [], [], [], [], False
+    libraries, material, materials = [], "", set()
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
         try:
@@ -120,7 +173,12 @@ def _read_obj(path: Path) -> list[MeshPart]:
                     has_colors |= len(rest) >= 3  # one number is a weight
                 case ["vt", u, *rest]:
                     uvs.append((float(u), float(rest[0]) if rest else 0.0))
+                case ["mtllib", *words]:
+                    libraries.append(" ".join(words))
+                case ["usemtl", *words]:
+                    material = " ".join(words)
                 case ["f", *tokens]:
+                    materials.add(material)
                     corner_counts.append(len(tokens))
                     for token in tokens:
                         vertex, _, others = token.partition("/")
@@ -138,7 +196,23 @@ def _read_obj(path: Path) -> list[MeshPart]:
     if len(uv_corners) < len(corners):
         missing = len(corners) - len(uv_corners)
         return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
+    pictures = _obj_pictures([path.parent / library for library in libraries])
+    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
     return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
+
+
+def _obj_pictures(libraries: list[Path]) -> dict[str, BaseColor]:
+    """The diffuse pictures of the materials of MTL files, those that are there."""
+    pictures, material = {}, ""
+    for library in filter(Path.is_file, libraries):
+        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
+            match line.split():
+                case ["newmtl", *words]:
+                    material = " ".join(words)
+                case ["map_Kd", *words]:
+                    name = words[-1] if words and words[0].startswith("-") else " ".join(words)  # after options
+                    pictures[material] = BaseColor(library.parent / name.replace("\\", "/"))
+    return pictures
 
 
 def _obj_index(token: str, count: int) -> int:
@@ -165,17 +239,30 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
 
 def _trimesh_part(shape) -> MeshPart:
     """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
+    pictures = (_trimesh_picture(getattr(shape.visual, "material", None)),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
     corner_uvs = _ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
-        return MeshPart(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3))
+        return MeshPart(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3), pictures=pictures)
     uvs = getattr(shape.visual, "uv", None)
     if uvs is None:
         return MeshPart(positions, faces, has_colors=shape.visual.kind == "vertex")
     # Normals in the cache are the file's; shape.vertex_normals computes missing ones, which differ at seams.
     normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
     welded = _weld(faces, positions, *normals)
-    return MeshPart(positions, welded, uvs, faces, len(np.unique(faces)) - len(np.unique(welded)))
+    part = MeshPart(positions, welded, uvs, faces, pictures=pictures)
+    return part._replace(welded=len(np.unique(faces)) - len(np.unique(welded)))
+
+
+def _trimesh_picture(material) -> BaseColor | None:
+    """The picture of a material, glTF's or a simple one."""
+    from trimesh.visual.material import empty_material
+
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is None or image == empty_material().image:  # which trimesh puts where there is none
+        return None
+    factor = getattr(material, "baseColorFactor", None)  # in steps of 1/255
+    return BaseColor(image) if factor is None else BaseColor(image, tuple((factor[:3] / 255).tolist()))
 
 
 def _ply_corner_uvs(shape) -> np.ndarray | None:
@@ -237,3 +324,6 @@ _READERS: dict[str, Callable[[Path], list[MeshPart]]] = {
     **dict.fromkeys([".ply", ".stl", ".glb", ".gltf"], _read_trimesh),
     **dict.fromkeys([".usd", ".usda", ".usdc", ".usdz"], _read_usd),
 }
+
+MESH_SUFFIXES = tuple(_READERS)
+"""What files of meshes are called."""

@@ -13,7 +13,15 @@ from warpshadow.assets import files
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 
-VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")
+_STEPS = {".gif": 10, ".webp": 1}
+"""What a frame's duration is a multiple of [ms]."""
+
+_FASTEST = {".mp4": 1000, ".gif": 50, ".webp": 90}
+"""Most frames a second; browsers show frames of 10 ms and less, of .gif and .webp, for 100 ms."""
+
+_SLOWEST = 0.1
+
+VIDEO_SUFFIXES = tuple(_FASTEST)
 """What files of videos are called."""
 
 
@@ -25,22 +33,29 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
             "video").
         frames: Pictures of one size, or images as :class:`Picture` takes them, which then all have the automatic
             exposure of the first. What is transparent is black.
-        fps: Frames a second.
+        fps: Frames a second, 0.1 to 1000; up to 90 of .webp, and 50 of .gif, whose frames last 10 ms, 20 ms and so on:
+            the next is shown when its time is nearest.
 
     Raises:
         ImportError: for an .mp4 file without ``imageio-ffmpeg``.
     """
     path = check.path("path", path)
     check_video(path)
-    check.positive("fps", fps)
+    most = _FASTEST[path.suffix.lower()]
+    if not (check.is_number(fps) and _SLOWEST <= fps <= most):
+        raise ValueError(f"fps: got {check.described(fps)}, expected {_SLOWEST} to {most} for {path.suffix}")
     check.instance("frames", frames, Iterable, "pictures, one after another")
+    if isinstance(frames, np.ndarray) and frames.ndim != 4:
+        raise ValueError(f"frames: got an array of shape {frames.shape}, expected [frame, height, width, channel]")
     shown = _shown(frames)
     first = next(shown, None)
     if first is None:
         raise ValueError("frames: got none, expected at least one picture")
     with files.whole(path) as unfinished:
-        write = _write_mp4 if path.suffix.lower() == ".mp4" else _write_animation
-        write(unfinished, first, shown, fps)
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(unfinished, first, shown, fps)
+        else:
+            _write_animation(unfinished, first, shown, fps, _STEPS[path.suffix.lower()])
 
 
 def check_video(path: Path) -> None:
@@ -84,10 +99,17 @@ def _write_mp4(path: Path, first: np.ndarray, others: Iterator[np.ndarray], fps:
         writer.close()
 
 
-def _write_animation(path: Path, first: np.ndarray, others: Iterator[np.ndarray], fps: float) -> None:
+def _write_animation(path: Path, first: np.ndarray, others: Iterator[np.ndarray], fps: float, step: int) -> None:
     from PIL import Image
 
-    rest = map(Image.fromarray, others)
-    Image.fromarray(first).save(
-        path, save_all=True, append_images=rest, duration=max(round(1000 / fps), 1), loop=0, quality=90
-    )
+    def time(frame: int) -> int:  # when it begins [ms]
+        return step * round(1000 * frame / (step * fps))
+
+    durations = [time(1)]
+
+    def rest() -> Iterator[Image.Image]:
+        for number, frame in enumerate(others, start=1):
+            durations.append(time(number + 1) - time(number))  # Pillow looks for it once it has the frame
+            yield Image.fromarray(frame)
+
+    Image.fromarray(first).save(path, save_all=True, append_images=rest(), duration=durations, loop=0, quality=90)

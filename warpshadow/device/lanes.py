@@ -16,7 +16,6 @@ import contextlib
 import functools
 import os
 import sys
-import warnings
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -124,7 +123,7 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
         return " ".join((base, *flags))
     refused = [flag for flag in flags if not _builds(f"{base} {flag}")]
     message = f"Warp's compiler refuses {' '.join(refused)}: kernels are built without, and may be slow"
-    warnings.warn(message, stacklevel=2)
+    check.warn(message)
     return " ".join((base, *(flag for flag in flags if flag not in refused)))
 
 

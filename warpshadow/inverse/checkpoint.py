@@ -8,13 +8,13 @@ import contextlib
 import hashlib
 import io
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.check import AnyPath
 
@@ -89,7 +89,7 @@ def load(path: AnyPath) -> dict[str, Any] | None:
         payload = _payload(candidate)
         if payload is not None:
             if faults:
-                warnings.warn(f"{faults[0]}; going on from {candidate.name}", stacklevel=2)
+                check.warn(f"{faults[0]}; going on from {candidate.name}")
             return torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
         faults.append(f"{candidate}: not a whole checkpoint (truncated or damaged)")
     if faults:

@@ -6,7 +6,6 @@ import functools
 import math
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -373,10 +372,9 @@ def fit(
         if watch is not None:
             watch.end(descent, reason)
     if descent.reason is not None and all(run.failure for run in descent.ended):
-        warnings.warn(
+        check.warn(
             f"the fit stopped in stage {descent.stage + 1}: {descent.reason}; the best values before it are kept",
             FitWarning,
-            stacklevel=2,
         )
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()

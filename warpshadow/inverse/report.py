@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.image import write_image
@@ -123,7 +123,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
     try:
         import matplotlib
     except ImportError:
-        warnings.warn(f"{path}: not drawn, since matplotlib is not installed (the extra 'plot')", stacklevel=2)
+        check.warn(f"{path}: not drawn, since matplotlib is not installed (the extra 'plot')")
         return []
     matplotlib.use("agg")
     from matplotlib import pyplot

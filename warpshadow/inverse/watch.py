@@ -9,7 +9,6 @@ from __future__ import annotations
 import builtins
 import contextlib
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import Protocol
@@ -105,7 +104,7 @@ class Watch:
             message = f"{type(error).__name__}: {error}"
             if not self._has_failed:
                 self._has_failed = True
-                warnings.warn(f"the view of the fit failed ({message}); the fit goes on", stacklevel=2)
+                check.warn(f"the view of the fit failed ({message}); the fit goes on")
             with contextlib.suppress(Exception):
                 self._page.fail(message)
 

@@ -6,7 +6,6 @@ beside the spheres that are fitted to the mesh. Other bodies' spheres block thei
 
 import hashlib
 import json
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -198,10 +197,9 @@ class OwnShadows:
             count = ray_count(self._row_count(body))
             if count < RAYS:
                 called = self._assembly.scene.bodies[body].called
-                warnings.warn(
+                check.warn(
                     f"body {body} ({called!r}): {len(sites.positions):,} points have {count} rays each for the body's "
                     f"shadow on itself, in place of {RAYS}, which would take too much memory",
-                    stacklevel=2,
                 )
             numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
             key = hashlib.sha256(json.dumps(numbers).encode())

@@ -3,7 +3,6 @@
 import copy
 import functools
 import operator
-import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -117,10 +116,9 @@ class Materials:
     def _warn_of_growth(self, name: str, values: wp.array) -> None:
         """Say, where the host need not wait for it, that more light is reflected than falls in; Python says it once."""
         if self.assembly.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
-            warnings.warn(
+            check.warn(
                 f"{name}: got values above 1, with which light grows with each bounce, expected reflectances in "
                 "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
-                stacklevel=2,
             )
 
     @property

@@ -4,7 +4,6 @@ What a call leaves out, and why, :meth:`Renderer.explain` says.
 """
 
 import functools
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -291,7 +290,7 @@ class Renderer:
         if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
             remarks = [view.emptiness(), *(misplacements(self.scene) if is_scenes else [])]
             if found := [remark for remark in remarks if remark]:
-                warnings.warn("; ".join(found), stacklevel=3)
+                check.warn("; ".join(found))
                 self._has_warned = True
         self._last_cameras = view.cameras
         if view.static is not None:
@@ -423,10 +422,9 @@ class Renderer:
         sizes = pixels_per_face(fragments.face_ids.numpy(), self.assembly) / self.scene.supersampling**2
         for number, (body, size) in enumerate(zip(self._given_scene.bodies, sizes, strict=True)):
             if body.receivers == "vertex" and not self._method.lights_samples and size > COARSE_FACE:
-                warnings.warn(
+                check.warn(
                     f"body {number} ({body.called!r}): a face covers {size:.0f} pixels on average, and light is "
                     'evaluated at its corners alone; receivers = "auto" or "pixel" evaluates it at every pixel',
-                    stacklevel=2,
                 )
 
     # ------------------------------------------------------------------------------------------ light and reflectance

@@ -16,6 +16,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.mesh_files import MESH_SUFFIXES
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
@@ -40,6 +41,8 @@ _KEYS = {
 }
 """Keys that each table of a scene file may have."""
 
+_MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
+
 
 class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
@@ -59,6 +62,8 @@ def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object)
         FileNotFoundError: for a file that is not there.
     """
     path = check.path("path", path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        raise SceneError(f'{path}: got a mesh, expected a scene file, which names it: [[body]] mesh = "{path.name}"')
     with check.located(str(path), SceneError):
         return _scene(toml_tables.read(path, "scene file"), path.parent, bounces, settings)
 
@@ -111,6 +116,8 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
         others = [] if is_typo else [other for other, keys in _KEYS.items() if key in keys]
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
+        if key not in known and _MEANT.get(key) in known:
+            raise ValueError(f"{what}: unknown key {key!r} (did you mean {_MEANT[key]!r}?)")
     check.known_keys(what, table, known)
 
 
@@ -118,6 +125,8 @@ def parse_camera(table: Table) -> Camera:
     """A camera from its table: from where it looks at what, or by intrinsics and world-to-camera [R | t]."""
     toml_tables.check_table(table)
     check.known_keys("key", table, _CAMERA_KEYS)
+    if not any(key in table for key in ("eye", "target", *_PINHOLE_KEYS)):
+        raise ValueError('eye: missing, expected eye and target, or framing = "auto", or intrinsics and the rest')
     if not any(key in table for key in _PINHOLE_KEYS):
         return toml_tables.make(Camera.look_at, table)
     mixed = next((key for key in _VIEW_KEYS if key in table), None)

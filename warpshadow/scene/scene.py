@@ -1,5 +1,7 @@
 """Scenes: bodies, light, camera and how visibility is computed."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
-from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.assets.mesh_files import load_textured_mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, falloff_width
@@ -55,6 +57,9 @@ COLORS = ".npy"
 """What a file of colors for each vertex is called; other text is no albedo."""
 
 _SPHERES = ".npz"
+
+_GRAY = (0.8, 0.8, 0.8)
+"""Reflectance of a body of which nothing is said."""
 
 
 BodyLike = int | str
@@ -124,7 +129,7 @@ class Visibility:
         check_merging(self.merging)
 
     @classmethod
-    def of(cls, settings: Mapping[str, object]) -> "Visibility":
+    def of(cls, settings: Mapping[str, object]) -> Visibility:
         """Make one of settings for any methods, by their names: all are checked, and those that its own reads count."""
         check.known_keys("key", settings, ("method", *READ_BY))
         every = object.__new__(cls)
@@ -132,7 +137,7 @@ class Visibility:
         every._check_values()
         return cls(every.method, **{name: getattr(every, name) for name in READ_BY if every.method in READ_BY[name]})
 
-    def by(self, method: str) -> "Visibility":
+    def by(self, method: str) -> Visibility:
         """The same by another method, with the settings that both read."""
         return Visibility.of(vars(self) | {"method": method})
 
@@ -145,9 +150,10 @@ class Body:
 
     Args:
         mesh: The mesh, or a file that :func:`warpshadow.load_mesh` reads.
-        albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it.
-        texture: Reflectance as an image in place of ``albedo``, linear RGB of shape [height, width, 3], or a file that
-            :func:`warpshadow.read_image` reads; needs uvs.
+        albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it. By
+            default the texture that the mesh's file has, where all its faces have the same, or gray, 0.8.
+        texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
+            [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
             casts no shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane
             that it is, whatever the number; by others a flat body with all else on its front side is a ground, for
@@ -182,10 +188,11 @@ class Body:
     self_shadows: str | None
     shadow_catcher: bool
 
+    @check.keywords(color="albedo", colour="albedo", spheres="blockers", position="translation", path="mesh")
     def __init__(
         self,
         mesh: Mesh | AnyPath,
-        albedo: npt.ArrayLike | AnyPath = (0.8, 0.8, 0.8),
+        albedo: npt.ArrayLike | AnyPath | None = None,
         texture: npt.ArrayLike | AnyPath | None = None,
         blockers: int | Spheres | AnyPath = 64,
         rotation: npt.ArrayLike = (0.0, 0.0, 0.0),
@@ -199,6 +206,7 @@ class Body:
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
+        self._read_mesh()
         self._read_files()
         expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
@@ -242,10 +250,22 @@ class Body:
         """Whether the body blocks light."""
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
+    def _read_mesh(self) -> None:
+        """Put what the mesh's file holds in place of its path, its texture where no reflectance is given."""
+        mesh, texture = self.mesh, None
+        if check.is_path(mesh):
+            path = check.file("mesh", mesh)
+            with check.located("mesh", MeshError):
+                mesh, texture = load_textured_mesh(path, wanted=self.albedo is None and self.texture is None)
+        vars(self).update(
+            mesh=mesh,
+            albedo=_GRAY if self.albedo is None else self.albedo,
+            texture=texture if self.texture is None else self.texture,
+        )
+
     def _read_files(self) -> None:
         """Put what files hold in place of their paths."""
         readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
-            ("mesh", load_mesh, "", MeshError),
             ("texture", read_rgb, "", ImageError),
             ("albedo", _read_colors, COLORS, ValueError),
             ("blockers", Spheres.read, _SPHERES, ValueError),
@@ -259,7 +279,7 @@ class Body:
 
     def _checked_albedo(self) -> np.ndarray:
         count = self.mesh.vertex_count
-        expected = "3 finite numbers, or an .npy file of [vertex, 3]"
+        expected = "a linear color such as (0.8, 0.1, 0.1), one for each vertex, [vertex, 3], or an .npy file of them"
         albedo = check.numbers("albedo", self.albedo, expected=expected)
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
@@ -290,19 +310,22 @@ class Body:
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
-    def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> "Body":
+    def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:
         """Stand the body on a ground, as it is turned; its spheres are not fitted again.
 
+        Turned otherwise, it stands at the same place and has the same size, since both are those of the mesh's bounds.
+
         Args:
-            foot: Where the middle of its bottom goes [scene units], shape [3].
-            size: Longest edge of its bounds in the world [scene units]; by default its scale stays.
+            foot: Where its bottom goes, below the middle of the mesh's bounds [scene units], shape [3].
+            size: Longest edge of the mesh's bounds, turned with it [scene units]; by default its scale stays.
         """
         foot = check.array("foot", foot, (3,))
-        points = self.world_points() - self.translation
-        low, high = points.min(axis=0), points.max(axis=0)
-        factor = 1.0 if size is None else check.positive("size", size) / (high - low).max()
-        bottom = np.array([low[0] + high[0], 2 * low[1], low[2] + high[2]]) / 2
-        return replace(self, scale=float(self.scale * factor), translation=foot - factor * bottom)
+        low, high = (corner.astype(np.float64) for corner in self.mesh.bounds)
+        scale = self.scale if size is None else check.positive("size", size) / (high - low).max()
+        points = self.mesh.world_points().astype(np.float64) @ self.rotation_matrix().T
+        bottom = self.rotation_matrix() @ (low + high) / 2
+        bottom[1] = points[:, 1].min()
+        return replace(self, scale=float(scale), translation=foot - scale * bottom)
 
     def world_points(self) -> np.ndarray:
         """The vertices that faces refer to, where they are in the world [scene units], float64 of shape [point, 3]."""
@@ -371,6 +394,9 @@ class Scene:
     supersampling: int = 2
     bounces: int = 0
 
+    @check.keywords(
+        cameras="camera; several go to Renderer(scene, cameras=[…])", method="visibility=Visibility(method)"
+    )
     def __init__(
         self,
         bodies: Iterable[Body],

@@ -29,7 +29,14 @@ def read(path: Path, kind: str) -> Table:
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # editors on Windows begin files with a mark
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
-        raise ValueError(f"not valid TOML: {cause}") from cause
+        raise ValueError(f"not valid TOML: {cause}{_remedy(str(cause))}") from cause
+
+
+def _remedy(fault: str) -> str:
+    """What most often is meant where TOML finds a fault."""
+    if " twice" in fault:
+        return "; a table that comes several times has two brackets, [[body]]"
+    return '; text is in quotes, "…"' if fault.startswith("Invalid value") else ""
 
 
 def check_table(value: object) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -129,7 +128,7 @@ def _search(fit: Callable[[int], tuple[np.ndarray, FitReport]], error: float) ->
         best = fit(count)
     if best[1].visibility_error > error:
         message = f"error: {error} is not met with {count} spheres; the fit has {best[1].visibility_error:.4f}"
-        warnings.warn(message, stacklevel=3)
+        check.warn(message)
         return best
     while count - failed > max(count // 8, 1):
         middle = (failed + count) // 2

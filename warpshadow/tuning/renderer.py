@@ -42,6 +42,12 @@ class Renderer(renderer.Renderer):
         super().__init__(scene, cameras=cameras, device=device, basis=basis, progress=progress)
 
 
+@check.keywords(
+    bounces="Scene(…, bounces=…)",
+    method="Scene(…, visibility=Visibility(method))",
+    **dict.fromkeys(("camera", "size"), "Scene(…, camera=Camera.framing(bodies, size=…))"),
+    light="Renderer(scene).render(light)",
+)
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True) -> np.ndarray:
     """Render a scene once; for several images of it, keep a :class:`Renderer`.
 

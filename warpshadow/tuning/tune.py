@@ -313,10 +313,9 @@ def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
     error, nearest = min(tried, key=lambda each: each[0])
     least = _interpolation_error(scene, sample)
     reason = "" if least < wanted else f"; interpolation between vertices alone has {least:.3f}: receivers = 'pixel'"
-    warnings.warn(
+    check.warn(
         f"visibility: no setting of method = 'auto' reaches error = {wanted:g}; {describe(nearest)} "
         f"comes nearest, with {error:.3f}{reason}",
-        stacklevel=3,
     )
     return nearest
 

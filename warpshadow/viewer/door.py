@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import socket
+import threading
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -49,8 +50,9 @@ class Server(viser.ViserServer):
 
     def close(self) -> None:
         """Let all pages go, and serve no more."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.stop()
+        stopping = threading.Thread(target=self.stop, daemon=True)
+        stopping.start()
+        stopping.join(1.0)  # it lets nobody in from now on, but waits six seconds for connections that browsers keep
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Open no tunnel."""
@@ -104,7 +106,6 @@ def check_address(host: object, port: object) -> None:
     except (OSError, UnicodeError) as cause:
         raise ValueError(f"host: got {host!r} ({cause}), expected {expected}") from cause
     if host not in OWN_NAMES:
-        warnings.warn(
+        check.warn(
             f"host: got {host!r}: everybody who can reach this address sees the scene and can change what is shown",
-            stacklevel=4,
         )

@@ -26,7 +26,6 @@ product more.
 """
 
 import functools
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -544,9 +543,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
         if broken:
             check.finite_arrays({"log_sh": log_sh})
         if held:
-            warnings.warn(
+            check.warn(
                 f"log-SH visibility of {held} of {batch_count * vertex_count} receivers is held back from rising above "
                 "1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate",
-                stacklevel=2,
             )
     return visibility
