@@ -1,0 +1,47 @@
+"""Run the notebooks, and keep what they show in them.
+
+    python demos/tools/run_notebooks.py [NOTEBOOK …]
+
+Without arguments, all in `demos/notebooks`. They hold neither paths of this machine nor times of the run.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+MOST_SECONDS = 600  # of a cell: the first one of a new machine compiles kernels and fits spheres
+
+
+def executed(path: Path, *more: str) -> nbformat.NotebookNode:
+    """A notebook as it is after it has run from its own folder, with further cells behind its own."""
+    notebook = nbformat.read(path, as_version=4)
+    notebook.cells += [nbformat.v4.new_code_cell(source) for source in more]
+    NotebookClient(notebook, timeout=MOST_SECONDS, resources={"metadata": {"path": str(path.parent)}}).execute()
+    return notebook
+
+
+def tidied(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """The same without what differs from run to run, and from machine to machine: times, progress and warnings."""
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    notebook.metadata = nbformat.from_dict({"kernelspec": kernel, "language_info": {"name": "python"}})
+    for number, cell in enumerate(notebook.cells):
+        cell.metadata, cell["id"] = nbformat.from_dict({}), f"cell-{number}"
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+    return notebook
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("notebooks", nargs="*", type=Path, default=sorted(NOTEBOOKS.glob("*.ipynb")))
+    for path in parser.parse_args().notebooks:
+        nbformat.write(tidied(executed(path)), path)
+        sys.stdout.write(f"{path}: {path.stat().st_size / 1e3:.0f} kB\n")
+
+
+if __name__ == "__main__":
+    main()
