@@ -67,7 +67,7 @@ def fetched(image, grid, y, cosine, t, radius):
     return values[0] if part == 0 else (1 - part) * values[0] + part * values[1]
 
 
-def met_sides(point, omega, radius, frames, grids, radiosity, skip):
+def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None):
     """Coverage, distance, its width, light and flat of each side that a cell meets."""
     sides = []
     for f, grid in enumerate(grids):
@@ -79,7 +79,7 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip):
         height = normal @ (point - origin) / scales[0]
         edges = [np.sign(e) * np.expm1(np.abs(e)) * grid.spread for e in (grid.low, grid.high)]
         margin = 0.1 * grid.texel_sizes().min()
-        front = ramp(1 + 2 * height / margin)
+        front = ramp(1 + 2 * height / margin) if fronts is None else fronts[f]
         for side, presence in ((1, front), (-1, 1 - front)):
             cosine = -side * (normal @ omega)
             if f == skip or presence <= 0 or cosine <= -radius:
@@ -100,7 +100,7 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip):
     return sides
 
 
-def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None):
+def twin_light(points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None):
     """Of one instance, [receiver, 3]; radiosity is [side, row, column, 3] for each flat."""
     radius, result = cell_radius(len(directions)), np.zeros((len(points), 3))
     for receiver, (point, normal) in enumerate(zip(points, normals, strict=True)):
@@ -108,7 +108,8 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
             weight = 4 / len(directions) * max(normal @ omega, 0) * transmittance[receiver, q]
             if weight == 0:
                 continue
-            sides = met_sides(point, omega, radius, frames, grids, radiosity, skip)
+            own = None if fronts is None else fronts[receiver]
+            sides = met_sides(point, omega, radius, frames, grids, radiosity, skip, own)
             for k, (_, t, width, light, _) in enumerate(sides):
                 unhidden = 1.0
                 for j, (h, other_t, other_width, _, _) in enumerate(sides):
@@ -118,12 +119,15 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
     return result
 
 
-def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=None):
+def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=None, fronts=None):
     radius, covered = cell_radius(len(directions)), np.zeros(np.shape(transmittance))
     black = [np.zeros((2, *grid.covered.shape, 3)) for grid in grids]
     for receiver, point in enumerate(points):
         for q, omega in enumerate(directions):
-            for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip):
+            if transmittance[receiver, q] == 0:
+                continue
+            own = None if fronts is None else fronts[receiver]
+            for h, *_, f in met_sides(point, omega, radius, frames, grids, black, skip, own):
                 covered[receiver, q] += h * blocks[f]
     return transmittance * np.maximum(0, 1 - covered)
 
@@ -177,6 +181,7 @@ class Setting:
         if batch > 1:
             self.points[1:] += 0.05
             self.vertices[1:] += 0.02
+        self.fronts = None  # of each receiver [receiver, flat], where its height does not decide
         self.device = device
 
     def values(self):
@@ -212,11 +217,13 @@ class Setting:
 
     def light(self, skip=None, batch=0):
         at = self.points[batch], self.normals[batch], self.transmittance[batch]
-        return twin_light(*at, self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip)
+        given = self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip, self.fronts
+        return twin_light(*at, *given)
 
     def passing(self, skip=None, batch=0):
         at = self.points[batch], self.transmittance[batch]
-        return twin_passing(*at, self.frames(self.vertices[batch]), self.grids, self.blocks, DIRECTIONS, skip)
+        given = self.frames(self.vertices[batch]), self.grids, self.blocks, DIRECTIONS, skip, self.fronts
+        return twin_passing(*at, *given)
 
 
 # ---------------------------------------------------------------------------------------------------- values
@@ -300,6 +307,34 @@ def test_gradients_of_what_passes_are_those_of_the_twin(names, device, verified_
         steps = random_steps(setting, number)
         expected = slopes_of(setting, steps, Setting.passing, weights)
         assert (variables[number].grad.numpy() * steps[number]).sum() == pytest.approx(expected, rel=2e-3), number
+
+
+def test_what_receivers_see_of_fronts_can_be_given(device, verified_tape):
+    setting, rng = Setting(device, two_sided=True, names=("ground", "wall")), np.random.default_rng(6)
+    setting.fronts = rng.uniform(0.1, 0.9, size=(7, 2))
+    setting.transmittance[:, 2:] = 0  # which spares the twin
+    points, normals, transmittance, vertices, radiosity = setting.arrays()
+    fronts = wp.array(setting.fronts[None], dtype=wp.float32, device=device, requires_grad=True)
+    with recorded() as tape:
+        frames, flats = setting.flats.frames(vertices), setting.flats
+        light = flat_light(points, normals, transmittance, frames, radiosity, flats, DIRECTIONS, fronts=fronts)
+        passing = passing_flats(points, transmittance, frames, flats, DIRECTIONS, fronts=fronts)
+    np.testing.assert_allclose(light.numpy()[0], setting.light(), atol=FLOAT32)
+    np.testing.assert_allclose(passing.numpy()[0], setting.passing(), atol=FLOAT32)
+
+    weights = rng.uniform(size=(7, 3)), rng.uniform(size=passing.shape[1:])
+    for found, twin, weight in ((light, Setting.light, weights[0]), (passing, Setting.passing, weights[1])):
+        seed = wp.array(weight[None], dtype=found.dtype, device=device)
+        tape.zero()
+        tape.backward(grads={found: seed})
+        steps = random_steps(setting, 0)
+        expected = slopes_of(setting, steps, twin, weight)
+        assert (points.grad.numpy() * steps[0]).sum() == pytest.approx(expected, rel=2e-3)
+        step, ends = 1e-6 * rng.normal(size=setting.fronts.shape), []
+        for sign in (1, -2, 1):
+            setting.fronts = setting.fronts + sign * step
+            ends.append((weight * twin(setting)).sum())
+        assert (fronts.grad.numpy()[0] * step).sum() == pytest.approx((ends[0] - ends[1]) / 2, rel=2e-3)
 
 
 def test_instances_that_share_an_array_add_to_its_gradient(device):

@@ -17,6 +17,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
@@ -220,7 +221,7 @@ class SphereBounces:
             """What sources see, where flat bodies are, and what patches show of their area towards cells."""
             make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals, items=words)
             sources = points.kept("sources", senders, make)
-            seen = see(self._at(sources, points, points.materials), where=where)
+            seen = see(self._at(sources, points, points.materials, stand_ins.spheres_of_sources), where=where)
             frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
             return seen, frames, Node("", show, sources, seen, spheres, frames)
 
@@ -269,7 +270,9 @@ class SphereBounces:
     def _still(self) -> KeptBounces:
         return KeptBounces(self._patches, self._count, own_bounces=OWN_BOUNCES, progress=self._method.progress)
 
-    def _at(self, sources: Node, points: LitPoints, materials: Materials) -> LitPoints:
-        """Sources, to be lit among the bodies among which points are."""
+    def _at(
+        self, sources: Node, points: LitPoints, materials: Materials, stand_ins: np.ndarray | None = None
+    ) -> LitPoints:
+        """Sources, to be lit among the bodies among which points are; the spheres that stand in for them, if any do."""
         given = self._method, materials, points.vertices, points.spheres, sources, points.call
-        return LitPoints(*given, normals=points.normals, blocking=points.blocking)
+        return LitPoints(*given, normals=points.normals, blocking=points.blocking, stand_ins=stand_ins)

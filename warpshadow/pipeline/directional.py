@@ -103,7 +103,10 @@ class Directional(SphereMethod):
         if flats is None or past_solid is None or not points.size:
             return seen
         facing = group.normals if group.kept_rows is None else None
-        cover = functools.partial(flat_coverage, points, flats.frames, flats.flats, facing=facing, skip=flats.skip)
+        fronts = group.fronts(flats.frames, flats.flats)
+        cover = functools.partial(
+            flat_coverage, points, flats.frames, flats.flats, facing=facing, fronts=fronts, skip=flats.skip
+        )
         covered = cover(taken.directions)
         if covered is None:
             return seen

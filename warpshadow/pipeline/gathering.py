@@ -155,7 +155,7 @@ class StandIns:
         return spheres, np.concatenate(nearest)
 
     @functools.cached_property
-    def _spheres_of_sources(self) -> np.ndarray:
+    def spheres_of_sources(self) -> np.ndarray:
         """The sphere that stands in for each source, among those of bodies that are not flat; −1 for none."""
         return self._nearest(None)[0][self.senders.patch_of_source]
 
@@ -177,7 +177,7 @@ class StandIns:
         normals, flats, senders = sources.normals, self.flats, self.senders
         if flats is not None:
             _, radii = self.assembly.spheres_of(solid_bodies(self.assembly), spheres)
-            normals = turn_from_flats(sources.points, normals, radii, self._spheres_of_sources, frames, flats.all)
+            normals = turn_from_flats(sources.points, normals, radii, self.spheres_of_sources, frames, flats.all)
         rows = [
             wp.full_like(part.past_solid, 1.0, requires_grad=False) if part.past_own is None else part.past_own
             for part in cells
@@ -285,7 +285,8 @@ class Gathering:
         flats = outgoing.stand_ins.flats
         assert flats is not None
         given = group.points, group.normals, cells.past_solid, outgoing.frames, outgoing.radiosity, flats.all
-        return flat_light(*given, cells.directions, skip=flats.number.get(group.body))
+        fronts = group.fronts(outgoing.frames, flats.all)
+        return flat_light(*given, cells.directions, fronts=fronts, skip=flats.number.get(group.body))
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
         centers, radii, exitance = outgoing.of_spheres(group.body)

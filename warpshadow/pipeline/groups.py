@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.flats import FlatsAround, SceneFlats
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.own_shadows import OwnLobes, OwnLookup
+from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
+from warpshadow.stages.flats.prepared import Flats
 from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.receivers import Receivers
@@ -33,13 +37,18 @@ class Group(NamedTuple):
     places: Places | None = None  # where they lie on that body
     own_shadow: OwnLookup | OwnLobes | None = None  # by rays; None where there is none, or its spheres block
     flats: FlatsAround | None = None  # bodies that block as planes; None without any
+    stand_ins: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
+
+    def fronts(self, frames: wp.array, flats: Flats) -> wp.array | None:
+        """Part of the front of each flat that they see; None where their heights decide."""
+        return None if self.stand_ins is None else find_fronts(self.points, self.stand_ins, frames, flats)
 
     def parts(self) -> Iterator[Group]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats = self
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, stand_ins = self
         size = points.shape[1]
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
@@ -59,6 +68,7 @@ class Group(NamedTuple):
                 centers=centers,
                 radii=radii,
                 places=None if places is None else places.part(part),
+                stand_ins=None if stand_ins is None else stand_ins.part(part),
             )
 
 
@@ -118,9 +128,10 @@ class Grouping:
     ) -> Iterator[Group]:
         """Those that may move."""
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
+        stand_ins = self._stand_ins(spheres)
         if not receivers.spans:
-            blocking = self._assembly.spheres_of(bodies, spheres)
-            yield Group(receivers.points, receivers.normals, *blocking, flats=self._flats_around(frames))
+            blocking, flats = self._assembly.spheres_of(bodies, spheres), self._flats_around(frames)
+            yield Group(receivers.points, receivers.normals, *blocking, flats=flats, stand_ins=stand_ins)
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
             is_traced = span.body in self._points.blocking.traced
@@ -130,11 +141,21 @@ class Grouping:
             if span.body >= 0:
                 places = self._points.method.own_shadows.places(receivers, span)
                 group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))
+            if stand_ins is not None:
+                group = group._replace(stand_ins=stand_ins.part(slice(span.first, span.end)))
             yield group
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
         """Those of some bodies that block by their spheres."""
         return [body for body in bodies if body not in self._points.blocking.flats]
+
+    def _stand_ins(self, spheres: tuple[wp.array, wp.array]) -> SpheresOfPoints | None:
+        """Spheres that stand in for the receivers."""
+        numbers, assembly = self._points.stand_ins, self._assembly
+        if numbers is None:
+            return None
+        solid = np.flatnonzero(~assembly.is_flat).tolist()
+        return SpheresOfPoints(*assembly.spheres_of(solid, spheres), constant(numbers, wp.int32, assembly.device))
 
     def _flats_around(
         self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1

@@ -46,6 +46,8 @@ class LitPoints:
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocking: How the bodies block light.
         stands: Whether bodies and points are where the scene and its camera have them, for good.
+        stand_ins: Of points that send light, the sphere that stands in for each among those of bodies that are not
+            flat, −1 for none, NumPy of shape [receiver].
     """
 
     def __init__(
@@ -60,8 +62,9 @@ class LitPoints:
         normals: Node | None = None,
         blocking: Blocking = BY_SPHERES,
         stands: bool = False,
+        stand_ins: np.ndarray | None = None,
     ):
-        self.blocking, self.stands = blocking, stands
+        self.blocking, self.stands, self.stand_ins = blocking, stands, stand_ins
         self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static

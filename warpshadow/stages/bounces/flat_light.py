@@ -34,7 +34,8 @@ from warpshadow.stages.flats.cells import (
     find_place_adjoint,
     find_spot,
     flat_scene,
-    front_presence,
+    front_of,
+    front_of_adjoint,
     meet,
     meet_adjoint,
     on_side,
@@ -64,7 +65,15 @@ _ROWS = 14
 
 
 @wp.func
-def _place_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), scene: FlatScene, own: wp.array(dtype=wp.vec3)):
+def _place_receiver(
+    point: wp.vec3,
+    frames: wp.array(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
+    scene: FlatScene,
+    batch: int,
+    receiver: int,
+    own: wp.array(dtype=wp.vec3),
+):
     """Write what a receiver is to each flat; returns how many sides it may meet."""
     flat_count = scene.grids.shape[0]
     side_count = int(0)
@@ -75,7 +84,7 @@ def _place_receiver(point: wp.vec3, frames: wp.array(dtype=wp.vec3), scene: Flat
         own[4 * f + 2] = place.along_v
         own[4 * f + 3] = place.normal
         # below the plane the front fades, and the back takes over
-        front = front_presence(scene.grids[f], place.at[2])
+        front = front_of(fronts, scene.grids[f], place.at[2], batch, receiver, f)
         if f != scene.skip and wp.length_sq(place.normal) > 0.0:
             if front > 0.0:
                 own[4 * flat_count + side_count] = wp.vec3(float(f), 0.0, front)
@@ -101,15 +110,28 @@ def _kept_place(own: wp.array(dtype=wp.vec3), f: int):
 def _place_receiver_adjoint(
     point: wp.vec3,
     frames: wp.array(dtype=wp.vec3),
-    flat_count: int,
+    fronts: wp.array3d(dtype=wp.float32),
+    scene: FlatScene,
+    batch: int,
+    receiver: int,
+    side_count: int,
     own: wp.array(dtype=wp.vec3),
     adj_own: wp.array(dtype=wp.vec3),
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
+    adj_fronts: wp.array3d(dtype=wp.float32),
 ):
-    """Add to the gradients of the frames of an instance; returns that of the point."""
+    """Add to the gradients of the frames of an instance, and of fronts; returns that of the point."""
+    sides = 4 * scene.grids.shape[0]
+    for i in range(side_count):
+        side = own[sides + i]
+        f = int(side[0])
+        adj_front = wp.where(side[1] > 0.0, -1.0, 1.0) * adj_own[sides + i][2]
+        height = own[4 * f][2]
+        adj_height = front_of_adjoint(fronts, scene.grids[f], height, adj_front, batch, receiver, f, adj_fronts)
+        adj_own[4 * f] = adj_own[4 * f] + wp.vec3(0.0, 0.0, adj_height)
     adj_point = wp.vec3()
-    for f in range(flat_count):
+    for f in range(scene.grids.shape[0]):
         place, adj = _kept_place(own, f), _kept_place(adj_own, f)
         adj_point += find_place_adjoint(point, frames, f, place, adj, instance, adj_frames)
     return adj_point
@@ -232,7 +254,8 @@ def _meet_sides_adjoint(
                 wp.vec2(adj_spot[0], adj_spot[1]),
             )
             before = _kept_place(adj_own, f)
-            adj_place = to_place(place, grid, is_back, direction, adj_at, adj_toward, adj_presence, before)
+            adj_place = to_place(place, is_back, direction, adj_at, adj_toward, before)
+            adj_own[sides + i] = adj_own[sides + i] + wp.vec3(0.0, 0.0, adj_presence)
             adj_own[4 * f] = adj_place.at
             adj_own[4 * f + 1] = adj_place.along_u
             adj_own[4 * f + 2] = adj_place.along_v
@@ -286,6 +309,7 @@ def _light_receivers(
     transmittance: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
     scene: FlatScene,
     directions: wp.array(dtype=wp.vec3),
     # scratch
@@ -301,7 +325,7 @@ def _light_receivers(
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
     placed = frames[instance_in(batch, frames.shape[0])]
-    side_count = _place_receiver(points[batch, receiver], placed, scene, own)
+    side_count = _place_receiver(points[batch, receiver], placed, fronts, scene, batch, receiver, own)
     total = wp.vec3()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
@@ -323,6 +347,7 @@ def _light_receivers_adjoint(
     transmittance: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     texels: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
     scene: FlatScene,
     directions: wp.array(dtype=wp.vec3),
     adj_light: wp.array2d(dtype=wp.vec3),
@@ -333,6 +358,7 @@ def _light_receivers_adjoint(
     adj_points: wp.array2d(dtype=wp.vec3),
     adj_normals: wp.array2d(dtype=wp.vec3),
     adj_transmittance: wp.array3d(dtype=wp.float32),
+    adj_fronts: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
@@ -348,8 +374,8 @@ def _light_receivers_adjoint(
     sent = texels[seen_texels]
     normal = normals[batch, receiver]
     cells = 6 * scene.grids.shape[0]
-    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], scene, own)
-    for k in range(4 * scene.grids.shape[0]):
+    side_count = _place_receiver(points[batch, receiver], frames[seen_frames], fronts, scene, batch, receiver, own)
+    for k in range(cells):
         adj_own[k] = wp.vec3()
     adj = (4.0 / float(directions.shape[0])) * adj_light[batch, receiver]
     adj_normal = wp.vec3()
@@ -378,7 +404,18 @@ def _light_receivers_adjoint(
     if adj_normals:
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
     adj_point = _place_receiver_adjoint(
-        points[batch, receiver], frames[seen_frames], scene.grids.shape[0], own, adj_own, seen_frames, adj_frames
+        points[batch, receiver],
+        frames[seen_frames],
+        fronts,
+        scene,
+        batch,
+        receiver,
+        side_count,
+        own,
+        adj_own,
+        seen_frames,
+        adj_frames,
+        adj_fronts,
     )
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
@@ -393,6 +430,7 @@ def flat_light(
     flats: Flats,
     directions: np.ndarray,
     *,
+    fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
     """Light that flats send to receivers.
@@ -406,27 +444,29 @@ def flat_light(
             and above.
         flats: The flats.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
+        fronts: Part of the front of each flat that receivers see, float32 of shape [batch, receiver, flat], from
+            :func:`warpshadow.stages.flats.fronts.find_fronts`; by default their heights decide.
         skip: Number of the flat that the receivers are part of, which sends them nothing; None for none.
 
     Returns:
         What white receivers reflect of it, vec3 of shape [batch, receiver].
 
-    Differentiable: points, normals, transmittance, frames, radiosity.
+    Differentiable: points, normals, transmittance, frames, radiosity, fronts.
     """
     check_flats(flats, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
-    instances = common_batch(
-        {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames, "radiosity": radiosity}
-    )
+    given = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
+    instances = common_batch({**given, "radiosity": radiosity, "fronts": fronts})
     if flats.count == (skip is not None):
         return wp.zeros((instances, points.shape[1]), wp.vec3, points.device)
     assert flats.texels_of_patches is not None
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
+    fronts = None if fronts is None else expand_rows(fronts, instances)
     texels = multiply(flats.texels_of_patches, radiosity)
     scratch = Scratch((_ROWS * flats.count,), wp.vec3)
-    variables = [points, normals, transmittance, frames, texels]
+    variables = [points, normals, transmittance, frames, texels, fronts]
     scene, cells = flat_scene(flats, cell_radius(len(directions)), skip), constant(directions, wp.vec3, points.device)
     inputs = [*variables, scene, cells]
     return differentiable(
@@ -443,7 +483,7 @@ def flat_light(
             points.size,
             inputs=[*inputs, adj_light],
             scratch=[scratch] * 2,
-            outputs=[points.grad, normals.grad, transmittance.grad],
+            outputs=[points.grad, normals.grad, transmittance.grad, None if fronts is None else fronts.grad],
             sums=[frames.grad, texels.grad],
             cost=2 * _CELL_COST * len(directions),
         ),

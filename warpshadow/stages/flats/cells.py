@@ -146,6 +146,33 @@ def find_place_adjoint(
 
 
 @wp.func
+def front_of(fronts: wp.array3d(dtype=wp.float32), grid: FlatGrid, height: float, batch: int, receiver: int, f: int):
+    """Part of the front that a receiver sees, as it is given or by its height."""
+    if fronts:
+        return fronts[batch, receiver, f]
+    return front_presence(grid, height)
+
+
+@wp.func
+def front_of_adjoint(
+    fronts: wp.array3d(dtype=wp.float32),
+    grid: FlatGrid,
+    height: float,
+    adj: float,
+    batch: int,
+    receiver: int,
+    f: int,
+    adj_fronts: wp.array3d(dtype=wp.float32),
+):
+    """Gradient of the height; adds to that of what is given."""
+    if fronts:
+        if adj_fronts:
+            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj
+        return float(0.0)
+    return adj * front_presence_slope(grid, height)
+
+
+@wp.func
 def front_presence(grid: FlatGrid, height: float):
     """Part of the front that a receiver sees; of the back it sees the rest."""
     return step(1.0 + 2.0 * height / grid.margin)
@@ -177,19 +204,15 @@ def toward_side(place: Place, is_back: bool, direction: wp.vec3):
 @wp.func
 def to_place(
     place: Place,
-    grid: FlatGrid,
     is_back: bool,
     direction: wp.vec3,
     adj_at: wp.vec3,
     adj_toward: wp.vec3,
-    adj_presence: float,
     adj_place: Place,
 ):
-    """Gradient of a place, added to what it is from elsewhere, by those of what a side is to a receiver and cell."""
+    """Gradient of a place, added to what it is from elsewhere, by those of where a side is to a receiver and cell."""
     sign = wp.where(is_back, -1.0, 1.0)
-    height = place.at[2]
-    adj_height = wp.where(sign * height > 0.0, sign * adj_at[2], 0.0)
-    adj_height += adj_presence * sign * front_presence_slope(grid, height)
+    adj_height = wp.where(sign * place.at[2] > 0.0, sign * adj_at[2], 0.0)
     adj = Place()
     adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
     adj.along_u = adj_place.along_u + adj_toward[0] * direction

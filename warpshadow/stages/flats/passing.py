@@ -28,7 +28,8 @@ from warpshadow.stages.flats.cells import (
     find_place_adjoint,
     find_spot,
     flat_scene,
-    front_presence,
+    front_of,
+    front_of_adjoint,
     meet,
     meet_adjoint,
     on_side,
@@ -80,7 +81,7 @@ def _cover_adjoint(
     adj: float,
     adj_place: Place,
 ):
-    """Gradient of the place, added to what it is from elsewhere."""
+    """Gradients of the place, added to what it is from elsewhere, and of the presence."""
     met = covered.met
     adj_spot = wp.vec3()
     if grid.is_whole == 0:
@@ -101,7 +102,7 @@ def _cover_adjoint(
         -0.5 * met.per_cosine * adj_spot[2],
         wp.vec2(adj_spot[0], adj_spot[1]),
     )
-    return to_place(place, grid, is_back, direction, adj_at, adj_toward, adj_presence, adj_place)
+    return to_place(place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
 
 
 @wp.func
@@ -127,6 +128,7 @@ def _add_coverage(
     facing: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
     scene: FlatScene,
     f: int,
     directions: wp.array(dtype=wp.vec3),
@@ -138,7 +140,7 @@ def _add_coverage(
     place = find_place(points[batch, receiver], frames[instance_in(batch, frames.shape[0])], f)
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
-    front = front_presence(grid, place.at[2])
+    front = front_of(fronts, grid, place.at[2], batch, receiver, f)
     normal = _normal(facing, batch, receiver)
     for q in range(directions.shape[0]):
         direction = directions[q]
@@ -160,6 +162,7 @@ def _add_coverage_adjoint(
     facing: wp.array2d(dtype=wp.vec3),
     covered: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
     scene: FlatScene,
     f: int,
     directions: wp.array(dtype=wp.vec3),
@@ -167,6 +170,7 @@ def _add_coverage_adjoint(
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     adj_covered: wp.array3d(dtype=wp.float32),
+    adj_fronts: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
@@ -177,9 +181,10 @@ def _add_coverage_adjoint(
     place = find_place(point, frames[instance], f)
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
-    front = front_presence(grid, place.at[2])
+    front = front_of(fronts, grid, place.at[2], batch, receiver, f)
     normal = _normal(facing, batch, receiver)
     adj_place = Place()
+    adj_front = float(0.0)
     for q in range(directions.shape[0]):
         direction = directions[q]
         adj = adj_result[batch, receiver, q]
@@ -191,9 +196,14 @@ def _add_coverage_adjoint(
                 is_back, presence = side == 1, wp.where(side == 1, 1.0 - front, front)
                 found = _cover(scene, grid, place, is_back, direction, presence)
                 if found.coverage > 0.0 and found.coverage < 1.0:  # a cell that is covered wholly stays so
-                    adj_place = _cover_adjoint(scene, grid, place, is_back, direction, presence, found, adj, adj_place)
+                    adj_place, adj_presence = _cover_adjoint(
+                        scene, grid, place, is_back, direction, presence, found, adj, adj_place
+                    )
+                    adj_front += wp.where(is_back, -adj_presence, adj_presence)
         if adj_covered:
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + adj
+    adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
+    adj_place.at = adj_place.at + wp.vec3(0.0, 0.0, adj_height)
     adj_point = find_place_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
@@ -247,6 +257,7 @@ def flat_coverage(
     *,
     radius: float | None = None,
     facing: wp.array | None = None,
+    fronts: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array | None:
     """Coverage of cells by the flats that cast shadows, Σ_k h_k: what is above 1 need not be complete.
@@ -258,21 +269,24 @@ def flat_coverage(
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of the cells [rad], how soft edges and horizons are; by default that of so many even ones.
         facing: Normals, vec3 of shape [batch, receiver]: nothing covers cells below the horizon.
+        fronts: Part of the front of each flat that receivers see, from :func:`.fronts.find_fronts`, float32 of shape
+            [batch, receiver, flat]; by default their heights decide.
         skip: Number of the flat that the receivers are part of, which blocks none of their light; None for none.
 
     Returns:
         Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no flat casts a
         shadow on them.
 
-    Differentiable: points, frames. Not: facing, which decides by steps.
+    Differentiable: points, frames, fronts. Not: facing, which decides by steps.
     """
     check_flats(flats, points, frames, directions, skip)
-    points = expand(points, common_batch({"points": points, "frames": frames}))
+    count = common_batch({"points": points, "frames": frames, "fronts": fronts})
+    points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
     scene = flat_scene(flats, cell_radius(len(directions)) if radius is None else radius, skip)
     cells, covered = constant(directions, wp.vec3, points.device), None
     for f in flats.blocking:
         if f != skip:
-            covered = _add(points, facing, covered, frames, scene, f, cells)
+            covered = _add(points, facing, covered, frames, fronts, scene, f, cells)
     return covered
 
 
@@ -281,12 +295,13 @@ def _add(
     facing: wp.array | None,
     covered: wp.array | None,
     frames: wp.array,
+    fronts: wp.array | None,
     scene: FlatScene,
     f: int,
     directions: wp.array,
 ) -> wp.array:
-    """Coverage by one flat more. Differentiable: points, covered, frames."""
-    inputs = [points, facing, covered, frames, scene, f, directions]
+    """Coverage by one flat more. Differentiable: points, covered, frames, fronts."""
+    inputs = [points, facing, covered, frames, fronts, scene, f, directions]
     cost = _CELL_COST * directions.size
     return differentiable(
         lambda result: launch(_add_coverage, points.size, inputs=inputs, outputs=[result], cost=cost),
@@ -294,12 +309,12 @@ def _add(
             _add_coverage_adjoint,
             points.size,
             inputs=[*inputs, adj_result],
-            outputs=[points.grad, None if covered is None else covered.grad],
+            outputs=[points.grad, *(None if array is None else array.grad for array in (covered, fronts))],
             sums=[frames.grad],
             cost=2 * cost,
         ),
         result=wp.empty((*points.shape, directions.size), dtype=wp.float32, device=points.device),
-        variables=[points, frames] if covered is None else [points, covered, frames],
+        variables=[points, covered, frames, fronts],
     )
 
 
