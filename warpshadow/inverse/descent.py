@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import statistics
@@ -25,14 +26,21 @@ from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.schedule import Stage, check_stages
+from warpshadow.inverse.quasi_newton import QuasiNewton
+from warpshadow.inverse.schedule import Stage, check_part, check_stages
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.scene import Scene
 from warpshadow.viewer import FitViewer
 
+FEW = 100
+"""Up to how many values are found by quasi-Newton steps unless an optimizer is named."""
+
 WINDOW = 25
 """Iterations over which a loss must fall for its stage to go on."""
+
+AROUND = 6
+"""To how many scattered values a result is compared that may stand out: a pose turned about each axis, either way."""
 
 
 class FitWarning(UserWarning):
@@ -97,12 +105,20 @@ class _Diverged(Exception):
     """Something became non-finite; the message names it."""
 
 
+class _Candidate(NamedTuple):
+    """Where a run begins."""
+
+    values: dict[str, Values]
+    curvature: dict[str, Any] | None  # a QuasiNewton's state, of the stage before
+
+
 class _Run(NamedTuple):
     """A candidate's descent that has ended."""
 
     loss: float
     best: dict[str, Values]
     failure: str | None  # what became non-finite
+    curvature: dict[str, Any] | None
 
 
 class _Descent:
@@ -125,7 +141,8 @@ class _Descent:
         self.seed = seed
         self.setting = problem.setting(device, progress=progress)
         self.stage = 0
-        self.candidates = self._widened([problem.start(self.setting)])
+        self.is_found = False
+        self.candidates = self._widened([_Candidate(problem.start(self.setting), None)])
         self.ended: list[_Run] = []
         self.losses: list[list[float]] = []
         self.reason: str | None = None
@@ -134,15 +151,18 @@ class _Descent:
         made = f"{type(self.optimizer).__qualname__} {self.optimizer.state_dict()!r}"
         self.fingerprint = f"{problem.fingerprint()} {stages!r} {tolerance!r} {seed} {made}"
 
-    def _widened(self, best: list[dict[str, Values]]) -> list[dict[str, Values]]:
+    def _widened(self, best: list[_Candidate]) -> list[_Candidate]:
         """The candidates of a stage: the best so far, and others scattered around the first where it wants more."""
-        count = self.stages[self.stage].candidates
+        count = 1 if self.is_found else self.stages[self.stage].candidates
+        scattered = self._scattered(best[0].values, count - len(best))
+        return [*best[:count], *(_Candidate(values, None) for values in scattered)]
+
+    def _scattered(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
         generator = torch.Generator().manual_seed(self.seed)
-        scattered = [
-            {free.name: free.scattered(best[0][free.name], number, generator) for free in self.problem.free}
-            for number in range(count - len(best))
+        return [
+            {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
+            for number in range(count)
         ]
-        return [*best[:count], *scattered]
 
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""
@@ -151,14 +171,16 @@ class _Descent:
         self._begin_run(self.candidates[0])
         self.losses.append([])
 
-    def _begin_run(self, values: Mapping[str, Values]) -> None:
+    def _begin_run(self, candidate: _Candidate) -> None:
         """Set up the optimizer for a candidate."""
-        self.values, self.best = _copied(values), _copied(values)
+        self.values, self.best = _copied(candidate.values), _copied(candidate.values)
         self.failure: str | None = None
         self.tensors = {f"{name}.{key}": t for name, own in self.values.items() for key, t in own.items()}
         for tensor in self.tensors.values():
             tensor.requires_grad_()
         self.optimizer = self.make_optimizer(list(self.tensors.values()), lr=self.stages[self.stage].learning_rate)
+        if candidate.curvature is not None and isinstance(self.optimizer, QuasiNewton):
+            self.optimizer.inherit(candidate.curvature)
 
     # ---------------------------------------------------------------------------------------- state
 
@@ -167,7 +189,8 @@ class _Descent:
         return {
             "fingerprint": self.fingerprint,
             "stage": self.stage,
-            "candidates": self.candidates,
+            "candidates": [tuple(candidate) for candidate in self.candidates],
+            "is_found": self.is_found,
             "ended": [tuple(run) for run in self.ended],
             "values": _copied(self.values),
             "best": self.best,
@@ -186,11 +209,12 @@ class _Descent:
             )
         device = self.setting.device
         self.stage = state["stage"]
-        self.candidates = [_copied(values, device) for values in state["candidates"]]
+        self.candidates = [_Candidate(_copied(values, device), *rest) for values, *rest in state["candidates"]]
+        self.is_found = state["is_found"]
         self.begin_stage()
-        self._begin_run(_copied(state["values"], device))
+        self._begin_run(_Candidate(_copied(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
-        self.ended = [_Run(loss, _copied(best, device), failure) for loss, best, failure in state["ended"]]
+        self.ended = [_Run(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
         self.best, self.failure = _copied(state["best"], device), state["failure"]
         self.losses, self.reason = state["losses"], state["reason"]
 
@@ -213,35 +237,60 @@ class _Descent:
         """
         if self.reason is not None:
             return False
-        losses = self.losses[-1]
-        # means, as the least loss may be the luck of a passing iterate
-        last, before = losses[-WINDOW:], losses[-2 * WINDOW : -WINDOW]
-        has_converged = len(before) == WINDOW and sum(last) >= (1 - self.tolerance) * sum(before)
-        is_over = has_converged or self.failure is not None or len(losses) == self.stages[self.stage].iterations
+        has_converged = self._has_converged()
+        stage = self.stages[self.stage]
+        is_over = has_converged or self.failure is not None or len(self.losses[-1]) == stage.iterations
         if not is_over:
             return True
         self.ended.append(self._ended_run())
-        if len(self.ended) < len(self.candidates):
+        self.is_found = self.is_found or (len(self.candidates) > 1 and self._stands_out(self.ended[-1]))
+        if len(self.ended) < len(self.candidates) and not self.is_found:
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])
             return True
-        ranked = [run.best for run in sorted(self.ended, key=lambda run: run.loss)]
+        ranked = [
+            _Candidate(run.best, run.curvature)
+            for run in sorted(self.ended, key=lambda run: run.loss)
+        ]
         is_last = self.stage + 1 == len(self.stages)
         if all(run.failure for run in self.ended):
             self.reason = self.ended[0].failure
         elif is_last:
             self.reason = "converged" if has_converged else "finished"
         if self.reason is not None:
-            self.best = ranked[0]
+            self.best = ranked[0].values
             return False
         self.stage += 1
         self.candidates, self.ended = self._widened(ranked), []
         self.begin_stage()
         return True
 
+    def _has_converged(self) -> bool:
+        """Whether the run gains no more than a part of its loss, by the optimizer's word where it has one."""
+        own = self.stages[self.stage].tolerance
+        tolerance = self.tolerance if own is None else own
+        losses = self.losses[-1]
+        if losses and isinstance(self.optimizer, QuasiNewton):
+            return self.optimizer.has_converged(tolerance)
+        # means, as the least loss may be the luck of a passing iterate
+        last, before = losses[-WINDOW:], losses[-2 * WINDOW : -WINDOW]
+        return len(before) == WINDOW and sum(last) >= (1 - tolerance) * sum(before)
+
+    def _stands_out(self, run: _Run) -> bool:
+        """Whether the loss of a run is far below that of values scattered around its best."""
+        part = self.stages[self.stage].standout
+        if part == 0 or run.failure is not None:
+            return False
+        losses = []
+        for values in self._scattered(run.best, AROUND):
+            with torch.no_grad(), contextlib.suppress(ValueError):  # one that cannot be drawn
+                losses.append(float(self.model.loss(values)[0]))
+        return run.loss < part * min(filter(math.isfinite, losses), default=0.0)
+
     def _ended_run(self) -> _Run:
         """The best values of a run; its last step may have led to them."""
-        best = _Run(min(self.losses[-1], default=math.inf), self.best, self.failure)
+        curvature = self.optimizer.state_dict() if isinstance(self.optimizer, QuasiNewton) else None
+        best = _Run(min(self.losses[-1], default=math.inf), self.best, self.failure, curvature)
         if self.failure is not None:
             return best
         try:
@@ -249,7 +298,7 @@ class _Descent:
                 last = float(self.model.loss(self.values)[0])
         except ValueError as error:  # a step too far to be drawn
             return best._replace(failure=str(error))
-        return _Run(last, _copied(self.values), None) if last < best.loss else best
+        return best._replace(loss=last, best=_copied(self.values)) if last < best.loss else best
 
     def best_so_far(self) -> dict[str, Values]:
         """The best values of the stage that it is in."""
@@ -308,11 +357,17 @@ def short_adam(parameters: list[torch.Tensor], lr: float) -> torch.optim.Optimiz
     return torch.optim.Adam(parameters, lr=lr, betas=(0.8, 0.99))
 
 
+def default_optimizer(parameters: list[torch.Tensor], lr: float) -> torch.optim.Optimizer:
+    """Quasi-Newton steps for up to 100 values, such as poses and colors; :func:`short_adam` for more."""
+    few = sum(tensor.numel() for tensor in parameters) <= FEW
+    return QuasiNewton(parameters, lr) if few else short_adam(parameters, lr)
+
+
 def fit(
     problem: Problem,
     stages: Sequence[Stage] = (Stage(),),
     *,
-    optimizer: Callable[..., torch.optim.Optimizer] = short_adam,
+    optimizer: Callable[..., torch.optim.Optimizer] = default_optimizer,
     tolerance: float = 1e-4,
     seed: int = 0,
     device: str | torch.device = "cpu",
@@ -360,8 +415,7 @@ def fit(
             "torch.optim.Adam"
         )
     where = torch.device(wp.device_to_torch(check.device("device", str(device))))
-    if not (check.is_number(tolerance) and 0 <= tolerance < 1):
-        raise ValueError(f"tolerance: got {tolerance!r}, expected a part of the loss, 0 or more and below 1")
+    check_part("tolerance", tolerance, "of the loss")
     for name, file in (("checkpoint", checkpoint), ("preview", preview)):
         if file is not None and not Path(file).parent.is_dir():
             raise ValueError(f"{name}: got {str(file)!r}, expected a file in a folder that is there")

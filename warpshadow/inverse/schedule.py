@@ -29,6 +29,9 @@ class Stage:
         supersampling: Samples a pixel across and down; by default the scene's.
         candidates: How many descents take part. They go on from the best of the stage before; where those are fewer,
             others start scattered around the best. The least loss tells them apart.
+        standout: A candidate has found it, and no others are tried from then on, if its loss is below this part of
+            that of each of six values scattered around it. 0: all are tried.
+        tolerance: In place of the fit's.
         regularization: Factor of all regularizers: coarse stages want more of them.
     """
 
@@ -40,6 +43,8 @@ class Stage:
     supersampling: int | None = None
     candidates: int = 1
     regularization: float = 1.0
+    standout: float = 0.0
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
         check.whole("iterations", self.iterations)
@@ -47,6 +52,9 @@ class Stage:
         if not (check.is_number(self.learning_rate) and self.learning_rate > 0):
             raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
         check.nonnegative("regularization", self.regularization)
+        check_part("standout", self.standout, "of the loss of scattered values")
+        if self.tolerance is not None:
+            check_part("tolerance", self.tolerance, "of the loss")
         if not (check.is_number(self.scale) and 0 < self.scale <= 1):
             raise ValueError(f"scale: got {self.scale!r}, expected a part of the image, above 0 and up to 1")
         if self.softness is not None:
@@ -65,6 +73,12 @@ class Stage:
         """A scene's visibility with what the stage says of it."""
         given: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
         return replace(visibility, **{name: value for name, value in given.items() if value is not None})
+
+
+def check_part(name: str, value: object, of: str) -> None:
+    """Raise ValueError for what is no number from 0 to below 1."""
+    if not (check.is_number(value) and 0 <= value < 1):
+        raise ValueError(f"{name}: got {value!r}, expected a part {of}, 0 or more and below 1")
 
 
 def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
@@ -89,13 +103,12 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     A descent from there ends in a wrong pose about once in eight times, and its loss tells: so it starts from the pose
     as it is and turned by 30° fourteen ways, on images of some 32 pixels, and the best five, two and one go on.
     """
-    small, middle, large = (_scale(problem, size) for size in (32, 64, 128))
-    soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
+    small, middle, large = (_scale(problem, size) for size in (32, 64, 512))
+    soft = _soft(problem, 1.0)
     return (
-        Stage(25, 0.05, small, supersampling=1, candidates=15, **soft),
-        Stage(25, 0.03, small, supersampling=1, candidates=5, **firm),
-        Stage(30, 0.03, middle, supersampling=1, candidates=2, **firm),
-        Stage(30, 0.015, large),
+        Stage(30, 0.1, small, candidates=15, standout=0.08, tolerance=0.01, **soft),
+        Stage(20, 0.02, middle, candidates=3, standout=0.08, tolerance=0.01),
+        Stage(40, 0.01, large),
     )
 
 

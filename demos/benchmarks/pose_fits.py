@@ -1,0 +1,216 @@
+"""How long a pose fit takes, beside a plain loop of Adam.
+
+    python demos/benchmarks/pose_fits.py [--count 10] [--size 128] [--skip-plain] [--verbose]
+
+README's bunny, turned by 40°, its target rendered; and random poses, 10° to 40° and 5% to 25% of the diagonal off,
+their targets ray traced. ``pose_stages`` and ``inverse.fit`` beside what one writes first: Adam on a turn and a shift,
+150 steps at a rate of 0.03, squares of differences at the target's size.
+
+Times are from the call to the first and to the last iterate that is more than 0.5% of the diagonal off (MDE), and to
+the end; each includes making renderers, but neither compiling nor fitting spheres. Candidates take their turns, so the
+last is when the fit is sure. CPU time is that of the process.
+"""
+
+import argparse
+import dataclasses
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
+import warpshadow as ws
+from demos.problems import changed, displaced, distance_error, placement, ray_traced
+from demos.scenes import shipped_mesh
+from warpshadow import inverse
+from warpshadow.torch import TorchRenderer, rotation_matrices
+
+NEAR = 0.5  # MDE [%] that counts as found
+STEPS, RATE = 150, 0.03  # of the plain loop
+
+
+@dataclass(frozen=True)
+class Moment:
+    """An iterate: when it was evaluated, by the clock and by the processor [s], and the body as it has it."""
+
+    wall: float
+    cpu: float
+    body: ws.Body
+
+
+class Stopwatch:
+    """Notes iterates; the time from its making, less what noting takes."""
+
+    def __init__(self) -> None:
+        self.moments: list[Moment] = []
+        self.wall, self.cpu = time.perf_counter(), time.process_time()
+
+    def note(self, body: Callable[[], ws.Body]) -> None:
+        """Note a body as it is now."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        self.moments.append(Moment(wall - self.wall, cpu - self.cpu, body()))
+        self.wall += time.perf_counter() - wall
+        self.cpu += time.process_time() - cpu
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a fit took: seconds by the clock and by the processor until its iterates come near, stay near, and end."""
+
+    error: float
+    iterations: int
+    first: tuple[float, float]
+    last: tuple[float, float]
+    whole: tuple[float, float]
+
+    @classmethod
+    def of(cls, moments: Sequence[Moment], true: ws.Body) -> "Outcome":
+        """Judge the iterates of a fit, of which the last is its result."""
+        errors = [distance_error(moment.body, true) for moment in moments]
+        times = [(moment.wall, moment.cpu) for moment in moments]
+        never = (float("inf"), float("inf"))
+        near = [number for number, error in enumerate(errors) if error <= NEAR]
+        far = [number for number, error in enumerate(errors) if error > NEAR]
+        stays = far[-1] + 1 if far else 0
+        return cls(
+            errors[-1],
+            len(moments) - 1,
+            times[near[0]] if near else never,
+            times[stays] if stays < len(times) else never,
+            times[-1],
+        )
+
+
+def plain(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
+    """The loop that one writes first."""
+    watch = Stopwatch()
+    renderer = TorchRenderer(scene)
+    rotations, translations, scales = renderer.scene_poses()
+    wanted = torch.from_numpy(target)
+    turn, shift = (torch.zeros(2, 3, requires_grad=True) for _ in range(2))
+    optimizer = torch.optim.Adam([turn, shift], lr=RATE)
+
+    def body() -> ws.Body:
+        with torch.no_grad():
+            rotation = (rotation_matrices(turn) @ rotations)[0].numpy()
+            translation = (translations + shift)[0].numpy()
+        return moved(scene.bodies[0], rotation, translation)
+
+    for _ in range(STEPS):
+        watch.note(body)
+        optimizer.zero_grad()
+        geometry = renderer.placed(rotation_matrices(turn) @ rotations, translations + shift, scales, moving=[0])
+        torch.nn.functional.mse_loss(renderer(geometry=geometry), wanted).backward()
+        optimizer.step()
+    watch.note(body)
+    return watch.moments
+
+
+def moved(body: ws.Body, rotation: np.ndarray, translation: np.ndarray) -> ws.Body:
+    """The body at a pose, its rotation a matrix."""
+    from scipy.spatial.transform import Rotation
+
+    vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+    return dataclasses.replace(body, rotation=vector, translation=translation)
+
+
+def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
+    """The ready-made stages."""
+    watch = Stopwatch()
+    problem = inverse.Problem(scene, inverse.Target(target), inverse.Pose(0))
+    setting = problem.setting(torch.device("cpu"))
+
+    def make(tensors: list[torch.Tensor], lr: float) -> torch.optim.Optimizer:
+        optimizer = inverse.descent.default_optimizer(tensors, lr=lr)
+        step = optimizer.step
+
+        def watched(closure: Callable[[], float]) -> object:
+            values = {"pose[0]": dict(zip(("turn", "shift"), (tensor.detach().clone() for tensor in tensors)))}
+            watch.note(lambda: problem.found(values, setting).scene.bodies[0])
+            return step(closure)
+
+        optimizer.step = watched
+        return optimizer
+
+    result = inverse.fit(problem, inverse.pose_stages(problem), optimizer=make, progress=False)
+    watch.note(lambda: result.scene.bodies[0])
+    staged.result = result
+    return watch.moments
+
+
+def readme_scene(size: int) -> ws.Scene:
+    """README's first scene."""
+    bunny = ws.Body(shipped_mesh("bunny"), albedo=(0.8, 0.6, 0.5)).on_ground(size=2)
+    camera = ws.Camera.framing(bunny, size=(size, size))
+    return ws.Scene([bunny, ws.Body(ws.plane(6.0), name="ground")], ws.synthetic_sky(), camera)
+
+
+def turned(body: ws.Body, degrees: float) -> ws.Body:
+    """The body turned about the vertical through its middle."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec([0, degrees, 0], degrees=True)
+    low, high = body.world_mesh().bounds
+    middle = (low + high) / 2
+    rotation = (turn * Rotation.from_matrix(body.rotation_matrix())).as_matrix()
+    return moved(body, rotation, turn.apply(body.translation - middle) + middle)
+
+
+def processor() -> str:
+    """The CPU by name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
+
+
+def row(name: str, way: str, outcome: Outcome) -> str:
+    first, last, whole = (f"{wall:6.2f} {cpu:6.2f}" for wall, cpu in (outcome.first, outcome.last, outcome.whole))
+    return f"{name:10} {way:6} {outcome.iterations:4d}   {first}   {last}   {whole}   {outcome.error:8.4f}"
+
+
+def main(count: int, size: int, ways: dict, verbose: bool) -> None:
+    ws.quiet()
+    torch.set_num_threads(1)
+    print(f"{processor()}; seconds by the clock and by the processor to the first and the last iterate beyond {NEAR}%")
+    print(f"{'pose':10} {'way':6} {'it.':>4}   {'first':>13}   {'last':>13}   {'whole':>13}   {'MDE [%]':>8}")
+    truth = readme_scene(2 * size)
+    start = changed(truth, 0, **placement(turned(truth.bodies[0], 40)))
+    cases = {"README 40°": (start, ws.render(truth), truth)}
+    truth = readme_scene(size)
+    wanted = ray_traced(truth)
+    for seed in range(count):
+        body = displaced(truth.bodies[0], np.random.default_rng(seed))
+        cases[f"random {seed}"] = (changed(truth, 0, **placement(body)), wanted, truth)
+    outcomes: dict[str, list[Outcome]] = {way: [] for way in ways}
+    for name, (start, target, truth) in cases.items():
+        for way, solve in ways.items():
+            outcome = Outcome.of(solve(start, target), truth.bodies[0])
+            print(row(name, way, outcome), flush=True)
+            if verbose and way == "stages":
+                for losses in staged.result.losses:
+                    print("   ", len(losses), *(f"{losses[i]:.2e}" for i in sorted({0, 1, 2, len(losses) // 2, len(losses) - 1}) if i < len(losses)))
+            if name.startswith("random"):
+                outcomes[way].append(outcome)
+    for way, each in outcomes.items():
+        if each:
+            pairs = ([tuple(statistics.median(p) for p in zip(*(getattr(o, n) for o in each)))] for n in ("first", "last", "whole"))
+            print("median", way, *(f"{w:.2f} {c:.2f} |" for (w, c), in pairs), f"MDE {statistics.median(o.error for o in each):.4f} worst {max(o.error for o in each):.4f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=10, help="random poses")
+    parser.add_argument("--size", type=int, default=128, help="of the random poses' images [pixels]; README's has twice it")
+    parser.add_argument("--ways", nargs="*", default=["plain", "stages"])
+    parser.add_argument("--verbose", action="store_true", help="losses of the stages")
+    arguments = parser.parse_args()
+    every = {"plain": plain, "stages": staged}
+    main(arguments.count, arguments.size, {w: every[w] for w in arguments.ways}, arguments.verbose)

@@ -1,0 +1,129 @@
+"""Quasi-Newton steps that grow and shrink by what they achieve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+
+HISTORY = 12
+"""How many steps are remembered: of six values, their curvature wholly."""
+
+_GROWTH = 2.0  # of the bound, where a step that reached it was kept
+_SHORTEST, _LONGEST = 0.1, 0.5  # what the bound becomes where a step was taken back, as parts of the step
+_REACH = 5.0  # the bound at most, in learning rates
+_CURVED = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
+
+
+class QuasiNewton(torch.optim.Optimizer):
+    """L-BFGS with bounded steps, one evaluation each.
+
+    The direction is that of Nocedal and Wright 2006, algorithm 7.4. No value changes by more than a bound. A step that
+    lowers the loss is kept, and the bound grows if it was reached. Another one is taken back and makes the bound
+    shorter; the gradient at its end tells of curvature nonetheless.
+
+    Args:
+        parameters: Tensors of one device.
+        lr: The first bound. It may fall from step to step; the bound is never longer than five times of it.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], lr: float):
+        super().__init__(parameters, {"lr": lr})
+        self._tensors: list[torch.Tensor] = self.param_groups[0]["params"]
+
+    @property
+    def _memory(self) -> dict[str, Any]:
+        """All that is kept: tensors, numbers, and lists of tensors."""
+        return self.state[self._tensors[0]]
+
+    def inherit(self, state: dict[str, Any]) -> None:
+        """Take over the curvature that another one found, of a similar loss; ``state`` is its state_dict."""
+        self._memory.update({name: list(state["state"][0][name]) for name in ("steps", "changes")})
+
+    def has_converged(self, tolerance: float) -> bool:
+        """Whether the last step that was kept gained, and the next may gain, at most this part of the loss."""
+        memory = self._memory
+        return max(memory.get("gained", math.inf), memory["hoped"]) <= tolerance * abs(memory["loss"])
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float]) -> float:  # type: ignore[override]
+        """Evaluate where the last step led, keep it or take it back, and take the next."""
+        with torch.enable_grad():
+            loss = float(closure())
+        memory, place, gradient = self._memory, self._flat(self._tensors), self._flat(self._gradients())
+        if "loss" not in memory:
+            memory["bound"] = self._rate
+            self._keep(loss, place, gradient)
+        else:
+            self._judge(loss, place, gradient)
+        direction = self._direction()
+        longest, bound = float(direction.abs().max()), memory["bound"]
+        if longest > bound or not memory["steps"]:  # a gradient alone does not tell how far
+            direction *= bound / longest if longest > 0 else 0.0
+        memory["slope"] = _dot(memory["gradient"], direction)
+        memory["hoped"] = -memory["slope"]
+        self._move_to(memory["place"] + direction)
+        return loss
+
+    @property
+    def _rate(self) -> float:
+        return self.param_groups[0]["lr"]
+
+    def _gradients(self) -> list[torch.Tensor]:
+        return [torch.zeros_like(t) if t.grad is None else t.grad for t in self._tensors]
+
+    @staticmethod
+    def _flat(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+        return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+    def _move_to(self, place: torch.Tensor) -> None:
+        parts = place.split([tensor.numel() for tensor in self._tensors])
+        for tensor, part in zip(self._tensors, parts, strict=True):
+            tensor.copy_(part.view_as(tensor))
+
+    def _keep(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
+        self._memory.update(loss=loss, place=place, gradient=gradient)
+
+    def _judge(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
+        """Keep the last step or take it back, and bound the next."""
+        memory = self._memory
+        step, slope = place - memory["place"], memory["slope"]
+        self._remember(step, gradient - memory["gradient"])
+        length, rise = float(step.abs().max()), loss - memory["loss"]
+        if rise >= 0 and length > 0:
+            lowest = -slope / (2 * (rise - slope)) if rise > slope else _LONGEST  # of the parabola through both
+            memory["bound"] = length * min(max(lowest, _SHORTEST), _LONGEST)
+            return
+        if length > 0.8 * memory["bound"]:
+            memory["bound"] = min(_GROWTH * memory["bound"], _REACH * self._rate)
+        memory["gained"] = -rise
+        self._keep(loss, place, gradient)
+
+    def _remember(self, step: torch.Tensor, change: torch.Tensor) -> None:
+        """Add a step and how the gradient changed over it, if the loss curves upwards there."""
+        memory = self._memory
+        steps, changes = memory.setdefault("steps", []), memory.setdefault("changes", [])
+        if _dot(step, change) > _CURVED * math.sqrt(_dot(step, step) * _dot(change, change)):
+            memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
+
+    def _direction(self) -> torch.Tensor:
+        """Minus the gradient times the inverse of the curvature, as the steps tell it."""
+        memory = self._memory
+        steps, changes = memory.setdefault("steps", []), memory.setdefault("changes", [])
+        direction = -memory["gradient"]
+        pairs = list(zip(steps, changes, strict=True))
+        parts = []
+        for step, change in reversed(pairs):
+            parts.append(_dot(step, direction) / _dot(step, change))
+            direction = direction - parts[-1] * change
+        if pairs:
+            direction = direction * (_dot(*pairs[-1]) / _dot(changes[-1], changes[-1]))
+        for (step, change), part in zip(pairs, reversed(parts), strict=True):
+            direction = direction + (part - _dot(change, direction) / _dot(step, change)) * step
+        return direction
+
+
+def _dot(first: torch.Tensor, second: torch.Tensor) -> float:
+    return float(first.double() @ second.double())
