@@ -66,7 +66,7 @@ def test_all_but_a_scene_a_target_and_what_is_free_has_the_defaults_of_python(lo
     assert problem.loss == inverse.Loss()
     assert (problem.still.method, problem.still.samples) == ("ray-traced", ws.Visibility().samples)
     assert fit.stages == (inverse.Stage(),)
-    assert (fit.optimizer, fit.tolerance, fit.seed) == (inverse.short_adam, 1e-4, 0)
+    assert (fit.optimizer, fit.tolerance, fit.seed) == (inverse.default_optimizer, 1e-4, 0)
     (target,) = problem.targets
     assert target.mask is None and target.camera is None
     np.testing.assert_array_equal(target.image, np.full((6, 8, 3), 0.5))

@@ -5,7 +5,7 @@ to a :class:`Result`, whose scene can be rendered, relit and written. Needs torc
 """
 
 from warpshadow.inverse.checkpoint import CheckpointError
-from warpshadow.inverse.descent import FitWarning, Result, fit, short_adam
+from warpshadow.inverse.descent import FitWarning, Result, default_optimizer, fit, short_adam
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
@@ -16,6 +16,7 @@ from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.views import CameraPose, Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.report import write_result
 from warpshadow.inverse.schedule import Stage, deformation_stages, pose_stages
 from warpshadow.inverse.target import Target
@@ -37,11 +38,13 @@ __all__ = [
     "Loss",
     "Pose",
     "Problem",
+    "QuasiNewton",
     "Radii",
     "Result",
     "Stage",
     "Target",
     "Texture",
+    "default_optimizer",
     "deformation_stages",
     "fit",
     "load_fit",

@@ -145,6 +145,7 @@ class _Descent:
         self.candidates = self._widened([_Candidate(problem.start(self.setting), None)])
         self.ended: list[_Run] = []
         self.losses: list[list[float]] = []
+        self.descents: list[int] = []
         self.reason: str | None = None
         self._begin_run(self.candidates[0])
         # The optimizer is known by what it makes: a partial or a lambda has no name that says all of it.
@@ -170,6 +171,7 @@ class _Descent:
         self.images: torch.Tensor | None = None  # of the last iteration, if it took any
         self._begin_run(self.candidates[0])
         self.losses.append([])
+        self.descents.append(1)
 
     def _begin_run(self, candidate: _Candidate) -> None:
         """Set up the optimizer for a candidate."""
@@ -196,6 +198,7 @@ class _Descent:
             "best": self.best,
             "failure": self.failure,
             "losses": self.losses,
+            "descents": self.descents,
             "reason": self.reason,
             "optimizer": self.optimizer.state_dict(),
         }
@@ -216,7 +219,7 @@ class _Descent:
         self.optimizer.load_state_dict(state["optimizer"])
         self.ended = [_Run(loss, _copied(best, device), *rest) for loss, best, *rest in state["ended"]]
         self.best, self.failure = _copied(state["best"], device), state["failure"]
-        self.losses, self.reason = state["losses"], state["reason"]
+        self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
 
     # ---------------------------------------------------------------------------------------- steps
 
@@ -247,11 +250,9 @@ class _Descent:
         if len(self.ended) < len(self.candidates) and not self.is_found:
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])
+            self.descents[-1] += 1
             return True
-        ranked = [
-            _Candidate(run.best, run.curvature)
-            for run in sorted(self.ended, key=lambda run: run.loss)
-        ]
+        ranked = [_Candidate(run.best, run.curvature) for run in sorted(self.ended, key=lambda run: run.loss)]
         is_last = self.stage + 1 == len(self.stages)
         if all(run.failure for run in self.ended):
             self.reason = self.ended[0].failure
@@ -384,9 +385,11 @@ def fit(
         problem: The problem.
         stages: What to do in which order; :func:`pose_stages` and :func:`deformation_stages` are ways that work. The
             paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with ``optimizer=torch.optim.SGD``.
-        optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``.
+        optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``, by default
+            :func:`default_optimizer`.
         seed: Of candidates that are drawn at random.
-        tolerance: A stage has converged when over 25 iterations its loss fell by less than this part.
+        tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
+            loss falls by less than this part.
         device: Where to compute.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
             off, with the result that it would have had (on a CPU, to the bit).

@@ -12,7 +12,7 @@ import torch
 
 from warpshadow import check
 from warpshadow.check import AnyPath
-from warpshadow.inverse.descent import Result, fit, short_adam
+from warpshadow.inverse.descent import Result, default_optimizer, fit, short_adam
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
@@ -21,6 +21,7 @@ from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.views import CameraPose, Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.schedule import Stage, check_stages, deformation_stages, pose_stages
 from warpshadow.inverse.target import Target, read_target
 from warpshadow.scene import toml_tables
@@ -40,6 +41,7 @@ def _pair(key: str, value: object) -> tuple[float, ...]:
 
 
 _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Callable[[str, object], Any]]]] = {
+    "quasi-newton": (QuasiNewton, {}),
     "adam": (torch.optim.Adam, {"betas": _pair}),
     "sgd": (torch.optim.SGD, {"momentum": check.number, "dampening": check.number, "nesterov": check.flag}),
     "rmsprop": (torch.optim.RMSprop, {"alpha": check.number, "eps": check.number, "momentum": check.number}),
@@ -63,7 +65,8 @@ class Fit:
         problem: What is to be solved.
         stages: What to do in which order.
         optimizer: Makes an optimizer of a list of tensors and ``lr``.
-        tolerance: A stage has converged when over 25 iterations its loss fell by less than this part.
+        tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
+            loss falls by less than this part.
         seed: Of what is scattered where a stage has candidates.
     """
 
@@ -179,6 +182,8 @@ def _stages(table: Table, problem: Problem) -> tuple[Stage, ...]:
 
 def _optimizer(table: Table) -> Callable[..., torch.optim.Optimizer]:
     toml_tables.check_table(table)
+    if not table:
+        return default_optimizer
     name = table.get("name", "adam")
     check.choice("name", name, _OPTIMIZERS)
     kind, checks = _OPTIMIZERS[name]

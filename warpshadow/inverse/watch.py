@@ -40,6 +40,7 @@ class Watched(Protocol):
     stages: tuple[Stage, ...]
     stage: int
     losses: list[list[float]]
+    descents: list[int]  # of each stage that has begun
     model: Model
     values: dict[str, Values]
     images: torch.Tensor | None  # of the last iteration, if it took any
@@ -88,7 +89,7 @@ class Watch:
             words = [note, f"stage {fit.stage + 1} of {len(fit.stages)}", f"iteration {sum(map(len, fit.losses))}"]
             last = next((run[-1] for run in reversed(fit.losses) if run), None)
             words += [] if last is None else [f"loss {last:.3e}"]
-            losses = by_stage(fit.losses, fit.stages)
+            losses = by_stage(fit.losses, fit.descents)
             self._page.show(" · ".join(words), losses, fit.stage, fit.stages[fit.stage].candidates)
             self._page.show_pictures(pictures(fit))
             self._page.fail(None)
@@ -109,10 +110,10 @@ class Watch:
                 self._page.fail(message)
 
 
-def by_stage(losses: Sequence[list[float]], stages: Sequence[Stage]) -> list[list[list[float]]]:
-    """Losses of a fit's descents, which stand one after another, for each stage."""
+def by_stage(losses: Sequence[list[float]], descents: Sequence[int]) -> list[list[list[float]]]:
+    """Losses of a fit's descents, which stand one after another, for each stage, of which the numbers are given."""
     runs = iter(losses)
-    return [list(islice(runs, stage.candidates)) for stage in stages]
+    return [list(islice(runs, count)) for count in descents]
 
 
 def pictures(fit: Watched) -> np.ndarray:

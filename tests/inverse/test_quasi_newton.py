@@ -1,0 +1,123 @@
+"""Quasi-Newton steps: where they lead, how far they go, and that what is taken back leaves no trace but its lesson."""
+
+import copy
+import io
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+
+from warpshadow.inverse import QuasiNewton
+
+CURVATURE = torch.tensor([[1.0, 0.3, 0.0], [0.3, 30.0, -0.5], [0.0, -0.5, 300.0]])
+LOWEST = torch.tensor([0.7, -0.4, 0.2])
+
+
+def bowl(x: torch.Tensor) -> torch.Tensor:
+    return 0.5 * (x - LOWEST) @ CURVATURE @ (x - LOWEST)
+
+
+def valley(x: torch.Tensor) -> torch.Tensor:
+    """Rosenbrock's."""
+    return (100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2).sum()
+
+
+def walked(
+    loss: Callable[[torch.Tensor], torch.Tensor], start: list[float], count: int, lr: float = 0.1
+) -> tuple[list[float], list[np.ndarray], QuasiNewton]:
+    """Losses and places of so many evaluations."""
+    x = torch.tensor(start, requires_grad=True)
+    optimizer = QuasiNewton([x], lr)
+    losses, places = [], []
+
+    def closure() -> float:
+        optimizer.zero_grad()
+        value = loss(x)
+        value.backward()
+        losses.append(float(value))
+        places.append(x.detach().numpy().astype(np.float64))
+        return losses[-1]
+
+    for _ in range(count):
+        optimizer.step(closure)
+    return losses, places, optimizer
+
+
+def test_it_finds_the_lowest_place_of_a_bowl_that_is_300_times_as_steep_one_way_as_another():
+    losses, places, _ = walked(bowl, [0.0, 0.0, 0.0], 25)
+    np.testing.assert_allclose(places[int(np.argmin(losses))], LOWEST, atol=1e-4)
+
+
+def test_it_finds_the_end_of_a_bent_valley_as_scipy_does():
+    losses, places, _ = walked(valley, [-1.2, 1.0, 0.8], 100)
+    expected = scipy.optimize.minimize(scipy.optimize.rosen, [-1.2, 1.0, 0.8], jac=scipy.optimize.rosen_der).x
+    np.testing.assert_allclose(places[int(np.argmin(losses))], expected, atol=5e-3)
+
+
+def test_no_value_changes_by_more_than_the_rate_at_first_nor_ever_by_more_than_five_times_it():
+    _, places, _ = walked(bowl, [40.0, 0.0, 0.0], 20, lr=0.5)
+    longest = np.abs(np.diff(places, axis=0)).max(axis=1)
+    assert longest[0] == pytest.approx(0.5, rel=1e-5)
+    assert longest.max() == pytest.approx(2.5, rel=1e-5)
+
+
+def test_a_step_that_raises_the_loss_is_taken_back_and_the_next_is_shorter():
+    losses, places, _ = walked(lambda x: torch.where(x < 0.05, -x, 10 * x).sum(), [0.0], 3, lr=0.1)
+    assert losses[1] > losses[0]
+    first, second, third = (place[0] for place in places)
+    assert first < third < first + 0.51 * (second - first)
+
+
+def test_it_has_converged_where_steps_gain_nothing_and_not_before():
+    losses, _, optimizer = walked(bowl, [0.0, 0.0, 0.0], 3)
+    assert not optimizer.has_converged(1e-2)
+    _, _, optimizer = walked(lambda x: bowl(x) + 1, [0.0, 0.0, 0.0], 30)
+    assert optimizer.has_converged(1e-4)
+    assert losses[0] > losses[2]
+
+
+def test_where_nothing_changes_it_stays():
+    losses, places, optimizer = walked(lambda x: (0 * x).sum() + 3, [0.5, 0.5], 3)
+    assert losses == [3, 3, 3] and (np.array(places) == 0.5).all() and optimizer.has_converged(0.0)
+
+
+def test_what_inherits_curvature_knows_the_way_at_once():
+    _, _, optimizer = walked(bowl, [0.0, 0.0, 0.0], 20)
+    x = torch.tensor([0.6, -0.35, 0.25], requires_grad=True)
+    heir = QuasiNewton([x], 1.0)
+    heir.inherit(optimizer.state_dict())
+
+    def closure() -> float:
+        heir.zero_grad()
+        value = bowl(x)
+        value.backward()
+        return float(value)
+
+    before = heir.step(closure)
+    assert float(bowl(x)) < 1e-2 * before
+
+
+def test_its_state_goes_on_to_the_bit():
+    def on(count: int, x: torch.Tensor, optimizer: QuasiNewton) -> None:
+        def closure() -> float:
+            optimizer.zero_grad()
+            value = valley(x)
+            value.backward()
+            return float(value)
+
+        for _ in range(count):
+            optimizer.step(closure)
+
+    x = torch.tensor([-1.2, 1.0, 0.8], requires_grad=True)
+    optimizer = QuasiNewton([x], 0.1)
+    on(15, x, optimizer)
+    file = io.BytesIO()
+    torch.save(optimizer.state_dict(), file)
+    y = copy.deepcopy(x.detach()).requires_grad_()
+    other = QuasiNewton([y], 0.1)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    on(15, x, optimizer), on(15, y, other)
+    assert torch.equal(x, y)
