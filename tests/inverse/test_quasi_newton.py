@@ -87,7 +87,7 @@ def test_what_inherits_curvature_knows_the_way_at_once():
     _, _, optimizer = walked(bowl, [0.0, 0.0, 0.0], 20)
     x = torch.tensor([0.6, -0.35, 0.25], requires_grad=True)
     heir = QuasiNewton([x], 1.0)
-    heir.inherit(optimizer.state_dict())
+    heir.inherit(optimizer.curvature)
 
     def closure() -> float:
         heir.zero_grad()

@@ -26,7 +26,7 @@ from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.quasi_newton import QuasiNewton
+from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.schedule import Stage, check_part, check_stages
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import Found, Setting
@@ -109,7 +109,7 @@ class _Candidate(NamedTuple):
     """Where a run begins."""
 
     values: dict[str, Values]
-    curvature: dict[str, Any] | None  # a QuasiNewton's state, of the stage before
+    curvature: Curvature | None  # that a QuasiNewton found in the stage before
 
 
 class _Run(NamedTuple):
@@ -118,7 +118,7 @@ class _Run(NamedTuple):
     loss: float
     best: dict[str, Values]
     failure: str | None  # what became non-finite
-    curvature: dict[str, Any] | None
+    curvature: Curvature | None  # of a QuasiNewton
 
 
 class _Descent:
@@ -290,7 +290,7 @@ class _Descent:
 
     def _ended_run(self) -> _Run:
         """The best values of a run; its last step may have led to them."""
-        curvature = self.optimizer.state_dict() if isinstance(self.optimizer, QuasiNewton) else None
+        curvature = self.optimizer.curvature if isinstance(self.optimizer, QuasiNewton) else None
         best = _Run(min(self.losses[-1], default=math.inf), self.best, self.failure, curvature)
         if self.failure is not None:
             return best

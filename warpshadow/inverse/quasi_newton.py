@@ -8,6 +8,9 @@ from typing import Any
 
 import torch
 
+Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
+"""Steps, and how the gradient changed over them, [value] each."""
+
 HISTORY = 12
 """How many steps are remembered: of six values, their curvature wholly."""
 
@@ -38,9 +41,17 @@ class QuasiNewton(torch.optim.Optimizer):
         """All that is kept: tensors, numbers, and lists of tensors."""
         return self.state[self._tensors[0]]
 
-    def inherit(self, state: dict[str, Any]) -> None:
-        """Take over the curvature that another one found, of a similar loss; ``state`` is its state_dict."""
-        self._memory.update({name: list(state["state"][0][name]) for name in ("steps", "changes")})
+    @property
+    def curvature(self) -> Curvature:
+        """What is known of the curvature."""
+        memory = self._memory
+        return memory.get("steps", []), memory.get("changes", [])
+
+    def inherit(self, curvature: Curvature) -> None:
+        """Take over the curvature that another one found, of a similar loss."""
+        place = self._tensors[0]
+        names = ("steps", "changes")
+        self._memory.update({n: [each.to(place) for each in part] for n, part in zip(names, curvature, strict=True)})
 
     def has_converged(self, tolerance: float) -> bool:
         """Whether the last step that was kept gained, and the next may gain, at most this part of the loss."""
@@ -60,7 +71,7 @@ class QuasiNewton(torch.optim.Optimizer):
             self._judge(loss, place, gradient)
         direction = self._direction()
         longest, bound = float(direction.abs().max()), memory["bound"]
-        if longest > bound or not memory["steps"]:  # a gradient alone does not tell how far
+        if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
             direction *= bound / longest if longest > 0 else 0.0
         memory["slope"] = _dot(memory["gradient"], direction)
         memory["hoped"] = -memory["slope"]
@@ -104,15 +115,14 @@ class QuasiNewton(torch.optim.Optimizer):
     def _remember(self, step: torch.Tensor, change: torch.Tensor) -> None:
         """Add a step and how the gradient changed over it, if the loss curves upwards there."""
         memory = self._memory
-        steps, changes = memory.setdefault("steps", []), memory.setdefault("changes", [])
+        steps, changes = self.curvature
         if _dot(step, change) > _CURVED * math.sqrt(_dot(step, step) * _dot(change, change)):
             memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
 
     def _direction(self) -> torch.Tensor:
         """Minus the gradient times the inverse of the curvature, as the steps tell it."""
-        memory = self._memory
-        steps, changes = memory.setdefault("steps", []), memory.setdefault("changes", [])
-        direction = -memory["gradient"]
+        steps, changes = self.curvature
+        direction = -self._memory["gradient"]
         pairs = list(zip(steps, changes, strict=True))
         parts = []
         for step, change in reversed(pairs):

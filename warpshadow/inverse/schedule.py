@@ -108,7 +108,7 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     """
     small, middle, large = (_scale(problem, size) for size in (32, 64, 512))
     soft, firm = _soft(problem, 1.0), _soft(problem, 0.5)
-    alone = {"standout": 0.08, "tolerance": 0.01}
+    alone: dict[str, Any] = {"standout": 0.08, "tolerance": 0.01}
     return (
         Stage(30, 0.1, small, candidates=15, **alone, **soft),
         Stage(20, 0.03, small, candidates=4, **alone, **firm),
