@@ -59,7 +59,7 @@ def test_bending_moves_the_top_far_and_the_foot_little():
 @pytest.mark.slow
 def test_a_fit_is_measured_and_one_that_fails_is_listed(ball_case):
     figures = tables.solve(ball_case, "directional", None)
-    assert figures["iterations"] == 30 and figures["reason"] == "finished" and figures["ms"] > 0
+    assert 3 < figures["iterations"] <= 30 and figures["reason"] in ("finished", "converged") and figures["ms"] > 0
     assert figures["TE"] < 0.1 * ball_case.measure(ball_case.problem.scene)["TE"]  # how a ball is turned, none can tell
     assert tables.solve(ball_case, "directional", 3)["iterations"] == 3
     key = "pose | 00 ball, sky | "
