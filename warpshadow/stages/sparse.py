@@ -50,7 +50,7 @@ class SparseMatrix:
         """Give a matrix of SciPy, or NumPy, to a device, without its zeros."""
         from scipy.sparse import csr_matrix
 
-        by_rows = csr_matrix(matrix)
+        by_rows = csr_matrix(matrix, copy=True)
         return SparseMatrix(by_rows.shape, _entries(by_rows, device), _entries(by_rows.T.tocsr(), device))
 
     def on_host(self) -> csr_matrix:
