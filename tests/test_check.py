@@ -224,3 +224,10 @@ def test_a_warning_of_the_renderer_points_at_the_line_that_called_it():
         with pytest.warns(UserWarning, match="the image shows nothing") as caught:
             render(scene)
         assert caught[0].filename == __file__
+
+
+def test_a_folder_that_begins_like_the_package_is_a_users():
+    file = f"{Path(check.__file__).parent}_demo/mine.py"
+    with pytest.warns(UserWarning, match="careful") as warned:
+        exec(compile("check.warn('careful')", file, "exec"), {"check": check, "__name__": "mine"})
+    assert warned[0].filename == file

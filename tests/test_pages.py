@@ -48,9 +48,9 @@ def prose(page):
 
 
 def code(page):
-    """What a page has between backticks, and its lines of commands."""
+    """What a page has between backticks, and its commands: a line each, and those that go on farther to the right."""
     spans = re.findall(r"`([^`]+)`", prose(page))
-    indented = re.findall(r"^    (\S.*)$", prose(page), re.MULTILINE)
+    indented = re.findall(r"^    (\S.*(?:\n {8}\S.*)*)$", prose(page), re.MULTILINE)
     return [*spans, *indented, *"".join(blocks(page, "sh")).splitlines()]
 
 
@@ -97,6 +97,23 @@ def test_files_that_a_page_names_exist(page):
     for text in code(page):
         for name in re.findall(r"[\w./]+\.(?:py|json)\b", text):
             assert any(f"/{file}".endswith(f"/{name}") for file in FILES), name
+
+
+STAGES = ROOT / "warpshadow" / "stages"
+
+
+@pytest.mark.parametrize(
+    ("folder", "files"),
+    [
+        (STAGES, sorted(STAGES.rglob("*.py"))),
+        (ROOT / "tests", sorted((ROOT / "tests").glob("test_*.py"))),
+        (ROOT / "demos", sorted((ROOT / "demos").rglob("*.py"))),
+    ],
+    ids=["stages", "tests", "demos"],
+)
+def test_every_file_of_a_folder_stands_on_its_page(folder, files):
+    page = (folder / "README.md").read_text("utf-8")
+    assert not [name_of(file) for file in files if file.stem != "__init__" and f"`{file.name}`" not in page]
 
 
 @each_page_of_today

@@ -25,7 +25,7 @@ AnyPath = str | os.PathLike[str]
 LARGEST = 1.0e18
 """The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
 
-_OWN_FOLDER = str(Path(__file__).parent)
+_OWN_FOLDER = str(Path(__file__).parent) + os.sep
 
 _PASSED_OVER = ("contextlib", "dataclasses", "functools", "torch")  # modules between a user's line and ours
 

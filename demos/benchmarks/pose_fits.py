@@ -2,9 +2,9 @@
 
     python demos/benchmarks/pose_fits.py [--count 10] [--size 128] [--ways stages]
 
-README's bunny, turned by 40°, its target rendered; and random poses, 10° to 40° and 5% to 25% of the diagonal off,
-their targets ray traced. ``pose_stages`` and ``inverse.fit`` beside what one writes first: Adam on a turn and a shift,
-150 steps at a rate of 0.03, squares of differences at the target's size.
+The bunny on a ground, turned by 40°, its target rendered; and random poses, 10° to 40° and 5% to 25% of the diagonal
+off, their targets ray traced. ``pose_stages`` and ``inverse.fit`` beside what one writes first: Adam on a turn and a
+shift, 150 steps at a rate of 0.03, squares of differences at the target's size.
 
 Printed are iterations, times, and how far vertices are off in the end (MDE, in percent of the diagonal). Times are
 from the call to the first iterate that is at most 0.5% off, to the one from which on all are, and to the end. They
@@ -144,8 +144,8 @@ def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
     return watch.moments
 
 
-def readme_scene(size: int) -> ws.Scene:
-    """README's first scene."""
+def bunny_on_ground(size: int) -> ws.Scene:
+    """The bunny that ships with Warp, on a ground."""
     bunny = ws.Body(shipped_mesh("bunny"), albedo=(0.8, 0.6, 0.5)).on_ground(size=2)
     camera = ws.Camera.framing(bunny, size=(size, size))
     return ws.Scene([bunny, ws.Body(ws.plane(6.0), name="ground")], ws.synthetic_sky(), camera)
@@ -187,9 +187,9 @@ def main(count: int, size: int, ways: list[str]) -> None:
     torch.set_num_threads(1)
     print(f"{processor()}; seconds by the clock and by the processor")
     print(f"{'pose':10} {'way':6} {'it.':>4}   {'first':>13}   {'last':>13}   {'end':>13}   {'MDE [%]':>8}")
-    truth = readme_scene(2 * size)
-    cases = {"README 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], 40))), ws.render(truth))}
-    truth = readme_scene(size)
+    truth = bunny_on_ground(2 * size)
+    cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], 40))), ws.render(truth))}
+    truth = bunny_on_ground(size)
     wanted = ray_traced(truth)
     for seed in range(count):
         body = displaced(truth.bodies[0], np.random.default_rng(seed))
@@ -211,7 +211,9 @@ WAYS = {"plain": plain, "stages": staged}
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10, help="random poses")
-    parser.add_argument("--size", type=int, default=128, help="pixels of random poses' images; README's has twice it")
+    parser.add_argument(
+        "--size", type=int, default=128, help="pixels of random poses' images; that of 40° has twice it"
+    )
     parser.add_argument("--ways", nargs="*", choices=[*WAYS], default=[*WAYS], help="both by default")
     arguments = parser.parse_args()
     main(arguments.count, arguments.size, arguments.ways)

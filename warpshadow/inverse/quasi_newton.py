@@ -29,7 +29,7 @@ class QuasiNewton(torch.optim.Optimizer):
 
     Args:
         parameters: Tensors of one device.
-        lr: The first bound. It may fall from step to step; the bound is never longer than five times of it.
+        lr: The first bound, which may change from step to step: the bound grows to five times of it at most.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], lr: float):

@@ -86,7 +86,7 @@ class SphereMethod(Method):
         raise NotImplementedError
 
     def coefficient_count(self, light: Source | None) -> int:
-        """Number of coefficients of known light that take part; None for free light."""
+        """Number of coefficients of the light that take part; None: light that is not known yet, so all of them."""
         raise NotImplementedError
 
     def look_up(self, bodies: tuple[int, ...], rotations: wp.array, taken: Any) -> dict[int, Any]:
@@ -154,7 +154,7 @@ class InParts(Node):
         method: The method.
         points: The receivers.
         taken: What the method takes of the light.
-        light: Known light, in which parts are shaded; None to end with transfer vectors.
+        light: Known or free light; None where it is not given yet: parts end with transfer vectors.
         finish: What is made of the list of those of all parts.
         keeps: As for :class:`Node`.
         where: Put after the names of its stages, where others have those names.

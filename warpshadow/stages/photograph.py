@@ -6,9 +6,10 @@ by a ratio in place of a difference, which asks for no albedo]
 
     P (1 + (S − S₀) r),    r = S₀⁺ / (S₀⁺² + ε²)
 
-which is P S / S₀ where S₀ ≫ ε, by 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is 1/256 of the mean
-of S₀ over the samples that see catchers: what a photograph of 8 bits does not tell from black. The factor of P is
-averaged over the samples of a pixel and smoothed at silhouettes, P is not: what has no shadow stays as it is.
+which is P S / S₀ where S₀ ≫ ε, up to a factor 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is
+1/256 of the mean of S₀ over the samples that would see catchers without the other bodies: what a photograph of 8 bits
+does not tell from black. The factor of P is averaged over the samples of a pixel and smoothed at silhouettes, P is not:
+what has no shadow stays as it is.
 """
 
 from typing import NamedTuple
@@ -85,15 +86,15 @@ def divide_samples(face_ids: wp.array, catches: wp.array, reflected: wp.array, u
         face_ids: Face that each sample sees, −1 for none, int32 of shape [batch, height, width].
         catches: Whether a face is one of a catcher, bool of shape [face].
         reflected: What the samples reflect, vec3 of shape [batch, height, width].
-        unshadowed: S₀, and 1 where a sample sees a catcher were there nothing else, vec4 likewise.
+        unshadowed: S₀, and whether a sample would see a catcher without the other bodies, 1 or 0; vec4 likewise.
             Any batch may be 1 and then serves every instance.
+
+    It waits for the device, since the host finds ε, and so cannot be captured in a CUDA graph.
 
     Differentiable: reflected, unshadowed (but for ε).
     """
-    count, device = (
-        common_batch({"face_ids": face_ids, "reflected": reflected, "unshadowed": unshadowed}),
-        face_ids.device,
-    )
+    count = common_batch({"face_ids": face_ids, "reflected": reflected, "unshadowed": unshadowed})
+    device = face_ids.device
     received = unshadowed.numpy()
     covered = np.maximum(received[..., 3].sum(axis=(1, 2)), 1.0)
     means = np.maximum(received[..., :3], 0).sum(axis=(1, 2, 3), dtype=np.float64) / (3 * covered)

@@ -16,7 +16,7 @@ holes, h is multiplied with what it covers of the footprint. Radiosity is biline
 are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′.
 
 From the plane to a margin below it a receiver sees the front fade away and the back appear, so that one that lies on
-the ground is as if it were above.
+the ground is as if it were above. Of points that send light their spheres decide (:mod:`.fronts`).
 """
 
 import numpy as np

@@ -26,7 +26,7 @@ from warpshadow.stages.flats.cells import front_presence, step
 from warpshadow.stages.flats.prepared import FlatGrid, Flats
 
 _ROOM = wp.constant(1.25)
-"""Spheres that are 1/1.25 of their radius above a flat are wholly so."""
+"""A source is wholly in front of a flat where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
 
 _TINY = wp.constant(1.0e-18)
 """Radius up to which a sphere stands in for nothing."""

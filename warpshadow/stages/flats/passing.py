@@ -3,9 +3,10 @@
     P_q = T_q max(0, 1 − Σ_k h_k),
 
 h_k the coverage of cell q by flat k (:mod:`.cells`), and T_q the transmittance past all else. Flats that share a cell
-mostly meet in it, as walls do, and cover different parts of it. A large
-sphere in place of a ground is off. Measured: on a cow over a ground the error of direct light is 0.7% of the image's
-mean, 2.3% by it.
+mostly meet in it, as walls do, and cover different parts of it.
+
+A large sphere in place of a ground is worse: on a cow over a ground the error of direct light is 0.7% of the image's
+mean by the plane, and 2.3% by the sphere.
 """
 
 import numpy as np
