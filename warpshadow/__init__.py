@@ -23,7 +23,8 @@ from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
-from warpshadow.tuning.renderer import Renderer, insert, render
+from warpshadow.tuning.insert import insert
+from warpshadow.tuning.renderer import Renderer, render
 from warpshadow.tuning.tune import Tuning, tune
 from warpshadow.viewer import view
 

@@ -256,7 +256,7 @@ def insert(
     """
     from warpshadow.assets.image import write_image
     from warpshadow.scene.files import load_scene
-    from warpshadow.tuning.renderer import insert as insert_bodies
+    from warpshadow.tuning.insert import insert as insert_bodies
 
     with _clear_errors():
         _check_output(output, ".exr", *SUFFIXES)

@@ -271,8 +271,8 @@ class SphereBounces:
         return KeptBounces(self._patches, self._count, own_bounces=OWN_BOUNCES, progress=self._method.progress)
 
     def _at(
-        self, sources: Node, points: LitPoints, materials: Materials, stand_ins: np.ndarray | None = None
+        self, sources: Node, points: LitPoints, materials: Materials, sphere_of_point: np.ndarray | None = None
     ) -> LitPoints:
         """Sources, to be lit among the bodies among which points are; the spheres that stand in for them, if any do."""
         given = self._method, materials, points.vertices, points.spheres, sources, points.call
-        return LitPoints(*given, normals=points.normals, blocking=points.blocking, stand_ins=stand_ins)
+        return LitPoints(*given, normals=points.normals, blocking=points.blocking, sphere_of_point=sphere_of_point)

@@ -37,18 +37,18 @@ class Group(NamedTuple):
     places: Places | None = None  # where they lie on that body
     own_shadow: OwnLookup | OwnLobes | None = None  # by rays; None where there is none, or its spheres block
     flats: FlatsAround | None = None  # bodies that block as planes; None without any
-    stand_ins: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
+    as_spheres: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
 
     def fronts(self, frames: wp.array, flats: Flats) -> wp.array | None:
         """Part of the front of each flat that they see; None where their heights decide."""
-        return None if self.stand_ins is None else find_fronts(self.points, self.stand_ins, frames, flats)
+        return None if self.as_spheres is None else find_fronts(self.points, self.as_spheres, frames, flats)
 
     def parts(self) -> Iterator[Group]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, stand_ins = self
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres = self
         size = points.shape[1]
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
@@ -68,7 +68,7 @@ class Group(NamedTuple):
                 centers=centers,
                 radii=radii,
                 places=None if places is None else places.part(part),
-                stand_ins=None if stand_ins is None else stand_ins.part(part),
+                as_spheres=None if as_spheres is None else as_spheres.part(part),
             )
 
 
@@ -128,10 +128,10 @@ class Grouping:
     ) -> Iterator[Group]:
         """Those that may move."""
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
-        stand_ins = self._stand_ins(spheres)
+        as_spheres = self._as_spheres(spheres)
         if not receivers.spans:
             blocking, flats = self._assembly.spheres_of(bodies, spheres), self._flats_around(frames)
-            yield Group(receivers.points, receivers.normals, *blocking, flats=flats, stand_ins=stand_ins)
+            yield Group(receivers.points, receivers.normals, *blocking, flats=flats, as_spheres=as_spheres)
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
             is_traced = span.body in self._points.blocking.traced
@@ -141,17 +141,17 @@ class Grouping:
             if span.body >= 0:
                 places = self._points.method.own_shadows.places(receivers, span)
                 group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))
-            if stand_ins is not None:
-                group = group._replace(stand_ins=stand_ins.part(slice(span.first, span.end)))
+            if as_spheres is not None:
+                group = group._replace(as_spheres=as_spheres.part(slice(span.first, span.end)))
             yield group
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
         """Those of some bodies that block by their spheres."""
         return [body for body in bodies if body not in self._points.blocking.flats]
 
-    def _stand_ins(self, spheres: tuple[wp.array, wp.array]) -> SpheresOfPoints | None:
+    def _as_spheres(self, spheres: tuple[wp.array, wp.array]) -> SpheresOfPoints | None:
         """Spheres that stand in for the receivers."""
-        numbers, assembly = self._points.stand_ins, self._assembly
+        numbers, assembly = self._points.sphere_of_point, self._assembly
         if numbers is None:
             return None
         solid = np.flatnonzero(~assembly.is_flat).tolist()

@@ -1,0 +1,76 @@
+"""Bodies put into a photograph, by a renderer of any scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.image import ImageError, read_rgb
+from warpshadow.check import AnyPath
+from warpshadow.device.tape import unrecorded
+from warpshadow.scene.scene import SCENE, Scene
+from warpshadow.tuning.renderer import Renderer
+
+
+def insert(
+    scene: Scene,
+    photograph: npt.ArrayLike | AnyPath,
+    *,
+    exposure: float = 0.0,
+    device: wp.DeviceLike = "cpu",
+    progress: bool = True,
+) -> np.ndarray:
+    """Put the bodies of a scene into a photograph, with their shadows on what the shadow catchers stand for.
+
+    Where the photograph shows a catcher, it is multiplied by the ratio of the light that the catcher receives with the
+    other bodies to that without them; these are drawn over it, with soft edges. See
+    :mod:`warpshadow.stages.photograph`, and :meth:`warpshadow.torch.TorchRenderer.insert` for gradients.
+
+    Args:
+        scene: The scene, with one or more bodies that are shadow catchers, and the camera of the photograph, whose size
+            becomes that of the photograph.
+        photograph: Linear RGB of shape [height, width, 3], or a file that :func:`warpshadow.read_image` reads.
+        exposure: Factor of the bodies' radiance in the photograph, in stops.
+        device: Warp device.
+        progress: Show progress where something takes longer than a second.
+
+    Returns:
+        Linear RGB, float32 of the photograph's shape; :func:`warpshadow.write_image` writes it as a picture.
+
+    Raises:
+        ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
+    """
+    check.instance("scene", scene, Scene, SCENE)
+    pixels = linear_photograph(photograph)
+    height, width, _ = pixels.shape
+    camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
+    renderer = Renderer(replace(scene, camera=camera), device=device, progress=progress)
+    given = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
+    with unrecorded():
+        image: np.ndarray = renderer.insert(given).numpy()[0] * np.float32(gain)
+    return image
+
+
+def linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
+    """Linear RGB of a photograph or of its file, float32 of shape [height, width, 3]."""
+    if check.is_path(photograph):
+        path = check.file("photograph", photograph)
+        with check.located("photograph", ImageError):
+            return read_rgb(path)
+    pixels = check.pixels("photograph", photograph, expected="linear RGB [height, width, 3], or the path of a picture")
+    check.shape("photograph", pixels.shape, ("height", "width", 3), check.channels_last(pixels.shape))
+    check.finite("photograph", pixels)
+    return pixels
+
+
+def fitting_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera for a photograph of another size; ValueError unless its proportions are the same up to a pixel."""
+    if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height, width, height):
+        raise ValueError(
+            f"photograph: got {width} × {height} pixels, expected the proportions of the scene's camera, "
+            f"{camera.width} × {camera.height}: crop it, or give [camera] its size"
+        )
+    return camera.stretched(width, height)
