@@ -164,15 +164,21 @@ def pose_errors(found: ws.Body, true: ws.Body) -> dict[str, float]:
     return {"pose MDE": distance_error(found, true), "RE": float(angle), "TE": float(offset @ offset)}
 
 
-def displaced(body: ws.Body, rng: np.random.Generator) -> ws.Body:
-    """A body turned by 10° to 40° about an axis through its middle, and shifted by 5% to 25% of its diagonal."""
+def displaced(
+    body: ws.Body,
+    rng: np.random.Generator,
+    *,
+    degrees: tuple[float, float] = (10, 40),
+    part: tuple[float, float] = (0.05, 0.25),
+) -> ws.Body:
+    """A body turned by some degrees about an axis through its middle, and shifted by a part of its diagonal."""
     from scipy.spatial.transform import Rotation
 
     axis, direction = (vector / np.linalg.norm(vector) for vector in rng.standard_normal((2, 3)))
-    turn = Rotation.from_rotvec(np.radians(rng.uniform(10, 40)) * axis)
+    turn = Rotation.from_rotvec(np.radians(rng.uniform(*degrees)) * axis)
     low, high = body.world_mesh().bounds
     middle = (low + high) / 2
-    shift = rng.uniform(0.05, 0.25) * np.linalg.norm(high - low) * direction
+    shift = rng.uniform(*part) * np.linalg.norm(high - low) * direction
     rotation = turn * Rotation.from_matrix(body.rotation_matrix())
     translation = turn.apply(body.translation - middle) + middle + shift
     return dataclasses.replace(body, rotation=rotation.as_rotvec(degrees=True), translation=translation)
