@@ -213,8 +213,8 @@ def by_outline(photo: Photograph, start: ws.Body) -> ws.Body:
     black = dataclasses.replace(start, albedo=np.zeros(3))
     scene = dataclasses.replace(unshadowed(photo.scene), bodies=(black,))
     target = inverse.Target(np.concatenate([np.zeros_like(photo.image), photo.outline[..., None]], axis=-1))
-    stages = [inverse.Stage(60, 0.03, _scale(photo, 96)), inverse.Stage(50, 0.01, _scale(photo, 160))]
-    return inverse.fit(inverse.Problem(scene, target, inverse.Pose(BODY)), stages, progress=False).scene.bodies[BODY]
+    problem = inverse.Problem(scene, target, inverse.Pose(BODY, spread=0.3))
+    return inverse.fit(problem, inverse.pose_stages(problem), progress=False).scene.bodies[BODY]
 
 
 def prediction(photo: Photograph, visibility: ws.Visibility) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
