@@ -214,7 +214,9 @@ def by_outline(photo: Photograph, start: ws.Body) -> ws.Body:
     scene = dataclasses.replace(unshadowed(photo.scene), bodies=(black,))
     target = inverse.Target(np.concatenate([np.zeros_like(photo.image), photo.outline[..., None]], axis=-1))
     problem = inverse.Problem(scene, target, inverse.Pose(BODY, spread=0.3))
-    return inverse.fit(problem, inverse.pose_stages(problem), progress=False).scene.bodies[BODY]
+    *coarse, _ = inverse.pose_stages(problem)
+    stages = [*coarse, inverse.Stage(40, 0.01, _scale(photo, 240))]
+    return inverse.fit(problem, stages, progress=False).scene.bodies[BODY]
 
 
 def prediction(photo: Photograph, visibility: ws.Visibility) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
