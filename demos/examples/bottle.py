@@ -10,9 +10,6 @@ the picture is masked out. First the bottle is moved until it covers its outline
 a fit of the image goes on, with shadows and without. The table's texture is to have few edges, and the inside of the
 bottle is masked out: its print, its gloss and the other orange of its cap are nothing that one color explains.
 
-With ``--blind`` nothing uses the outline but the mask: the approach is a fit of small images, too, in which the table
-is to have two colors, so that it cannot be painted as the bottle.
-
 At the end light and table are fitted to the half of the table in front of the bottle, and predict the half behind.
 """
 
@@ -43,8 +40,8 @@ BODY, TABLE = 0, 1
 SHADOWS = ws.Visibility(directions=64)
 TWO_COLORS: dict[str, Any] = {"palette": 1.0, "colors": 2}
 FEW_EDGES: dict[str, Any] = {"total_variation": 0.05}
-TEXELS = (160, 160)
 RIM = 1 / 96  # of the image's width: what counts of the body, along its outline
+EXPOSURE = 0.25  # of the stand-in: white tiles in the sun do not saturate
 PLAIN = ws.EnvironmentMap.constant(1.0)
 HUBER = inverse.Loss("huber")
 
@@ -58,12 +55,14 @@ class Photograph:
         table: Where the table is seen and is matte, 0 to 1, [height, width].
         outline: Where the body is seen, 0 to 1, [height, width].
         scene: The body as it is known to stand, and the table, a plane, as one gray.
+        texels: Of the table's texture, across and down.
     """
 
     image: np.ndarray
     table: np.ndarray
     outline: np.ndarray
     scene: ws.Scene
+    texels: int
 
     def mask(self, *, inside: bool = True) -> np.ndarray:
         """What counts: the table clear of the outline and of other objects, and the body, or its rim alone."""
@@ -141,7 +140,7 @@ def bottle_photograph(folder: Path) -> Photograph:
     others = np.max([_area(points, width, height) for points in _OTHERS], axis=0)
     matte = _area(_MATTE_TABLE, width, height) * (1 - others)
     scene = ws.Scene((body, table), PLAIN, camera, SHADOWS)
-    return Photograph(image, matte, _area(_BOTTLE, width, height), scene)
+    return Photograph(image, matte, _area(_BOTTLE, width, height), scene, texels=160)
 
 
 def stand_in(size: int = 256) -> Photograph:
@@ -154,7 +153,7 @@ def stand_in(size: int = 256) -> Photograph:
     traced = ray_traced(truth, 512)
     bunny = dataclasses.replace(unshadowed(truth), bodies=truth.bodies[:1], supersampling=4)
     plain = dataclasses.replace(changed(truth, TABLE, albedo=(0.4, 0.4, 0.4), texture=None), light=PLAIN)
-    return Photograph(traced[..., :3], np.floor(traced[..., 3]), ws.render(bunny)[..., 3], plain)
+    return Photograph(EXPOSURE * traced[..., :3], np.floor(traced[..., 3]), ws.render(bunny)[..., 3], plain, texels=64)
 
 
 def _area(points: str, width: int, height: int, finer: int = 4) -> np.ndarray:
@@ -173,39 +172,8 @@ def painted(photo: Photograph, **prior: Any) -> inverse.Result:
     """The table's texture with all that is on it, the body apart: where a fit starts, and which square is which."""
     scene = dataclasses.replace(unshadowed(photo.scene), bodies=photo.scene.bodies[TABLE:])
     target = inverse.Target(photo.image, photo.around())
-    problem = inverse.Problem(scene, target, inverse.Texture(0, TEXELS, **prior), HUBER, still=None)
+    problem = inverse.Problem(scene, target, inverse.Texture(0, (photo.texels,) * 2, **prior), HUBER, still=None)
     return inverse.fit(problem, [inverse.Stage(60, 0.05, _scale(photo, 240), supersampling=1)], progress=False)
-
-
-def approached(photo: Photograph, start: ws.Body, visibility: ws.Visibility) -> ws.Body:
-    """The body nearer to where it is, by small images and soft shadows."""
-    soft = {"softness": 0.7} if visibility.method == "directional" else {}
-    stage = inverse.Stage(50, 0.03, _scale(photo, 96), supersampling=1, **soft)
-    return _fitted(photo, start, visibility, stage, TWO_COLORS, inside=True).bodies[BODY]
-
-
-def refined(photo: Photograph, start: ws.Body, visibility: ws.Visibility, iterations: int) -> ws.Scene:
-    """The scene, from the body near where it is."""
-    stage = inverse.Stage(iterations, 0.01, _scale(photo, 160), supersampling=1)
-    return _fitted(photo, start, visibility, stage, FEW_EDGES, inside=False)
-
-
-def _fitted(
-    photo: Photograph,
-    start: ws.Body,
-    visibility: ws.Visibility,
-    stage: inverse.Stage,
-    prior: dict[str, Any],
-    *,
-    inside: bool,
-) -> ws.Scene:
-    """Pose, color, light and texture of an image, from the body at a place and all else unknown."""
-    texture = painted(photo, **prior).scene.bodies[0].texture
-    scene = dataclasses.replace(photo.scene, visibility=visibility)
-    scene = changed(changed(scene, BODY, **placement(start)), TABLE, texture=texture)
-    free = [inverse.Pose(BODY), inverse.Albedo(BODY), inverse.Light(3), inverse.Texture(TABLE, **prior)]
-    problem = inverse.Problem(scene, inverse.Target(photo.image, photo.mask(inside=inside)), free, HUBER)
-    return inverse.fit(problem, [stage], progress=False).scene
 
 
 def by_outline(photo: Photograph, start: ws.Body) -> ws.Body:
@@ -217,6 +185,17 @@ def by_outline(photo: Photograph, start: ws.Body) -> ws.Body:
     *coarse, _ = inverse.pose_stages(problem)
     stages = [*coarse, inverse.Stage(40, 0.01, _scale(photo, 240))]
     return inverse.fit(problem, stages, progress=False).scene.bodies[BODY]
+
+
+def by_image(photo: Photograph, start: ws.Body, visibility: ws.Visibility, iterations: int = 30) -> ws.Scene:
+    """The scene, from the body near where it is and all else unknown: pose, color, light and texture of an image."""
+    texture = painted(photo, **FEW_EDGES).scene.bodies[0].texture
+    scene = dataclasses.replace(photo.scene, visibility=visibility)
+    scene = changed(changed(scene, BODY, **placement(start)), TABLE, texture=texture)
+    free = [inverse.Pose(BODY), inverse.Albedo(BODY), inverse.Light(3), inverse.Texture(TABLE, **FEW_EDGES)]
+    problem = inverse.Problem(scene, inverse.Target(photo.image, photo.mask(inside=False)), free, HUBER)
+    stage = inverse.Stage(iterations, 0.01, _scale(photo, 160), supersampling=1)
+    return inverse.fit(problem, [stage], progress=False).scene
 
 
 def prediction(photo: Photograph, visibility: ws.Visibility) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -270,7 +249,7 @@ def _scale(photo: Photograph, width: int) -> float:
 # ------------------------------------------------------------------------------------------------ the comparison
 
 
-def main(data: Path | None, output: Path, starts: int, iterations: int, is_blind: bool) -> None:
+def main(data: Path | None, output: Path, starts: int, iterations: int) -> None:
     ws.quiet()
     torch.set_num_threads(1)
     began = time.perf_counter()
@@ -284,10 +263,7 @@ def main(data: Path | None, output: Path, starts: int, iterations: int, is_blind
     for seed in range(starts):
         start = displaced(truth, np.random.default_rng(seed), degrees=(15, 15), part=(0.1, 0.1))
         outlined = by_outline(photo, start)
-        explained = [
-            refined(photo, approached(photo, start, by) if is_blind else outlined, by, iterations)
-            for by in (SHADOWS, DIRECT)
-        ]
+        explained = [by_image(photo, outlined, by, iterations) for by in (SHADOWS, DIRECT)]
         scenes.append(explained[0])
         for label, body in zip(errors, [*(scene.bodies[BODY] for scene in explained), outlined], strict=True):
             errors[label].append(distance_error(body, truth))
@@ -309,7 +285,7 @@ def main(data: Path | None, output: Path, starts: int, iterations: int, is_blind
 def pictures(photo: Photograph, scene: ws.Scene, error: float) -> Image.Image:
     """The photograph beside what was found, at half the photograph's size."""
     camera = photo.scene.camera.resized(0.5)
-    visibility = ws.Visibility("ray-traced", samples=256)
+    visibility = ws.Visibility("ray-traced", samples=1024)
     image = ws.render(dataclasses.replace(scene, camera=camera, visibility=visibility, supersampling=3))
     without = ws.render(dataclasses.replace(unshadowed(scene), camera=camera, supersampling=3))
     seen = np.concatenate([halved(photo.image), np.ones((*image.shape[:2], 1))], axis=-1)
@@ -326,6 +302,5 @@ if __name__ == "__main__":
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the picture")
     parser.add_argument("--starts", type=int, default=10, help="number of starts")
     parser.add_argument("--iterations", type=int, default=30, help="of the fit that goes on from the outline")
-    parser.add_argument("--blind", action="store_true", help="use the outline for nothing but the mask")
     arguments = parser.parse_args()
-    main(arguments.data, arguments.output, arguments.starts, arguments.iterations, arguments.blind)
+    main(arguments.data, arguments.output, arguments.starts, arguments.iterations)
