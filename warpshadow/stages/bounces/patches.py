@@ -22,8 +22,8 @@ _PIECES = 8
 """Pieces of each patch, at least."""
 
 _NEEDLE = 0.01
-"""Area of a piece that stays whole however long it is, in squares of the length that it should have: so the number of
-pieces is bounded."""
+"""Area of a piece that stays whole however long it is, where pieces should be 1 long: so the number of pieces is
+bounded."""
 
 _SOURCES = 4
 """Sources of a patch, at most."""
@@ -114,7 +114,7 @@ def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool
     count = min(count, max(_LEAST_PATCHES, len(faces) // _PIECES)) // sides
     total = np.linalg.norm(_areas(positions.astype(np.float64)[faces]), axis=1).sum()
     longest = 2 * np.sqrt(total / (_PIECES * count))  # as in right triangles
-    cut = _cut(positions, faces, lambda middles: np.full(len(middles), longest))
+    cut = _cut(positions, faces, lambda points: points / longest)
     areas = np.linalg.norm(cut.areas, axis=1)
     half_size = np.linalg.norm(np.ptp(cut.middles, axis=0)) / 2 if len(areas) else 1.0
     features = np.concatenate([cut.middles / half_size, _NORMAL_WEIGHT * cut.areas / areas[:, None]], axis=1)
@@ -162,10 +162,11 @@ def find_flat_patches(
     frame, origin = grid.frame, grid.origin
     texels = grid.texel_sizes().reshape(-1, 2)
 
-    def longest(middles: np.ndarray) -> np.ndarray:
-        return texels[grid.texels_of((middles - origin) @ frame.T[:, :2])].min(axis=1)
+    def in_texels(points: np.ndarray) -> np.ndarray:
+        places = grid.in_texels((points - origin) @ frame.T[:, :2])
+        return np.concatenate([places, np.zeros_like(places[..., :1])], axis=-1)
 
-    cut = _cut(positions, faces, longest)
+    cut = _cut(positions, faces, in_texels)
     labels = grid.texels_of((cut.middles - origin) @ frame.T[:, :2])
     centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
     areas = grid.covered.ravel() * texels.prod(axis=1)
@@ -194,17 +195,22 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 
 
-def _cut(positions: np.ndarray, faces: np.ndarray, longest: Callable[[np.ndarray], np.ndarray]) -> _Cut:
-    """Halve faces across their longest edges, until these are as short as is asked for where the pieces are."""
+def _cut(positions: np.ndarray, faces: np.ndarray, measured: Callable[[np.ndarray], np.ndarray]) -> _Cut:
+    """Halve faces across their longest edges, until none is longer than 1.
+
+    Args:
+        positions: Vertices [units of the body], shape [vertex, 3].
+        faces: Faces, shape [face, 3].
+        measured: Takes points [..., 3] to those between which lengths count.
+    """
     whole = positions.astype(np.float64)[faces]
     owners = np.flatnonzero(_areas(whole).any(axis=1)).astype(np.int32)
     corners = np.tile(np.eye(3), (len(owners), 1, 1))
     parts = []
     while len(owners):
-        places = corners @ whole[owners]
+        places = measured(corners @ whole[owners])
         edges = np.linalg.norm(np.roll(places, -1, axis=1) - np.roll(places, -2, axis=1), axis=2)
-        most = longest(places.mean(axis=1))
-        is_long = (edges.max(axis=1) > most) & (np.linalg.norm(_areas(places), axis=1) > _NEEDLE * most**2)
+        is_long = (edges.max(axis=1) > 1) & (np.linalg.norm(_areas(places), axis=1) > _NEEDLE)
         parts.append((owners[~is_long], corners[~is_long]))
         opposite = edges[is_long].argmax(axis=1)[:, None]
         a, b, c = np.moveaxis(np.take_along_axis(corners[is_long], (opposite + np.arange(3))[..., None] % 3, 1), 1, 0)

@@ -58,11 +58,15 @@ class Grid(NamedTuple):
         ]
         return np.stack(np.meshgrid(*map(np.diff, edges)), axis=-1)
 
+    def in_texels(self, points: np.ndarray) -> np.ndarray:
+        """Where points (a, b) are [..., 2], in texels from the corner ``low``."""
+        height, width = self.covered.shape
+        return (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
+
     def texels_of(self, points: np.ndarray) -> np.ndarray:
         """Number of the texel that is nearest to each point (a, b) [point, 2]."""
         height, width = self.covered.shape
-        place = (squeezed(points / self.spread) - self.low) / (self.high - self.low) * (width, height)
-        column, row = np.clip(place.astype(int), 0, (width - 1, height - 1)).T
+        column, row = np.clip(self.in_texels(points).astype(int), 0, (width - 1, height - 1)).T
         return row * width + column
 
     def points(self, split: int) -> np.ndarray:
@@ -156,7 +160,7 @@ def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[Cov
     height, width = grid.covered.shape
     points = grid.points(_TESTED)
     shape = np.array([width, height]) * _TESTED
-    places = (squeezed(corners / grid.spread) - grid.low) / (grid.high - grid.low) * shape - 0.5
+    places = grid.in_texels(corners) * _TESTED - 0.5
     first = np.maximum(np.ceil(places.min(axis=1) - _ROUNDING), 0).astype(int)
     last = np.minimum(np.floor(places.max(axis=1) + _ROUNDING), shape - 1).astype(int)
     counts = np.maximum(last - first + 1, 0)
