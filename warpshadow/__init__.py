@@ -10,7 +10,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.picture import Picture
-from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.assets.primitives import icosphere, infinite_ground, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.assets.unwrap import unwrap
 from warpshadow.assets.video import write_video
@@ -53,6 +53,7 @@ __all__ = [
     "fibonacci",
     "fit_spheres",
     "icosphere",
+    "infinite_ground",
     "insert",
     "linear_to_srgb",
     "load_mesh",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
-from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.assets.primitives import icosphere, infinite_ground, plane
 from warpshadow.assets.unwrap import unwrap
 from warpshadow.stages.normals import vertex_normals
 
@@ -140,6 +140,24 @@ def test_a_plane_faces_up_and_fills_its_size():
     np.testing.assert_array_equal(mesh.uv_faces, mesh.faces)
 
 
+@pytest.mark.parametrize("segments", [8, 64, 100])
+def test_an_infinite_ground_faces_up_without_holes_in_faces_of_good_shape(segments):
+    mesh = infinite_ground(3.0, segments)
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    assert (normals[:, 1] > 0).all() and (normals[:, [0, 2]] == 0).all() and mesh.uvs is None and mesh.is_flat
+    reach = 3e4
+    np.testing.assert_allclose(normals.sum(), segments / 2 * np.sin(2 * np.pi / segments) * reach**2, rtol=1e-6)
+    edges = {tuple(edge) for edge in mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()}
+    rim = [edge for edge in edges if edge[::-1] not in edges]
+    assert len(edges) == 3 * mesh.face_count and len(rim) == segments
+    np.testing.assert_allclose(np.linalg.norm(mesh.positions[np.unique(rim)], axis=1), reach, rtol=1e-6)
+    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    distances = np.linalg.norm(corners, axis=2).max(axis=1)
+    assert (lengths < 1.5 * 2 * np.pi / segments * np.maximum(distances, 1.5)).all()
+    assert mesh.face_count < 6 * segments**2
+
+
 @pytest.mark.parametrize("subdivisions", [0, 1, 3])
 def test_an_icosphere_is_a_closed_sphere_seen_from_outside(subdivisions):
     mesh = icosphere(2.5, subdivisions)
@@ -158,6 +176,12 @@ def test_an_icosphere_is_a_closed_sphere_seen_from_outside(subdivisions):
         lambda: plane((1, np.inf)),
         lambda: plane(1, 0),
         lambda: plane(1, 2.5),
+        lambda: infinite_ground(0.0),
+        lambda: infinite_ground(np.nan),
+        lambda: infinite_ground(1e18),
+        lambda: infinite_ground((1, 2)),
+        lambda: infinite_ground(1, 7),
+        lambda: infinite_ground(1, 10.5),
         lambda: icosphere(-1),
         lambda: icosphere(1, 9),
     ],

@@ -11,6 +11,7 @@ from warpshadow.viewer.look import ERROR, Look, Place
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import (
     Painter,
+    bounds,
     coarse,
     distances,
     error_picture,
@@ -40,6 +41,19 @@ def scene():
 @pytest.fixture(scope="module")
 def painter(scene):
     return Painter(scene)
+
+
+def test_a_ground_to_the_horizon_does_not_count_in_the_size_of_a_scene(scene):
+    ball, ground = scene.bodies
+    horizon = dataclasses.replace(ground, mesh=ws.infinite_ground(8.0))
+    np.testing.assert_allclose(bounds(scene), [[-4, 0, -4], [4, 2, 4]], atol=1e-3)
+    np.testing.assert_allclose(bounds(dataclasses.replace(scene, bodies=(ball, horizon))), bounds_of(ball), atol=1e-6)
+    alone = dataclasses.replace(scene, bodies=(horizon,))
+    np.testing.assert_allclose(bounds(alone), bounds_of(horizon))
+
+
+def bounds_of(body):
+    return body.world_mesh().bounds
 
 
 def difference(image, other):

@@ -1,4 +1,4 @@
-"""Primitives: planes and spheres."""
+"""Primitives: planes, grounds and spheres."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from warpshadow.assets.mesh import Mesh, MeshError
 
 
 def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, int] = 64) -> Mesh:
-    """Make a grid in the plane y = 0, centered at the origin, facing +y.
+    """Make a grid in the plane y = 0, centered at the origin, facing +y; :func:`infinite_ground` has no edge in sight.
 
     Args:
         size: Edge length along x and z [scene units], one for both or a pair.
@@ -36,6 +36,40 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     return Mesh(positions, faces, uvs, faces, "plane")
+
+
+_REACH = 1e4
+"""How far an infinite ground goes, in sizes: seen from one size above, it ends 0.006 degrees below the horizon."""
+
+
+def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
+    """Make a ground in the plane y = 0 that goes to the horizon, around the origin, facing +y, without uvs.
+
+    Its faces are fine where bodies stand, and yet few: of one size within a disc, and further out longer in proportion
+    to their distance. It ends 10⁴ sizes away. Framings leave it out, as they do all flat bodies.
+
+    Args:
+        size: Diameter of the disc [scene units], such as that of what stands there with its shadow.
+        segments: Faces around the origin, 8 to 4096: in the disc they are π size / segments long.
+    """
+    if not (check.is_number(size) and 0 < size <= check.LARGEST / _REACH):
+        raise MeshError(f"size: got {check.described(size)}, expected a positive number of scene units")
+    if not check.is_integer(segments) or not 8 <= segments <= 4096:
+        raise MeshError(f"segments: got {check.described(segments)}, expected a whole number from 8 to 4096")
+    step = 2 * np.pi / segments
+    inner = np.linspace(0, 0.5, round(1 / step) + 1)[1:]
+    outer = np.geomspace(0.5, _REACH, int(np.ceil(np.log(2 * _REACH) / np.log1p(step))) + 1)[1:]
+    radii = size * np.concatenate([inner, outer])
+    angles = step * np.arange(segments)
+    around = np.stack([np.cos(angles), np.zeros(segments), -np.sin(angles)], axis=-1)
+    positions = np.concatenate([np.zeros((1, 3)), (radii[:, None, None] * around).reshape(-1, 3)])
+    first = 1 + segments * np.arange(len(radii))
+    here, beside = np.arange(segments), np.roll(np.arange(segments), -1)
+    fan = np.stack([np.zeros(segments, int), first[0] + here, first[0] + beside], axis=-1)
+    a, b = first[:-1, None] + here, first[:-1, None] + beside
+    c, d = first[1:, None] + here, first[1:, None] + beside
+    rings = np.stack([a, c, d, a, d, b], axis=-1).reshape(-1, 3)
+    return Mesh(positions, np.concatenate([fan, rings]), name="infinite_ground")
 
 
 def _pair(value: Any) -> tuple[Any, Any]:

@@ -17,7 +17,7 @@ from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MESH_SUFFIXES
-from warpshadow.assets.primitives import icosphere, plane
+from warpshadow.assets.primitives import icosphere, infinite_ground, plane
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
@@ -31,7 +31,11 @@ _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground")
-_PRIMITIVES: dict[str, Callable[..., Mesh]] = {"plane": plane, "icosphere": icosphere}
+_PRIMITIVES: dict[str, Callable[..., Mesh]] = {
+    "plane": plane,
+    "icosphere": icosphere,
+    "infinite_ground": infinite_ground,
+}
 _SHAPE_KEYS = {name: tuple(inspect.signature(make).parameters) for name, make in _PRIMITIVES.items()}
 _KEYS = {
     "[camera]": (*_CAMERA_KEYS, *_FRAMING_KEYS, "supersampling"),

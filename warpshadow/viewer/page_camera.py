@@ -17,7 +17,7 @@ from warpshadow.assets.camera import Camera
 LARGEST_CANVAS = 1 << 14
 """Width and height of a canvas [pixels] beyond which a page is not believed."""
 
-_PAGE_RADIUS = 3.0  # of scenes, in units of pages
+PAGE_RADIUS = 3.0  # of scenes, in units of pages
 _NARROWEST, _WIDEST = 0.5, 170.0  # field of view [degrees]
 
 
@@ -92,7 +92,7 @@ class PageCamera:
 def page_scale(low: np.ndarray, high: np.ndarray) -> float:
     """Units of a page in a unit of the scene, from the corners of the box around all bodies."""
     radius = 0.5 * float(np.linalg.norm(high - low))
-    return _PAGE_RADIUS / radius if radius > 0 else 1.0
+    return PAGE_RADIUS / radius if radius > 0 else 1.0
 
 
 def upward(camera: Camera) -> tuple[float, float, float]:

@@ -13,7 +13,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from warpshadow import check
-from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
@@ -29,6 +29,7 @@ from warpshadow.viewer.quality import Quality
 _BACKGROUND = 0.05  # linear gray behind what is not covered
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
 _RENDERERS, _SIZES = 6, 8  # that are kept
+_HORIZON = 100.0  # a flat body goes to the horizon that is so many times as large as all bodies that are not flat
 _FAR = 160.0  # depth of what is not there [page units]; viser knows none beyond 167
 _RAYS = 256  # of a pixel, that an error is told against
 _DEPTH_PIXELS = 256**2  # of depths, which are sent without loss
@@ -208,9 +209,11 @@ class Recent(Generic[Value]):
 
 
 def bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box around all bodies."""
-    boxes = [body.world_mesh().bounds for body in scene.bodies]
-    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+    """Corners of the box around all bodies but grounds that go to the horizon."""
+    parts = [body.world_points() for body in scene.bodies]
+    most = _HORIZON * np.ptp(framed_points(scene), axis=0).max()
+    points = np.concatenate([part for part in parts if np.ptp(part, axis=0).max() <= most])
+    return points.min(axis=0), points.max(axis=0)
 
 
 def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:

@@ -18,7 +18,7 @@ from warpshadow.scene.scene import METHODS, RECEIVERS
 from warpshadow.viewer import gizmo
 from warpshadow.viewer.look import AS_GIVEN, ERROR, PICTURE, Look, Place
 from warpshadow.viewer.loop import Loop
-from warpshadow.viewer.page_camera import quaternion
+from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion
 from warpshadow.viewer.painter import Painter, picture
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
 
@@ -188,9 +188,10 @@ class Panel:
         if number is not None:
             body = self._scene.bodies[number]
             wxyz, position = gizmo.handle_of(self._loop.look.places[number], body, self._scale)
+            radius = min(self._scale * gizmo.radius(body), PAGE_RADIUS)  # a ground may go to the horizon
             self._handles = self._server.scene.add_transform_controls(
                 _HANDLES,
-                scale=1.2 * self._scale * gizmo.radius(body),  # they begin inside the body, and end outside of it
+                scale=1.2 * radius,  # they begin inside the body, and end outside of it
                 wxyz=wxyz,
                 position=position,
             )
