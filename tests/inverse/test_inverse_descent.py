@@ -197,6 +197,7 @@ def test_a_stage_names_what_is_wrong_with_it(options, message):
     ("options", "message"),
     [
         ({"stages": []}, "stages: got none"),
+        ({"stages": "poses"}, "stages: got 'poses', .*did you mean 'pose'"),
         ({"stages": 100}, r"stages\[0\]: got 100, expected a Stage, such as Stage\(iterations=200\)"),
         ({"stages": [Stage(1), "pose"]}, r"stages\[1\]: got 'pose', expected a Stage"),
         ({"optimizer": "adam"}, "optimizer: got 'adam', .*torch.optim.Adam"),

@@ -104,6 +104,7 @@ class Camera:
         return f"Camera({self.width} × {self.height}, eye ({x:.3g}, {y:.3g}, {z:.3g}), fov_y {fov_y:.3g})"
 
     @classmethod
+    @check.keywords(fov="fov_y", position="eye", origin="eye", at="target")
     def look_at(
         cls,
         eye: npt.ArrayLike,
@@ -136,6 +137,7 @@ class Camera:
         return cls(intrinsics, rotation, -rotation @ origin, width, height, near)
 
     @classmethod
+    @check.keywords(fov="fov_y", eye="direction")
     def framing(
         cls,
         shown: Placed | Iterable[Placed] | HasBodies,

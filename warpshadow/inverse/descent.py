@@ -27,7 +27,7 @@ from warpshadow.inverse.model import Model, make_model
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
-from warpshadow.inverse.schedule import Stage, check_part, check_stages
+from warpshadow.inverse.schedule import READY_STAGES, Stage, check_part, check_stages
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.scene import Scene
@@ -366,7 +366,7 @@ def default_optimizer(parameters: list[torch.Tensor], lr: float) -> torch.optim.
 
 def fit(
     problem: Problem,
-    stages: Sequence[Stage] = (Stage(),),
+    stages: str | Sequence[Stage] = (Stage(),),
     *,
     optimizer: Callable[..., torch.optim.Optimizer] = default_optimizer,
     tolerance: float = 1e-4,
@@ -383,8 +383,9 @@ def fit(
 
     Args:
         problem: The problem.
-        stages: What to do in which order; :func:`pose_stages` and :func:`deformation_stages` are ways that work. The
-            paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with ``optimizer=torch.optim.SGD``.
+        stages: What to do in which order; "pose" and "deformation" are ways that work, :func:`pose_stages` and
+            :func:`deformation_stages`. The paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with
+            ``optimizer=torch.optim.SGD``.
         optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``, by default
             :func:`default_optimizer`.
         seed: Of candidates that are drawn at random.
@@ -410,6 +411,9 @@ def fit(
         CheckpointError: for a checkpoint of another problem.
     """
     check.instance("problem", problem, Problem, "a Problem, as Problem(scene, targets, free) makes it")
+    if isinstance(stages, str):
+        check.choice("stages", stages, READY_STAGES)
+        stages = READY_STAGES[stages](problem)
     stages = tuple(stages) if isinstance(stages, Iterable) else (stages,)
     check_stages(stages, problem)
     if not callable(optimizer):

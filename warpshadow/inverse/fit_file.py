@@ -22,7 +22,7 @@ from warpshadow.inverse.free.views import CameraPose, Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
-from warpshadow.inverse.schedule import Stage, check_stages, deformation_stages, pose_stages
+from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
 from warpshadow.inverse.target import Target, read_target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
@@ -33,7 +33,6 @@ _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "stil
 _TARGET_KEYS = ("image", "mask", "camera")
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
-_STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {"pose": pose_stages, "deformation": deformation_stages}
 
 
 def _pair(key: str, value: object) -> tuple[float, ...]:
@@ -170,8 +169,8 @@ def _stages(table: Table, problem: Problem) -> tuple[Stage, ...]:
     if "stages" in table:
         if "stage" in table:
             raise ValueError("expected either stages or [[stage]]")
-        check.choice("stages", table["stages"], _STAGES)
-        return _STAGES[table["stages"]](problem)
+        check.choice("stages", table["stages"], READY_STAGES)
+        return READY_STAGES[table["stages"]](problem)
     stages = []
     for where, stage in toml_tables.numbered({"stage": [{}]} | table, "stage"):
         with check.located(where):

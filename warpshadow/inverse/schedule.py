@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -129,6 +129,13 @@ def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
         Stage(100, 0.04, middle, supersampling=1, regularization=2.0),
         Stage(150, 0.02, large),
     )
+
+
+READY_STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {
+    "pose": pose_stages,
+    "deformation": deformation_stages,
+}
+"""Stages that work, by what they find."""
 
 
 def _soft(problem: Problem, softness: float) -> dict[str, Any]:

@@ -310,6 +310,7 @@ class Body:
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
+    @check.keywords(rotation="Body(…, rotation=…).on_ground(…)", scale="size", height="size", translation="foot")
     def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:
         """Stand the body on a ground, as it is turned; its spheres are not fitted again.
 
