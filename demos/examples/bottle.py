@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
-from demos.examples.bunny import checkers, contact_sheet
+from demos.examples.bunny import contact_sheet
 from demos.problems import DIRECT, changed, displaced, distance_error, placement, ray_traced, unshadowed
 from demos.scenes import on_ground, shipped_mesh
 from warpshadow import inverse
@@ -144,9 +144,11 @@ def bottle_photograph(folder: Path) -> Photograph:
 
 
 def stand_in(size: int = 256) -> Photograph:
-    """A ray-traced bunny on tiles."""
+    """A ray-traced bunny on tiles, black and white ones as the photograph's: two colors must be told apart."""
     sky = ws.synthetic_sky((0.8, 0.65, -0.1), sun_strength=3.0, sun_radius=10.0)
-    ground = ws.Body(ws.plane(6.0, 64), texture=checkers(128))
+    tiles = np.where(np.indices((12, 12)).sum(axis=0)[..., None] % 2, 0.8, 0.1) * np.ones(3)
+    texture = tiles.repeat(10, axis=0).repeat(10, axis=1).astype(np.float32)
+    ground = ws.Body(ws.plane(6.0, 64), texture=texture)
     truth = on_ground(shipped_mesh("bunny"), sky, blockers=40, ground=ground)
     camera = truth.camera.resized(size / truth.camera.width)
     truth = dataclasses.replace(truth, camera=camera, visibility=SHADOWS)
@@ -228,6 +230,8 @@ def prediction(photo: Photograph, visibility: ws.Visibility) -> tuple[np.ndarray
     pattern = drawn(dataclasses.replace(unshadowed(photo.scene), light=PLAIN), np.zeros(3), np.ones(3))[..., 0]
     is_whole = ndimage.minimum_filter(pattern, size=3) > 0.95 * pattern.max()
     counts = halved(np.where(~near & (photo.outline == 0), photo.mask(), 0)[..., None])[..., 0] == 1
+    if not (is_whole & counts).any():
+        raise ValueError("photo: no light square is seen whole behind the body")
     return drawn(result.scene, dark, light), halved(photo.image), is_whole & counts
 
 
