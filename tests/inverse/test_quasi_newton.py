@@ -121,3 +121,35 @@ def test_its_state_goes_on_to_the_bit():
     other.load_state_dict(torch.load(file, weights_only=True))
     on(15, x, optimizer), on(15, y, other)
     assert torch.equal(x, y)
+
+
+def test_values_that_are_clamped_end_at_the_least_within_their_bounds():
+    """Of convex functions, against L-BFGS-B; minima out of bounds pull values against these."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        count = rng.integers(2, 7)
+        axes, _ = np.linalg.qr(rng.normal(size=(count, count)))
+        curvature, middle = axes @ np.diag(10 ** rng.uniform(-2, 0, count)) @ axes.T, rng.uniform(-0.5, 1.5, count)
+
+        def loss(x, curvature=curvature, middle=middle):
+            return 0.5 * (x - middle) @ curvature @ (x - middle) + 1e-3
+
+        given = {"method": "L-BFGS-B", "bounds": [(0, 1)] * count, "options": {"ftol": 1e-15, "gtol": 1e-12}}
+        least = scipy.optimize.minimize(loss, np.full(count, 0.5), **given).fun
+        values = torch.full((count,), 0.5, dtype=torch.float64, requires_grad=True)
+        optimizer = QuasiNewton([values], lr=0.02)
+        tensors = torch.from_numpy(curvature), torch.from_numpy(middle)
+        for _ in range(200):
+
+            def closure(values=values, optimizer=optimizer, tensors=tensors):
+                optimizer.zero_grad()
+                found = loss(values, *tensors)
+                found.backward()
+                return float(found.detach())
+
+            found = optimizer.step(closure)
+            with torch.no_grad():
+                values.clamp_(0, 1)
+            if optimizer.has_converged(1e-6):
+                break
+        assert found < 1.001 * least

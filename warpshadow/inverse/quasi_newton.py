@@ -27,6 +27,9 @@ class QuasiNewton(torch.optim.Optimizer):
     lowers the loss is kept, and the bound grows if it was reached. Another one is taken back and makes the bound
     shorter; the gradient at its end tells of curvature nonetheless.
 
+    Values may be clamped after a step. One that was stays where it is as long as the loss would fall beyond, and the
+    direction is that of the others [Nocedal and Wright 2006, section 16.7, gradient projection].
+
     Args:
         parameters: Tensors of one device.
         lr: The first bound, which may change from step to step: the bound grows to five times of it at most.
@@ -66,16 +69,16 @@ class QuasiNewton(torch.optim.Optimizer):
         memory, place, gradient = self._memory, self._flat(self._tensors), self._flat(self._gradients())
         if "loss" not in memory:
             memory["bound"] = self._rate
-            self._keep(loss, place, gradient)
+            self._keep(loss, place, gradient, torch.zeros_like(place))
         else:
             self._judge(loss, place, gradient)
         direction = self._direction()
         longest, bound = float(direction.abs().max()), memory["bound"]
         if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
             direction *= bound / longest if longest > 0 else 0.0
-        memory["slope"] = _dot(memory["gradient"], direction)
-        memory["hoped"] = -memory["slope"]
-        self._move_to(memory["place"] + direction)
+        memory["hoped"] = -_dot(memory["gradient"], direction)
+        memory["aim"] = memory["place"] + direction
+        self._move_to(memory["aim"])
         return loss
 
     @property
@@ -94,13 +97,20 @@ class QuasiNewton(torch.optim.Optimizer):
         for tensor, part in zip(self._tensors, parts, strict=True):
             tensor.copy_(part.view_as(tensor))
 
-    def _keep(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
-        self._memory.update(loss=loss, place=place, gradient=gradient)
+    def _keep(self, loss: float, place: torch.Tensor, gradient: torch.Tensor, sides: torch.Tensor) -> None:
+        self._memory.update(loss=loss, place=place, gradient=gradient, sides=sides)
+
+    def _sides(self, place: torch.Tensor) -> torch.Tensor:
+        """On which side of a value its bound is, ±1, where it was clamped to one; 0 elsewhere."""
+        memory = self._memory
+        stays = torch.where(place == memory["place"], memory["sides"], 0.0)
+        return torch.where(place == memory["aim"], stays, torch.sign(memory["aim"] - place))
 
     def _judge(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""
         memory = self._memory
-        step, slope = place - memory["place"], memory["slope"]
+        step = place - memory["place"]  # maybe clamped
+        slope = _dot(memory["gradient"], step)
         self._remember(step, gradient - memory["gradient"])
         length, rise = float(step.abs().max()), loss - memory["loss"]
         if rise >= 0 and length > 0:
@@ -110,29 +120,36 @@ class QuasiNewton(torch.optim.Optimizer):
         if length > 0.8 * memory["bound"]:
             memory["bound"] = min(_GROWTH * memory["bound"], _REACH * self._rate)
         memory["gained"] = -rise
-        self._keep(loss, place, gradient)
+        self._keep(loss, place, gradient, self._sides(place))
 
     def _remember(self, step: torch.Tensor, change: torch.Tensor) -> None:
         """Add a step and how the gradient changed over it, if the loss curves upwards there."""
         memory = self._memory
         steps, changes = self.curvature
-        if _dot(step, change) > _CURVED * math.sqrt(_dot(step, step) * _dot(change, change)):
+        if _curves(step, change):
             memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
 
     def _direction(self) -> torch.Tensor:
         """Minus the gradient times the inverse of the curvature, as the steps tell it."""
-        steps, changes = self.curvature
-        direction = -self._memory["gradient"]
-        pairs = list(zip(steps, changes, strict=True))
+        memory = self._memory
+        moves = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
+        direction = -memory["gradient"] * moves
+        moved = [(step * moves, change * moves) for step, change in zip(*self.curvature, strict=True)]
+        pairs = [pair for pair in moved if _curves(*pair)]
         parts = []
         for step, change in reversed(pairs):
             parts.append(_dot(step, direction) / _dot(step, change))
             direction = direction - parts[-1] * change
         if pairs:
-            direction = direction * (_dot(*pairs[-1]) / _dot(changes[-1], changes[-1]))
+            direction = direction * (_dot(*pairs[-1]) / _dot(pairs[-1][1], pairs[-1][1]))
         for (step, change), part in zip(pairs, reversed(parts), strict=True):
             direction = direction + (part - _dot(change, direction) / _dot(step, change)) * step
         return direction
+
+
+def _curves(step: torch.Tensor, change: torch.Tensor) -> bool:
+    """Whether the loss curves upwards over a step, by how its gradient changed."""
+    return _dot(step, change) > _CURVED * math.sqrt(_dot(step, step) * _dot(change, change))
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> float:
