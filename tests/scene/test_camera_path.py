@@ -97,3 +97,18 @@ def test_a_camera_between_keyframes_that_is_none_is_named():
         path_of((0, 0, 4), (0, 0, -4), fps=2).cameras(CAMERA)
     with pytest.raises(ValueError, match="keyframes: got 1, expected two or more"):
         path_of((0, 0, 4))
+
+
+def test_a_path_ends_with_its_last_keyframe_whatever_the_frames_times_are():
+    path = ws.CameraPath([ws.Keyframe(0, (0, 1, 5), (0, 0, 0)), ws.Keyframe(1.1, (5, 1, 0), (0, 0, 0))], fps=4)
+    np.testing.assert_allclose(path.cameras(CAMERA)[-1].eye, (5, 1, 0), atol=1e-12)
+
+
+def test_pixels_keep_their_shape_and_the_principal_point_its_place():
+    intrinsics = [[44.0, 0, 12], [0, 22, 7], [0, 0, 1]]
+    like = ws.Camera(intrinsics, CAMERA.rotation, CAMERA.translation, 32, 16, 0.02)
+    own, wider = (ws.Keyframe(k, (4 - k, 1, 3), (0, 0, 0), fov_y=fov) for k, fov in enumerate((None, 60)))
+    first, *_, last = ws.CameraPath([own, wider]).cameras(like)
+    np.testing.assert_allclose(first.intrinsics, intrinsics, atol=1e-10)
+    fy = 8 / np.tan(np.radians(30))
+    np.testing.assert_allclose(last.intrinsics, [[2 * fy, 0, 12], [0, fy, 7], [0, 0, 1]], atol=1e-10)

@@ -142,7 +142,8 @@ class CameraPath:
         """The cameras of the frames of a video.
 
         Args:
-            like: Has their size, near plane and, where a keyframe says none, field of view.
+            like: Has their size, near plane, principal point and shape of pixels; and field of view, where keyframes
+                say none.
 
         Raises:
             ValueError: where a camera between keyframes is none: it is where it looks, or looks along ``up``.
@@ -153,8 +154,10 @@ class CameraPath:
         for number, values in enumerate(self._between(np.array(rows))):
             with check.located(f"the camera at {start + number / self.fps:g} s"):
                 eye, target, up = np.split(values[:9], 3)
-                size = like.width, like.height
-                cameras.append(Camera.look_at(eye, target, up=up, fov_y=float(values[9]), size=size, near=like.near))
+                seen = Camera.look_at(eye, target, up=up, fov_y=float(values[9]), size=(like.width, like.height))
+            intrinsics = like.intrinsics.copy()
+            intrinsics[:2, :2] *= seen.intrinsics[1, 1] / intrinsics[1, 1]
+            cameras.append(Camera(intrinsics, seen.rotation, seen.translation, like.width, like.height, like.near))
         return cameras
 
     def _between(self, rows: np.ndarray) -> np.ndarray:
@@ -163,7 +166,9 @@ class CameraPath:
 
         times = np.array([keyframe.time for keyframe in self.keyframes]) - self.keyframes[0].time
         frames = np.minimum(np.arange(self.frame_count) / self.fps, self.seconds)
-        if self.loop is not None:  # once more before and after, for slopes that go on
+        if self.loop is None:
+            frames[-1] = self.seconds
+        else:  # once more before and after, for slopes that go on
             times = np.concatenate([times + turn * self.seconds for turn in (-1, 0, 1)])
             rows = np.tile(rows, (3, 1))
         values: np.ndarray = PchipInterpolator(times, rows)(frames)
