@@ -71,7 +71,7 @@ def test_a_mesh_leaves_it_and_says_so(tmp_path, write):
     [
         (
             f"usemtl a\n{FACE}usemtl b\nf 1/1 3/3 2/2\n",
-            "newmtl a\nmap_Kd a.png\nnewmtl b\nmap_Kd b.png\n",
+            "newmtl a\nmap_Kd a.png\nnewmtl b\nmap_kd b.png\n",
             "textures dropped, since",
         ),
         (f"usemtl a\n{FACE}usemtl b\nf 1/1 3/3 2/2\n", "newmtl a\nmap_Kd a.png\nnewmtl b\n", "textures dropped, since"),

@@ -209,7 +209,7 @@ def _obj_pictures(libraries: list[Path]) -> dict[str, BaseColor]:
             match line.split():
                 case ["newmtl", *words]:
                     material = " ".join(words)
-                case ["map_Kd", *words]:
+                case [keyword, *words] if keyword.lower() == "map_kd":
                     name = words[-1] if words and words[0].startswith("-") else " ".join(words)  # after options
                     pictures[material] = BaseColor(library.parent / name.replace("\\", "/"))
     return pictures
