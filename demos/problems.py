@@ -7,6 +7,7 @@ is given its own errors. With ``bounces`` they are path traced; ``Case.by`` says
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -177,10 +178,18 @@ def displaced(
     axis, direction = (vector / np.linalg.norm(vector) for vector in rng.standard_normal((2, 3)))
     turn = Rotation.from_rotvec(np.radians(rng.uniform(*degrees)) * axis)
     low, high = body.world_mesh().bounds
-    middle = (low + high) / 2
     shift = rng.uniform(*part) * np.linalg.norm(high - low) * direction
+    there = turned(body, turn)
+    return dataclasses.replace(there, translation=there.translation + shift)
+
+
+def turned(body: ws.Body, turn: Any) -> ws.Body:
+    """A body turned about the middle of its bounds, by a rotation of SciPy."""
+    from scipy.spatial.transform import Rotation
+
+    middle = np.mean(body.world_mesh().bounds, axis=0)
     rotation = turn * Rotation.from_matrix(body.rotation_matrix())
-    translation = turn.apply(body.translation - middle) + middle + shift
+    translation = turn.apply(body.translation - middle) + middle
     return dataclasses.replace(body, rotation=rotation.as_rotvec(degrees=True), translation=translation)
 
 

@@ -13,7 +13,6 @@ include making renderers; kernels and spheres are best made before, by a run wit
 
 import argparse
 import dataclasses
-import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -22,16 +21,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
-from demos.problems import changed, displaced, distance_error, placement, ray_traced
+from demos.benchmarks.lane_choice import cpu_text
+from demos.problems import changed, displaced, distance_error, placement, ray_traced, turned
 from demos.scenes import shipped_mesh
 from warpshadow import inverse
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 NEAR = 0.5  # MDE [%] that counts as found
 STEPS, RATE = 150, 0.03  # of the plain loop
+TURN = Rotation.from_rotvec([0, 40, 0], degrees=True)
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,6 @@ def plain(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
 
 def moved(body: ws.Body, rotation: np.ndarray, translation: np.ndarray) -> ws.Body:
     """The body at a pose, its rotation a matrix."""
-    from scipy.spatial.transform import Rotation
-
     vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
     return dataclasses.replace(body, rotation=vector, translation=translation)
 
@@ -151,30 +151,10 @@ def bunny_on_ground(size: int) -> ws.Scene:
     return ws.Scene([bunny, ws.Body(ws.plane(6.0), name="ground")], ws.synthetic_sky(), camera)
 
 
-def turned(body: ws.Body, degrees: float) -> ws.Body:
-    """The body turned about the vertical through its middle."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_rotvec([0, degrees, 0], degrees=True)
-    low, high = body.world_mesh().bounds
-    middle = (low + high) / 2
-    rotation = (turn * Rotation.from_matrix(body.rotation_matrix())).as_matrix()
-    return moved(body, rotation, turn.apply(body.translation - middle) + middle)
-
-
 def median(outcomes: Sequence[Outcome]) -> Outcome:
     """Of each figure by itself."""
     figures = [[getattr(outcome, each.name) for outcome in outcomes] for each in dataclasses.fields(Outcome)]
     return Outcome(*(np.median(figure, axis=0).tolist() for figure in figures))
-
-
-def processor() -> str:
-    """The CPU by name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 def row(name: str, way: str, outcome: Outcome) -> str:
@@ -185,10 +165,10 @@ def row(name: str, way: str, outcome: Outcome) -> str:
 def main(count: int, size: int, ways: list[str]) -> None:
     ws.quiet()
     torch.set_num_threads(1)
-    print(f"{processor()}; seconds by the clock and by the processor")
+    print(f"{cpu_text().splitlines()[0]}; seconds by the clock and by the processor")
     print(f"{'pose':10} {'way':6} {'it.':>4}   {'first':>13}   {'last':>13}   {'end':>13}   {'MDE [%]':>8}")
     truth = bunny_on_ground(2 * size)
-    cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], 40))), ws.render(truth))}
+    cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], TURN))), ws.render(truth))}
     truth = bunny_on_ground(size)
     wanted = ray_traced(truth)
     for seed in range(count):

@@ -28,10 +28,8 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.world import Setting
 from warpshadow.maths.directions import fibonacci
-from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles, reconstruct_map
-
-ROWS = 64
-"""Of maps of found light."""
+from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
+from warpshadow.pipeline.lighting import map_of
 
 FAINTEST = 0.05
 """Exposure below which a direction is not determined, as a part of the mean over all directions: what noise in the
@@ -94,7 +92,7 @@ def found_light(
         setting: Of the problem.
         values: Of what is free, by its name.
     """
-    radiance = light.radiance if isinstance(light, EnvironmentMap) else reconstruct_map(light, ROWS)
+    radiance = map_of(light)
     towards = equirectangular_directions(len(radiance))
     cells = CellBasis(fibonacci(_CELLS)).functions(towards.reshape(-1, 3))
     exposure = cells @ exposure_of_cells(problem, setting, values)

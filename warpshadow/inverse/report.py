@@ -20,11 +20,9 @@ from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import Stage
-from warpshadow.maths.sh import reconstruct_map
+from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
-
-_MAP_HEIGHT = 64  # of a map of spherical harmonics [pixels]
 
 
 def write_result(result: Result, folder: AnyPath) -> list[Path]:
@@ -67,7 +65,7 @@ class Report:
         scene = result.scene
         written = write_scene(scene, folder)
         if not isinstance(scene.light, EnvironmentMap):
-            write_image(folder / "light.exr", reconstruct_map(scene.light, _MAP_HEIGHT).astype(np.float32))
+            write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
         toml_tables.write(folder / "summary.toml", self._summary())
         values: dict[str, Any] = {

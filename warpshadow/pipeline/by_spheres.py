@@ -219,18 +219,8 @@ class InParts(Node):
         shadows = _static_shadows(method, points, light)
         kept_rows = shadows if shadows.function else None
         looked_up: Node | dict = own_shadows if own_shadows.function else {}
-        super().__init__(
-            "",
-            None,
-            receivers,
-            spheres,
-            taken,
-            kept_rows,
-            looked_up,
-            frames,
-            beside=(own_shadows, shadows, result, *beside),
-            keeps=keeps,
-        )
+        before = receivers, spheres, taken, kept_rows, looked_up, frames
+        super().__init__("", None, *before, beside=(own_shadows, shadows, result, *beside), keeps=keeps)
 
     def compute(self, call: Call) -> Any:
         """Find it for all parts."""

@@ -15,10 +15,9 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.directional import Cells
-from warpshadow.pipeline.groups import Group, Seen
+from warpshadow.pipeline.groups import Group, Seen, solid_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.own_factors import OwnFactors
@@ -46,11 +45,6 @@ class SeenCells(NamedTuple):
     past_own: wp.array | None  # [batch, receiver, cell], transmittance past its own body; None where that is 1
     past_solid: wp.array  # [batch, receiver, cell], past all bodies but flats, its own included
     directions: np.ndarray  # [cell, 3]
-
-
-def solid_bodies(assembly: Assembly, *, but: int | None = None) -> list[int]:
-    """Bodies, other than one, for which spheres stand in where light bounces: those that are not flat."""
-    return [body for body in range(len(assembly.scene.bodies)) if body != but and not assembly.is_flat[body]]
 
 
 def see_cells(

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
+from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.flats import FlatsAround, SceneFlats
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.node import Call
@@ -23,6 +23,11 @@ from warpshadow.stages.receivers import Receivers
 
 PART = 1 << 13
 """Receivers that are lit at once where no gradient is asked for."""
+
+
+def solid_bodies(assembly: Assembly, *, but: int | None = None) -> list[int]:
+    """Bodies, other than one, for which spheres stand in where light bounces: those that are not flat."""
+    return [body for body in range(len(assembly.scene.bodies)) if body != but and not assembly.is_flat[body]]
 
 
 class Group(NamedTuple):
@@ -154,8 +159,8 @@ class Grouping:
         numbers, assembly = self._points.sphere_of_point, self._assembly
         if numbers is None:
             return None
-        solid = np.flatnonzero(~assembly.is_flat).tolist()
-        return SpheresOfPoints(*assembly.spheres_of(solid, spheres), constant(numbers, wp.int32, assembly.device))
+        own = assembly.spheres_of(solid_bodies(assembly), spheres)
+        return SpheresOfPoints(*own, constant(numbers, wp.int32, assembly.device))
 
     def _flats_around(
         self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1

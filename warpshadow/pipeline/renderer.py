@@ -655,9 +655,9 @@ class Renderer:
             :func:`warpshadow.stages.interpolate.interpolate` makes differentiable ones of a view's fragments.
         """
         has_batch = self.has_camera_batch or view is not None
-        camera = self.cameras[0]
+        height, width = self._size
         with unrecorded():
-            layers = find_layers(self._own(view), (camera.width, camera.height), across=self.scene.supersampling)
+            layers = find_layers(self._own(view), (width, height), across=self.scene.supersampling)
         return layers if has_batch else Layers(*(each[0] for each in layers))
 
     # ------------------------------------------------------------------------------------------ what runs

@@ -21,7 +21,17 @@ from warpshadow.assets.primitives import icosphere, infinite_ground, plane
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.scene import COLORS, READ_BY, SCENE, Body, Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.scene import (
+    COLORS,
+    MEANT,
+    READ_BY,
+    SCENE,
+    Body,
+    Scene,
+    Visibility,
+    check_bounces,
+    check_supersampling,
+)
 from warpshadow.scene.toml_tables import Table
 from warpshadow.spheres import Spheres
 
@@ -44,8 +54,6 @@ _KEYS = {
     "[[body]]": ("mesh", "primitive", *(key for keys in _SHAPE_KEYS.values() for key in keys), *_PLACE_KEYS),
 }
 """Keys that each table of a scene file may have."""
-
-_MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
 
 
 class SceneError(ValueError):
@@ -120,8 +128,8 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
         others = [] if is_typo else [other for other, keys in _KEYS.items() if key in keys]
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
-        if key not in known and _MEANT.get(key) in known:
-            raise ValueError(f"{what}: unknown key {key!r} (did you mean {_MEANT[key]!r}?)")
+        if key not in known and MEANT.get(key) in known:
+            raise ValueError(f"{what}: unknown key {key!r} (did you mean {MEANT[key]!r}?)")
     check.known_keys(what, table, known)
 
 

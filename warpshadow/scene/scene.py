@@ -62,6 +62,9 @@ _GRAY = (0.8, 0.8, 0.8)
 """Reflectance of a body of which nothing is said."""
 
 
+MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
+"""What likely names of a body's arguments, and keys, are called here."""
+
 BodyLike = int | str
 """A body of a scene: its number, from 0, or its name."""
 
@@ -188,7 +191,7 @@ class Body:
     self_shadows: str | None
     shadow_catcher: bool
 
-    @check.keywords(color="albedo", colour="albedo", spheres="blockers", position="translation", path="mesh")
+    @check.keywords(**MEANT, spheres="blockers", path="mesh")
     def __init__(
         self,
         mesh: Mesh | AnyPath,
