@@ -2,6 +2,7 @@
 
 import warp as _wp
 
+from warpshadow import check as _check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
@@ -15,6 +16,7 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.assets.unwrap import unwrap
 from warpshadow.assets.video import write_video
 from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Geometry
@@ -75,11 +77,15 @@ __all__ = [
 ]
 
 
-def quiet() -> None:
+def quiet(*, progress: bool = True) -> None:
     """Start Warp without its messages about devices and modules, and without a word of a missing GPU.
 
     Other warnings and errors stay.
+
+    Args:
+        progress: Whether progress bars show from now on; False hides all, as ``progress=False`` hides those of a call.
     """
+    _show_bars(_check.flag("progress", progress))
     _wp.config.log_level = getattr(_wp, "LOG_WARNING", 30)
     _wp.config.quiet = True  # what releases before log_level read
     _start_quietly()

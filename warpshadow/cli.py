@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional
 
@@ -43,6 +44,29 @@ _BACKGROUNDS = ("transparent", "environment")  # beside colors
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
 
+def _start(is_quiet: bool) -> bool:
+    """Start Warp without its messages; without progress bars, where that is asked for."""
+    quiet(progress=not is_quiet)
+    return is_quiet
+
+
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "-q",
+        "--quiet",
+        help="Print reports, warnings and errors alone: no progress, and not what was written.",
+        callback=_start,
+    ),
+]
+
+
+def _note(text: str, is_quiet: bool) -> None:
+    """Print how it goes and what was written."""
+    if not is_quiet:
+        typer.echo(text)
+
+
 def _count_of_bounces(text: str) -> int:
     """A number of bounces; what is none is refused as everywhere else."""
     from warpshadow.scene.scene import check_bounces
@@ -67,9 +91,7 @@ def main(
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Keep Warp's own messages off the terminal."""
-    if "--help" not in sys.argv:  # which needs no Warp, and its start takes half a second
-        quiet()
+    """Print warnings in one line each."""
     warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
 
 
@@ -153,6 +175,7 @@ def render(
         ),
     ] = None,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Render a scene file to an image with soft shadows."""
     from warpshadow.assets.image import write_image
@@ -192,23 +215,24 @@ def render(
         where = _device(device)
         loaded = resolved(parsed, device=where, progress=True)
         if parsed.visibility.method == AUTO:
-            typer.echo(f"auto: {describe(loaded)}")
+            _note(f"auto: {describe(loaded)}", is_quiet)
         start = time.perf_counter()
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
             frames = _frames(loaded, cameras, where, exposure, tone, background)
             write_video(output, frames, fps=24.0 if path is None else path.fps)
-            typer.echo(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s")
+            _note(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s", is_quiet)
             return
         renderer = Renderer(loaded, device=where, progress=True)
         image = renderer.render()
         seconds = time.perf_counter() - start
         write_image(output, image, layers=renderer.layers().channels() if layers else None)
-        typer.echo(f"{output}: {loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s")
+        size = f"{image.shape[1]} × {image.shape[0]}"
+        _note(f"{output}: {loaded.visibility.method}, {size}, {seconds:.2f} s", is_quiet)
         if png is not None:
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
             write_image(png, picture)
-            typer.echo(f"{png}: exposure {picture.exposure:+.2f} stops")
+            _note(f"{png}: exposure {picture.exposure:+.2f} stops", is_quiet)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
@@ -248,6 +272,7 @@ def insert(
     ],
     exposure: Annotated[float, typer.Option(help="Factor of the bodies' radiance in the photograph, in stops.")] = 0.0,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Put the bodies of a scene into a photograph, with their shadows on what it shows.
 
@@ -265,7 +290,7 @@ def insert(
         image = insert_bodies(loaded, into, exposure=exposure, device=where)
         write_image(output, image)
         height, width, _ = image.shape
-        typer.echo(f"{output}: {width} × {height}, {time.perf_counter() - start:.2f} s")
+        _note(f"{output}: {width} × {height}, {time.perf_counter() - start:.2f} s", is_quiet)
 
 
 @app.command()
@@ -277,6 +302,7 @@ def view(
     port: Annotated[int, typer.Option(help="Port, or the next one that is free.", min=0, max=65535)] = PORT,
     browser: Annotated[bool, typer.Option(help="Open a browser.")] = True,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Show a scene in the browser, to be turned with the mouse, until Ctrl+C."""
     from warpshadow.scene.files import load_scene
@@ -311,6 +337,7 @@ def tune(
         bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s each; they are kept for later.")
     ] = False,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
@@ -378,22 +405,28 @@ def fit(
     port: Annotated[int, typer.Option(help="Port of the page, or the next one that is free.", min=0, max=65535)] = PORT,
     browser: Annotated[bool, typer.Option(help="Open a browser with --view.")] = True,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Explain images by what a scene leaves free; run again, it goes on where it was interrupted.
 
     The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
     became NaN or Inf, and the folder has the best values before that.
     """
+    from warpshadow.inverse import checkpoint as checkpoints
     from warpshadow.inverse.fit_file import load_fit
-    from warpshadow.inverse.report import Report
+    from warpshadow.inverse.report import SUMMARY, Report
 
     with _clear_errors(), _resumable(output):
         where = _device(device)
-        has_begun = _check_folder(output)
+        _check_folder(output)
         loaded = load_fit(file)
         output.mkdir(exist_ok=True)
-        if has_begun:
-            typer.echo(f"going on from {output / _CHECKPOINT}")
+        state = checkpoints.load(output / _CHECKPOINT)
+        was_over = state is not None and state["reason"] is not None
+        if state is not None and not was_over:
+            _note(f"going on from {output / _CHECKPOINT}", is_quiet)
+        elif state is None and (output / _PREVIEW).exists():
+            _note(f"no checkpoint in {output} yet; the fit begins anew", is_quiet)
         viewer = FitViewer(port=port) if view else None
         if viewer is not None:
             typer.echo(viewer.url)
@@ -408,15 +441,21 @@ def fit(
         )
         if result.reason == "stopped":
             raise KeyboardInterrupt  # which the page's button stands for
-        report = Report(result)
         has_diverged = result.reason not in ("converged", "finished")
         ending = "diverged" if has_diverged else result.reason
-        pace = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
-        typer.echo(f"{ending} after {sum(map(len, result.losses))} iterations{pace}")
-        typer.echo(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after")
-        if result.light is not None:
-            typer.echo(f"{result.light}")
-        typer.echo(f"{output}: {', '.join(path.name for path in report.write(output))}")
+        ending += f" after {sum(map(len, result.losses))} iterations"
+        if was_over and (output / SUMMARY).exists():
+            last = datetime.fromtimestamp((output / _CHECKPOINT).stat().st_mtime)
+            remedy = f"remove {output} or choose another folder by -o to start anew"
+            _note(f"already {ending} (on {last:%Y-%m-%d at %H:%M}); {remedy}", is_quiet)
+        else:
+            report = Report(result)
+            pace = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
+            _note(f"{ending}{pace}", is_quiet)
+            _note(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after", is_quiet)
+            if result.light is not None:
+                _note(f"{result.light}", is_quiet)
+            _note(f"{output}: {', '.join(path.name for path in report.write(output))}", is_quiet)
     if has_diverged:
         typer.secho(f"error: {result.reason}; {output} has the best values before that", fg="red", err=True)
         raise typer.Exit(DIVERGED)
@@ -434,17 +473,16 @@ def _resumable(folder: Path) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from error
 
 
-def _check_folder(path: Path) -> bool:
-    """Find out before the work whether a folder may be written into; whether it has a fit to go on with."""
+def _check_folder(path: Path) -> None:
+    """Find out before the work whether a fit may write into a folder."""
     if path.exists() and not path.is_dir():
         raise NotADirectoryError(f"{path}: got a file, expected a folder")
     files.check_folder(path if path.is_dir() else path.parent)
     if not path.is_dir() or _has_checkpoint(path):
-        return path.is_dir()
+        return
     others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != _PREVIEW)
     if others:
         raise FileExistsError(f"{path}: got a folder with {others[0]} in it, expected a new one or that of this fit")
-    return False
 
 
 def _has_checkpoint(folder: Path) -> bool:
@@ -463,6 +501,7 @@ def spheres(
     picture: Annotated[Optional[Path], typer.Option(help="Draw the spheres in the mesh: .png.")] = None,
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write centers and radii: .npz.")] = None,
     device: Device = "cpu",
+    is_quiet: Quiet = False,
 ) -> None:
     """Fit spheres to a mesh and report how well they stand in for it; the fit is kept for later renders."""
     from warpshadow.assets.mesh_files import load_mesh
@@ -509,6 +548,7 @@ def envmap(
         Optional[Path],
         typer.Option("-o", "--output", help="Where to write the map; beside FILE by default."),
     ] = None,
+    is_quiet: Quiet = False,
 ) -> None:
     """Print an environment map's statistics and write its spherical-harmonic reconstruction beside it."""
     from warpshadow.assets.image import write_image
@@ -523,11 +563,11 @@ def envmap(
             shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
             typer.echo(f"{name.replace('_', ' '):26}{shown}")
         write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
-        typer.echo(f"{beside}: reconstruction from {order**2} coefficients")
+        _note(f"{beside}: reconstruction from {order**2} coefficients", is_quiet)
 
 
 @app.command()
-def warmup(device: Device = "cpu") -> None:
+def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
     """Compile every kernel that rendering needs, so that the first render need not."""
     from warpshadow.assets.camera import Camera
     from warpshadow.assets.light import EnvironmentMap
@@ -553,7 +593,7 @@ def warmup(device: Device = "cpu") -> None:
                 )
                 Renderer(scene, device=where).render()
                 bar.update()
-        typer.echo(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s")
+        _note(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s", is_quiet)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Progress bars: one for one wait, after a second, in terminals and notebooks."""
+"""Progress bars: one for one wait, after a second, in terminals and notebooks; none in files."""
 
 from __future__ import annotations
 
+import builtins
 import contextlib
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -17,7 +19,28 @@ class _Shown(threading.local):
     bar: Any = None
 
 
+class _Wish:
+    """Whether bars may show, in all of the process."""
+
+    shows = True
+
+
 _shown = _Shown()
+
+
+def show_bars(wanted: bool) -> None:
+    """Let bars show from now on, or none, whatever functions are told."""
+    _Wish.shows = wanted
+
+
+def in_ipython() -> bool:
+    """Whether this runs in IPython, which notebooks do."""
+    return hasattr(builtins, "__IPYTHON__")
+
+
+def _can_be_seen() -> bool:
+    """Whether what is shown can change: in a file, every state of a bar would stay."""
+    return in_ipython() or (sys.stderr is not None and sys.stderr.isatty())
 
 
 class _Within:
@@ -37,6 +60,8 @@ class _Within:
 def progress_bar(total: int, what: str, unit: str, *, wanted: bool = True, stays: bool = False) -> Iterator[Any]:
     """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
 
+    None shows where stderr is neither a terminal nor a notebook's.
+
     Args:
         total: Number of units.
         what: What is done, such as "shading".
@@ -49,6 +74,7 @@ def progress_bar(total: int, what: str, unit: str, *, wanted: bool = True, stays
     """
     from tqdm.auto import tqdm
 
+    wanted = wanted and _Wish.shows and _can_be_seen()
     outer = _shown.bar
     if wanted and outer is not None:
         try:

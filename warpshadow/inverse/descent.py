@@ -484,5 +484,6 @@ def _descend(
             if watch is not None and not watch.goes_on(descent, save):
                 break
             start = time.perf_counter()
-    save()
+    if state is None or state["reason"] is None:  # else it would look as if it had ended now
+        save()
     return durations

@@ -24,6 +24,9 @@ from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
 
+SUMMARY = "summary.toml"
+"""The file of a folder of results that is written last: where it is, the others are."""
+
 
 def write_result(result: Result, folder: AnyPath) -> list[Path]:
     """Write what a fit found; see :meth:`Report.write`."""
@@ -67,14 +70,15 @@ class Report:
         if not isinstance(scene.light, EnvironmentMap):
             write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
-        toml_tables.write(folder / "summary.toml", self._summary())
         values: dict[str, Any] = {
             f"{name}.{key}": each.cpu().numpy() for name, own in result.values.items() for key, each in own.items()
         }
         with files.whole(folder / "parameters.npz") as unfinished:
             np.savez(unfinished, **values)
-        written += [folder / "summary.toml", folder / "parameters.npz"]
-        return [*written, *self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
+        written.append(folder / "parameters.npz")
+        written += [*self._write_pictures(folder), *plot_losses(result, folder / "loss.png")]
+        toml_tables.write(folder / SUMMARY, self._summary())
+        return [*written, folder / SUMMARY]
 
     def _summary(self) -> toml_tables.Table:
         found, seconds = self.result.found, self.result.seconds

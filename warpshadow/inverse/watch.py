@@ -6,7 +6,6 @@ often as a small part of its time allows, and only while a browser looks.
 
 from __future__ import annotations
 
-import builtins
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,7 @@ import numpy as np
 import torch
 
 from warpshadow import check
+from warpshadow.device.progress import in_ipython
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.preview import side_by_side
@@ -149,12 +149,11 @@ def watching(view: bool | FitViewer, *, progress: bool) -> Iterator[Watch | None
     try:
         if progress:
             print(viewer.url)
-        if hasattr(builtins, "__IPYTHON__"):
+        if in_ipython():
             from IPython.display import display
 
             display(viewer)
-        else:
-            viewer.open()
+        viewer.open(None)
         yield Watch(viewer)
     finally:
         viewer.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import contextlib
 import html
 import threading
@@ -13,6 +12,7 @@ from pathlib import Path
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.progress import in_ipython
 from warpshadow.scene.scene import SCENE, Scene
 
 HOST, PORT = "127.0.0.1", 8080
@@ -37,7 +37,7 @@ class Viewer:
     def open(self, browser: bool | None = True) -> None:
         """Open a browser, or leave it; None: unless this is a notebook."""
         if browser is None:
-            browser = not hasattr(builtins, "__IPYTHON__")
+            browser = not in_ipython()
         if browser:
             webbrowser.open(self.url)
 
