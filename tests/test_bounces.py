@@ -30,8 +30,10 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline import bounces as pipeline_bounces
-from warpshadow.pipeline import groups, kept_bounces, patches
+from warpshadow.pipeline import groups
+from warpshadow.pipeline.bounces import by_spheres as pipeline_bounces
+from warpshadow.pipeline.bounces import kept as kept_bounces
+from warpshadow.pipeline.bounces import patches
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 METHODS = ("directional", "log-sh")

@@ -15,7 +15,7 @@ from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
 from warpshadow.stages.receivers import Receivers
 
 if TYPE_CHECKING:  # it is imported where light bounces
-    from warpshadow.pipeline.kept_bounces import KeptBounces
+    from warpshadow.pipeline.bounces.kept import KeptBounces
 
 Meshes = list[wp.Mesh | None]
 """What blocks the light of each instance of receivers; None for nothing."""
@@ -52,7 +52,7 @@ class Rays(Method):
             return shaded()
         direct = points.kept("direct", light, shaded)
         if materials is points.materials:
-            from warpshadow.pipeline.paths import path_traced
+            from warpshadow.pipeline.bounces.paths import path_traced
 
             given = direct, meshes, points, light, materials
             return path_traced(*given, samples=self._sample_count, progress=self.progress)
@@ -79,8 +79,8 @@ class Rays(Method):
 
     @functools.cached_property
     def _bounces(self) -> "KeptBounces":
-        from warpshadow.pipeline.kept_bounces import OWN_BOUNCES, KeptBounces
-        from warpshadow.pipeline.patches import ScenePatches
+        from warpshadow.pipeline.bounces.kept import OWN_BOUNCES, KeptBounces
+        from warpshadow.pipeline.bounces.patches import ScenePatches
 
         given = ScenePatches(self.assembly), self.assembly.scene.bounces
         return KeptBounces(*given, own_bounces=OWN_BOUNCES, progress=self.progress)

@@ -114,7 +114,7 @@ class Renderer:
         self.clock = Clock()
         self._method = make_method(self.assembly, basis, progress=progress)
         if scene.bounces and isinstance(self._method, SphereMethod):
-            from warpshadow.pipeline.bounces import SphereBounces
+            from warpshadow.pipeline.bounces.by_spheres import SphereBounces
 
             self._method.bounces = SphereBounces(self._method)
         self._materials = Materials.of_scene(self.assembly)

@@ -9,8 +9,9 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline import kept_bounces, rays
-from warpshadow.pipeline.patches import ScenePatches
+from warpshadow.pipeline import rays
+from warpshadow.pipeline.bounces import kept as kept_bounces
+from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
 from warpshadow.torch import TorchRenderer
 

@@ -15,13 +15,13 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.bounces.own_factors import OwnFactors
+from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.directional import Cells
 from warpshadow.pipeline.groups import Group, Seen, solid_bodies
 from warpshadow.pipeline.lighting import joined
 from warpshadow.pipeline.node import Call, Node, Source
-from warpshadow.pipeline.own_factors import OwnFactors
-from warpshadow.pipeline.patches import Senders
 from warpshadow.scene.scene import Visibility
 from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
 from warpshadow.stages.bounces.flat_light import flat_light

@@ -1,4 +1,4 @@
-"""Paths: light that bounces between the meshes, for the ray-traced method. Imported where light bounces."""
+"""Paths: light that bounces between the meshes, for the ray-traced method."""
 
 from dataclasses import replace
 

@@ -7,8 +7,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.node import Call, Clock
-from warpshadow.pipeline.patches import ScenePatches
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.exitance import sphere_exitance
 

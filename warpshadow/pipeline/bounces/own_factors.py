@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.cache import cache_path, remembered
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.own_shadows import OwnShadows
-from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.sparse import SparseMatrix

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.lighting import LitPoints, receiver_words
 from warpshadow.pipeline.node import Node, Source
-from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.factors import loose_mesh, trace_factors

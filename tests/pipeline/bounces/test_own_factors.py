@@ -9,8 +9,8 @@ import pytest
 import warpshadow as ws
 from warpshadow.pipeline import own_factors
 from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.own_shadows import OwnShadows
-from warpshadow.pipeline.patches import ScenePatches
 from warpshadow.stages.sparse import SparseMatrix
 
 

@@ -20,18 +20,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, Outgoing, SeenCells, StandIns, see_cells
+from warpshadow.pipeline.bounces.kept import OWN_BOUNCES, KeptBounces
+from warpshadow.pipeline.bounces.own_factors import OwnFactors
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
-from warpshadow.pipeline.gathering import ALL_FLAT, Gathering, Outgoing, SeenCells, StandIns, see_cells
 from warpshadow.pipeline.groups import Group
-from warpshadow.pipeline.kept_bounces import OWN_BOUNCES, KeptBounces
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
-from warpshadow.pipeline.own_factors import OwnFactors
-from warpshadow.pipeline.patches import ScenePatches, Senders
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
+
+_OF_SOURCES = " of sources"
+"""Put after the names of stages."""
+
+
+def _words(senders: Senders) -> str:
+    """Number of sources, in words."""
+    return f"{len(senders.sides):,} sources"
 
 
 class SeenPart(NamedTuple):
@@ -93,6 +101,15 @@ class LitParts(Node):
         return LitPart(self._shade.run(call, part.transfer, part.group, taken), part.group, part.cells)
 
 
+class Sources(NamedTuple):
+    """Nodes of the points at which patches are lit."""
+
+    seen: SeenParts  # what they see
+    spheres: Source  # that stand in for bodies
+    frames: Node  # of flat bodies
+    shown: Node  # what patches show of their area towards cells
+
+
 class Radiosity(Node):
     """What patches send in the end: of direct light, and of all bounces but the last, which the receivers find."""
 
@@ -104,10 +121,9 @@ class Radiosity(Node):
         gathering: Gathering,
         lit: Node,
         albedo: Node,
-        shown: Node,
-        spheres: Source,
-        frames: Node,
+        sources: Sources,
     ):
+        _, spheres, frames, shown = sources
         self._count, self._stand_ins, self._own_factors, self._gathering = count, stand_ins, own_factors, gathering
         senders = stand_ins.senders
         words = f"{len(senders.areas):,} patches"
@@ -207,33 +223,39 @@ class SphereBounces:
             idle = Node("bounces", None, idle="every body is black")
             return InParts(method, points, taken, light, joined, beside=(idle,))
         stand_ins = self._stand_ins.setdefault(senders, StandIns(senders, method.visibility.merging))
-        gathering = functools.partial(Gathering, method.visibility, senders, self._own_factors)
-        flats, spheres, where = stand_ins.flats, points.spheres, " of sources"
-        words, point_words = f"{len(senders.sides):,} sources", functools.partial(receiver_words, points)
-        key, is_kept = None if is_free else light, is_free or materials is not points.materials
         see = functools.partial(SeenParts, method, taken=seen_in, light=light, finish=list, is_shaded=False)
+        key, is_kept = None if is_free else light, is_free or materials is not points.materials
         seen = points.kept("seen", (key, is_kept), lambda: see(points, keeps=is_kept))
+        of_sources = points.kept("of sources", (key, senders), lambda: self._sources(see, stand_ins, points))
+        radiosity = self._radiosity(of_sources, taken, stand_ins, materials)
+        words = functools.partial(receiver_words, points)
+        at_points = self._gathering(senders, (points.receivers_node, radiosity), words)
+        return BouncedShading(seen, taken, words, radiosity, at_points)
+
+    def _sources(self, see: Callable[..., SeenParts], stand_ins: StandIns, points: LitPoints) -> Sources:
+        """Sources among the bodies among which points are."""
+        senders, flats, spheres = stand_ins.senders, stand_ins.flats, points.spheres
 
         def show(sources: Receivers, seen: list[SeenPart], *given: Any) -> wp.array:
             return stand_ins.shown(sources, [part.cells for part in seen], *given)
 
-        def at_sources() -> tuple[SeenParts, Node, Node]:
-            """What sources see, where flat bodies are, and what patches show of their area towards cells."""
-            make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals, items=words)
-            sources = points.kept("sources", senders, make)
-            seen = see(self._at(sources, points, points.materials, stand_ins.spheres_of_sources), where=where)
-            frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
-            return seen, frames, Node("", show, sources, seen, spheres, frames)
+        make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
+        sources = points.kept("sources", senders, lambda: make(items=_words(senders)))
+        seen = see(self._at(sources, points, points.materials, stand_ins.spheres_of_sources), where=_OF_SOURCES)
+        frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
+        return Sources(seen, spheres, frames, Node("", show, sources, seen, spheres, frames))
 
-        seen_by_sources, frames, shown = points.kept("seen by sources", (key, senders), at_sources)
-        lit = LitParts(seen_by_sources, taken, words, where)
+    def _radiosity(self, sources: Sources, taken: Node, stand_ins: StandIns, materials: Materials) -> Radiosity:
+        """What patches send in the light in which sources are."""
+        senders, why_not = stand_ins.senders, "light bounces once" if self._count == 1 else ""
+        seen, _, frames, _ = sources
+        lit = LitParts(seen, taken, _words(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
-        why_not = "light bounces once" if self._count == 1 else ""
-        of_sources = gathering((lit, albedo, frames), words, where, why_not, only_others=True)
-        given = self._count, stand_ins, self._own_factors, of_sources, lit, albedo, shown, spheres, frames
-        radiosity = Radiosity(*given)
-        at_points = gathering((points.receivers_node, radiosity), point_words)
-        return BouncedShading(seen, taken, point_words, radiosity, at_points)
+        among = self._gathering(senders, (lit, albedo, frames), _words(senders), _OF_SOURCES, why_not, only_others=True)
+        return Radiosity(self._count, stand_ins, self._own_factors, among, lit, albedo, sources)
+
+    def _gathering(self, senders: Senders, *given: Any, **options: Any) -> Gathering:
+        return Gathering(self._method.visibility, senders, self._own_factors, *given, **options)
 
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
         """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.
@@ -246,7 +268,7 @@ class SphereBounces:
         """
         sources, at_sources = self._kept_sources(points, materials)
         direct = points.kept("direct", light, lambda: InParts(self._method, points, taken, light, joined))
-        make = functools.partial(InParts, self._method, at_sources, taken, light, joined, where=" of sources")
+        make = functools.partial(InParts, self._method, at_sources, taken, light, joined, where=_OF_SOURCES)
         lit = points.kept("direct at sources", (light, sources), make)
         return self._still.in_known_light(direct, lit, points, materials)
 
@@ -258,7 +280,7 @@ class SphereBounces:
             points, light, materials: As above.
         """
         sources, at_sources = self._kept_sources(points, materials)
-        transfers = points.kept("transfer", sources, lambda: self._method.transfers(at_sources, " of sources"))
+        transfers = points.kept("transfer", sources, lambda: self._method.transfers(at_sources, _OF_SOURCES))
         return self._still.in_free_light(direct, transfers, light, points, materials)
 
     def _kept_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
