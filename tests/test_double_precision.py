@@ -432,17 +432,17 @@ def test_exposure(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
     face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 
-    def expose(clip_positions, shading, albedo):
+    def sample_radiance(clip_positions, shading, albedo):
         weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
         return double("stages.film").average(
-            double("stages.film").expose(
+            double("stages.film").sample_radiance(
                 double("stages.rasterize").Fragments(face_ids, weights), faces, shading, albedo
             ),
             2,
         )
 
     albedo = random(1, 1, SIZE[1], SIZE[0], 3)
-    check(expose, clip, (wp.vec3d, random(0, 2, 4, 3)), (wp.vec3d, albedo))
+    check(sample_radiance, clip, (wp.vec3d, random(0, 2, 4, 3)), (wp.vec3d, albedo))
 
 
 # ---------------------------------------------------------------------------------------------- all stages
@@ -516,8 +516,10 @@ def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, mo
 
     Surfaces pull by the faces at the points of samples, of which images are made: mean slopes are no derivatives.
     """
-    expose = double("stages.film").expose
-    monkeypatch.setattr(double("pipeline.view"), "expose_moving", lambda *inputs: (expose(*inputs[:4]), None))
+    sample_radiance = double("stages.film").sample_radiance
+    monkeypatch.setattr(
+        double("pipeline.view"), "moving_radiance", lambda *inputs: (sample_radiance(*inputs[:4]), None)
+    )
     renderer, rotation_matrices = make_renderer(method, receivers), double("torch").rotation_matrices
     camera = renderer.scene.camera
     towards, offset, intrinsics = variables(renderer, camera.rotation, camera.translation, camera.intrinsics)

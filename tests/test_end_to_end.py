@@ -186,7 +186,7 @@ def test_a_limb_pulls_by_the_color_it_has_at_its_edge(monkeypatch):
     shifts = np.eye(7)[3:6]
     got, expected = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
     assert relative_error(got, expected) < SILHOUETTE
-    monkeypatch.setattr(view_module, "expose_moving", lambda *inputs: (film.expose(*inputs[:4]), None))
+    monkeypatch.setattr(view_module, "moving_radiance", lambda *inputs: (film.sample_radiance(*inputs[:4]), None))
     beside, _ = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
     assert relative_error(beside, expected) > 2 * relative_error(got, expected)
 

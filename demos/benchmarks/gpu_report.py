@@ -64,7 +64,7 @@ FLOORS = {
     "transfer": ["transfer, directional"],
     "shading": ["shading, directional"],
     "reflectance": ["albedo"],
-    "exposure": ["exposed", "slopes"],
+    "radiance": ["radiance", "slopes"],
     "smoothing": ["smoothing"],
 }
 """Stages as a renderer explains them, and as ``kernel_floor.py`` counts them."""

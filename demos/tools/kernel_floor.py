@@ -107,7 +107,7 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
         Stage("transfer, directional", "receiver", Work(8 * q, 12 + 8 * q, 1), Work(20 * q, 24 + 24 * q, 3)),
         Stage("shading, directional", "receiver", Work(6 * q, 12 + 4 * q, 2), Work(6 * q, 12 + 8 * q, 1)),
         Stage("albedo", "sample", Work(15, 40, 2), Work(15, 40, 1)),
-        Stage("exposed", "sample", Work(20, 60, 3), Work(45, 92, 1)),
+        Stage("radiance", "sample", Work(20, 60, 3), Work(45, 92, 1)),
         Stage("smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 5), Work(60, 64 + 2 * 16 + 64, 5)),
         Stage("slopes", "sample", Work(0, 0, 0), Work(160 + 6 * SPECIAL, 28 + 84, 2)),
         Stage("loss", "sample", Work(8, 32, 2), Work(8, 48, 4)),

@@ -10,7 +10,7 @@ from PIL import Image
 
 import warpshadow as ws
 from warpshadow import inverse
-from warpshadow.inverse.found_light import exposure_of_cells
+from warpshadow.inverse.found_light import influence_of_cells
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions
@@ -71,12 +71,12 @@ def test_what_is_not_determined_changes_no_image_and_the_rest_does():
         assert least <= change < most
 
 
-def test_exposure_is_the_sum_of_cosines_over_what_is_seen():
+def test_influence_is_the_sum_of_cosines_over_what_is_seen():
     """Of a white ball, whose normals under the pixels are known."""
     scene = alone()
     problem = inverse.Problem(scene, inverse.Target(ws.render(scene)), inverse.Light(3))
     result = inverse.fit(problem, ONE, progress=False)
-    got = exposure_of_cells(problem, result.setting, result.values)
+    got = influence_of_cells(problem, result.setting, result.values)
     eye, towards = scene.camera.rays()
     offset = eye - np.array([0, 0.5, 0])
     along = -(towards @ offset)

@@ -190,7 +190,7 @@ def test_free_light_over_a_given_geometry_has_the_gradient_that_it_has_over_the_
 
 
 def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_beside_cameras():
-    """Alone, samples are exposed as it is found what they reflect, in light that is kept; lights take turns."""
+    """Alone, radiance is found with what samples reflect, in light that is kept; lights take turns."""
     renderer, random = TorchRenderer(scene_of()), np.random.default_rng(7)
     texture, colors, weights = (
         torch.tensor(random.uniform(size=shape), dtype=torch.float32) for shape in ((8, 8, 3), (162, 3), (24, 24, 4))
@@ -470,14 +470,14 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
         after = {
-            "_find_edge_colors": "exposure",
+            "_find_edge_colors": "radiance",
             "blend": "smoothing",
             "_measure_adjoint": "smoothing",
         }
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
         if "_sample" in key:  # given the samples of white surfaces, it exposes them
-            return "exposure" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
+            return "radiance" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
         return "footprints" if "footprints" in key else "mip pyramids"
     if module == "stages.interpolate":
         return "reflectance"
@@ -486,9 +486,9 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     if module in ("stages.transfer", "stages.kept_cells"):
         return "shading" if "_light_cells" in key else "transfer"
     if module == "stages.film":
-        return "averaging" if "average" in key else "exposure"
+        return "averaging" if "average" in key else "radiance"
     same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
-    return {"stages.project": "clip positions", "stages.slopes": "exposure", **same}[module]
+    return {"stages.project": "clip positions", "stages.slopes": "radiance", **same}[module]
 
 
 class Launches:
@@ -654,9 +654,9 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
     assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
     (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
     assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
-    (exposure,) = (line for line in lines[19:] if "exposure" in line)
-    assert "runs" in exposure and " ms" in exposure and "a gradient to textures is asked for" in exposure
-    assert "2,304 samples" in exposure
+    (radiance,) = (line for line in lines[19:] if "radiance" in line)
+    assert "runs" in radiance and " ms" in radiance and "a gradient to textures is asked for" in radiance
+    assert "2,304 samples" in radiance
 
 
 def test_an_explanation_computes_nothing(monkeypatch):

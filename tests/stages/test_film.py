@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.film import average, expose
+from warpshadow.stages.film import average, sample_radiance
 from warpshadow.stages.rasterize import Fragments
 
 # A handful of float32 products.
@@ -34,7 +34,7 @@ def random_samples(device, views=1, lights=1, colors=1):
     )
 
 
-def exposed_twin(face_ids, faces, weights, shading, albedo):
+def radiance_twin(face_ids, faces, weights, shading, albedo):
     corners = shading[:, faces[face_ids]] if len(face_ids) > 1 else shading[:, faces[face_ids[0]]][:, None]
     if len(face_ids) > 1:
         corners = np.stack([corners[min(b, len(shading) - 1), b] for b in range(len(face_ids))])
@@ -51,8 +51,8 @@ BATCHES = [{}, {"views": 3, "lights": 3, "colors": 3}, {"views": 3}, {"lights": 
 @pytest.mark.parametrize("batches", BATCHES)
 def test_a_sample_is_the_light_it_receives_times_what_it_reflects(device, batches):
     face_ids, faces, variables = random_samples(device, **batches)
-    samples = expose(Fragments(face_ids, variables[0]), faces, *variables[1:])
-    expected = exposed_twin(face_ids.numpy(), faces.numpy(), *(array.numpy() for array in variables))
+    samples = sample_radiance(Fragments(face_ids, variables[0]), faces, *variables[1:])
+    expected = radiance_twin(face_ids.numpy(), faces.numpy(), *(array.numpy() for array in variables))
     assert samples.shape == expected.shape[:-1]
     assert np.abs(samples.numpy() - expected).max() < FLOAT32
 
@@ -62,7 +62,7 @@ def test_gradients_of_exposure_are_its_central_differences(device, batches, veri
     face_ids, faces, variables = random_samples(device, **batches)
     rng = np.random.default_rng(1)
     with wp.Tape() as tape:
-        samples = expose(Fragments(face_ids, variables[0]), faces, *variables[1:])
+        samples = sample_radiance(Fragments(face_ids, variables[0]), faces, *variables[1:])
     weights = rng.normal(size=(*samples.shape, 4)).astype(np.float32)
     tape.backward(grads={samples: wp.array(weights, dtype=wp.vec4, device=device)})
     values = [array.numpy().astype(float) for array in variables]
@@ -71,7 +71,7 @@ def test_gradients_of_exposure_are_its_central_differences(device, batches, veri
         losses = []
         for step in (0.1, -0.1):
             moved = [value + step * direction if k == index else value for k, value in enumerate(values)]
-            losses.append((weights * exposed_twin(face_ids.numpy(), faces.numpy(), *moved)).sum())
+            losses.append((weights * radiance_twin(face_ids.numpy(), faces.numpy(), *moved)).sum())
         products = variable.grad.numpy() * direction
         assert abs(products.sum() - (losses[0] - losses[1]) / 0.2) < GRADIENT * np.linalg.norm(products)
 
@@ -79,7 +79,7 @@ def test_gradients_of_exposure_are_its_central_differences(device, batches, veri
 def test_batches_that_differ_are_refused(device):
     face_ids, faces, (weights, shading, albedo) = random_samples(device, views=2, lights=3)
     with pytest.raises(ValueError, match="shading: got a batch of 3, expected 1 or 2"):
-        expose(Fragments(face_ids, weights), faces, shading, albedo)
+        sample_radiance(Fragments(face_ids, weights), faces, shading, albedo)
 
 
 @pytest.mark.parametrize("across", [1, 2, 3])

@@ -7,12 +7,12 @@ from test_silhouettes import through_plane
 
 import warpshadow as ws
 from warpshadow.assets.topology import edge_neighbors
-from warpshadow.stages.film import expose
+from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import find_silhouettes
-from warpshadow.stages.slopes import LEAST_DISTANCE, expose_moving
+from warpshadow.stages.slopes import LEAST_DISTANCE, moving_radiance
 
 # float32 kernels against float64; measured 2e-6.
 FLOAT32 = 2e-5
@@ -44,7 +44,7 @@ class Drawn:
         return wp.array(np.arange(self.clip.shape[1]), dtype=wp.int32, device=self.device)
 
     def samples(self):
-        return expose(self.fragments, self.faces, self.shading, self.albedo)
+        return sample_radiance(self.fragments, self.faces, self.shading, self.albedo)
 
     def edge_colors(self, samples):
         return find_edge_colors(samples, self.silhouettes, self.clip, self.shading, self.receivers, self.albedo)
@@ -53,7 +53,7 @@ class Drawn:
         """Gradient to the clip positions by mean slopes."""
         with wp.Tape() as tape:
             seen = self.fragments, self.faces, self.shading, self.albedo
-            samples, edge_colors = expose_moving(*seen, self.silhouettes, self.clip, self.receivers)
+            samples, edge_colors = moving_radiance(*seen, self.silhouettes, self.clip, self.receivers)
         np.testing.assert_array_equal(samples.numpy(), self.samples().numpy())
         np.testing.assert_array_equal(edge_colors.numpy(), self.edge_colors(samples).numpy())
         return self._played(tape, samples, seeds)
@@ -64,7 +64,7 @@ class Drawn:
         with wp.Tape() as tape:
             height, width = self.fragments.face_ids.shape[1:]
             fragments = rasterize(self.clip, self.faces, width, height)
-            samples = expose(fragments, self.faces, self.shading, self.albedo)
+            samples = sample_radiance(fragments, self.faces, self.shading, self.albedo)
         return self._played(tape, samples, seeds)
 
     def _played(self, tape, samples, seeds):

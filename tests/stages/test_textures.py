@@ -13,7 +13,7 @@ from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import level_matrices, mip_pyramids
-from warpshadow.stages.textures.sample import expose_albedo, sample_albedo
+from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import fill_unseen, seen_texels
 
 MEAN = 5e-7  # float32 means of texels in [0, 1]
@@ -593,19 +593,19 @@ def test_samples_exposed_at_once_are_albedo_times_what_they_receive_both_ways(de
     white = random.uniform(size=(lights, height, width, 4)).astype(np.float32)
     white[..., 3] = 1.0
 
-    def exposed(vertex_albedo, *images):
+    def radiance(vertex_albedo, *images):
         pyramids = mip_pyramids(images)
         footprints = find_footprints(fragments, faces, clip, uvs, uv_faces, texture_of_face, pyramids)
-        return expose_albedo(fragments, faces, vertex_albedo, pyramids, footprints, bodies.put(white, wp.vec4))
+        return textured_radiance(fragments, faces, vertex_albedo, pyramids, footprints, bodies.put(white, wp.vec4))
 
     def twin(*values):
         albedo = bodies.albedo_twin(bodies.clip_positions, bodies.uvs[None], *values)
         return white * np.concatenate([albedo, np.ones_like(albedo[..., :1])], axis=-1)
 
     values = [array.numpy().astype(np.float64) for array in reflecting]
-    assert np.abs(exposed(*reflecting).numpy() - twin(*values)).max() < SAMPLE
+    assert np.abs(radiance(*reflecting).numpy() - twin(*values)).max() < SAMPLE
     weights = random.normal(size=(2, height, width, 4)).astype(np.float32)
-    for number, gradient in enumerate(tape_gradients(exposed, reflecting, weights)):
+    for number, gradient in enumerate(tape_gradients(radiance, reflecting, weights)):
         directions = random.normal(size=(8, *values[number].shape))
         sums = [
             [

@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.viewer import gizmo
-from warpshadow.viewer.look import AS_GIVEN, Look, Place
+from warpshadow.viewer.look import AS_GIVEN, Look, Pose
 from warpshadow.viewer.quality import Quality
 
 QUICK = Quality(64**2, cells=32, rays=16, supersampling=1, is_moving=True)
@@ -90,27 +90,27 @@ def test_what_no_page_may_ask_for_is_refused(scene, name, value):
 def test_a_place_is_finite():
     for bad in ((float("nan"), 0, 0), (0, 0, 1e12), (0, 0)):
         with pytest.raises(ValueError, match="translation: got .*expected"):
-            Place((0, 0, 0), bad)
+            Pose((0, 0, 0), bad)
 
 
 def test_handles_are_in_the_middle_of_a_body_and_move_it_as_they_are_moved():
     mesh = ws.icosphere(subdivisions=1).transformed(translation=np.array([5.0, 0, 0]))
     body = ws.Body(mesh, blockers=1, rotation=(0, 90, 0), translation=(1, 2, 3), scale=0.5)
-    place = Place(tuple(body.rotation), tuple(body.translation))
-    wxyz, position = gizmo.handle_of(place, body, 2.0)
+    pose = Pose(tuple(body.rotation), tuple(body.translation))
+    wxyz, position = gizmo.handle_of(pose, body, 2.0)
     low, high = body.world_mesh().bounds
     np.testing.assert_allclose(position, 2.0 * 0.5 * (low + high), atol=1e-5)  # vertices are float32
-    again = gizmo.place_of(wxyz, position, body, 2.0)
-    np.testing.assert_allclose(again.rotation, place.rotation, atol=ROUNDING)
-    np.testing.assert_allclose(again.translation, place.translation, atol=ROUNDING)
-    moved = gizmo.place_of(wxyz, position + (0, 1.0, 0), body, 2.0)
-    np.testing.assert_allclose(moved.translation, np.array(place.translation) + (0, 0.5, 0), atol=ROUNDING)
+    again = gizmo.pose_of(wxyz, position, body, 2.0)
+    np.testing.assert_allclose(again.rotation, pose.rotation, atol=ROUNDING)
+    np.testing.assert_allclose(again.translation, pose.translation, atol=ROUNDING)
+    moved = gizmo.pose_of(wxyz, position + (0, 1.0, 0), body, 2.0)
+    np.testing.assert_allclose(moved.translation, np.array(pose.translation) + (0, 0.5, 0), atol=ROUNDING)
 
 
 def test_handles_turn_a_body_about_its_middle():
     mesh = ws.icosphere(subdivisions=1).transformed(translation=np.array([5.0, 0, 0]))
     body = ws.Body(mesh, blockers=1)
-    turned = gizmo.place_of(np.array([np.sqrt(0.5), 0, np.sqrt(0.5), 0]), np.array([5.0, 0, 0]), body, 1.0)
+    turned = gizmo.pose_of(np.array([np.sqrt(0.5), 0, np.sqrt(0.5), 0]), np.array([5.0, 0, 0]), body, 1.0)
     shown = ws.Body(mesh, blockers=1, rotation=turned.rotation, translation=turned.translation)
     low, high = shown.world_mesh().bounds
     np.testing.assert_allclose(0.5 * (low + high), (5, 0, 0), atol=1e-5)  # vertices are float32
@@ -119,7 +119,7 @@ def test_handles_turn_a_body_about_its_middle():
 @pytest.mark.parametrize("wxyz", [(0, 0, 0, 0), (float("nan"), 0, 0, 1)])
 def test_handles_that_are_nowhere_are_refused(wxyz):
     with pytest.raises(ValueError):
-        gizmo.place_of(np.array(wxyz), np.zeros(3), ws.Body(ws.icosphere(1.0, 1), blockers=1), 1.0)
+        gizmo.pose_of(np.array(wxyz), np.zeros(3), ws.Body(ws.icosphere(1.0, 1), blockers=1), 1.0)
 
 
 def test_receivers_as_given_are_those_of_the_bodies(scene):

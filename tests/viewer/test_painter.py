@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene.scene import Visibility
-from warpshadow.viewer.look import ERROR, Look, Place
+from warpshadow.viewer.look import ERROR, Look, Pose
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import (
     Painter,
@@ -72,7 +72,7 @@ def test_a_picture_of_what_was_changed_is_that_of_the_scene_so_changed(scene, pa
         scale=0.5,
         directions=128,
         softness=0.6,
-        places=(Place((0, 30, 0), (0.5, 1.2, 0.2)), Place((0, 0, 0), (0, 0, 0))),
+        poses=(Pose((0, 30, 0), (0.5, 1.2, 0.2)), Pose((0, 0, 0), (0, 0, 0))),
     )
     page = own_page(scene, painter.page_scale)
     shown = look.scene(scene)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.viewer.look import Look, Place
+from warpshadow.viewer.look import Look, Pose
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import own_page
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
@@ -63,7 +63,7 @@ def changed(scene):
         softness=0.5,
         receivers="pixel",
         bounces=2,
-        places=(Place((0, 30, 0), (0.1, 1.0, 0)), Place((0, 0, 0), (0, 0, 0))),
+        poses=(Pose((0, 30, 0), (0.1, 1.0, 0)), Pose((0, 0, 0), (0, 0, 0))),
     )
 
 

@@ -1,7 +1,7 @@
 """The light that a fit found, and which directions of it the images determined.
 
 Light from below a ground reaches nothing that an image shows, so whatever a fit says of it is a guess. How much a
-direction matters is its exposure, the sum of what its light adds to all pixels,
+direction matters is its influence, the sum of what its light adds to all pixels,
 
     e(ω) = Σ_p w_p ∂I_p / ∂L(ω),
 
@@ -32,11 +32,11 @@ from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
 from warpshadow.pipeline.lighting import map_of
 
 FAINTEST = 0.05
-"""Exposure below which a direction is not determined, as a part of the mean over all directions: what noise in the
+"""Influence below which a direction is not determined, as a part of the mean over all directions: what noise in the
 images does to light from there is twenty times as much as on the average."""
 
 _CELLS = 512  # that directions are told apart by
-_SIDE = 96  # shorter side of the images that exposures are summed over [pixels]
+_SIDE = 96  # shorter side of the images that influences are summed over [pixels]
 _ENLARGED, _STRIPE = 4, 6  # of its picture: pixels across one of the map; width of a stripe [pixels]
 
 
@@ -47,22 +47,22 @@ class FoundLight:
     Args:
         radiance: Linear RGB as an equirectangular map, shape [height, 2·height, 3]; below 0 where spherical harmonics
             are.
-        exposure: How much each direction matters to the images, 1 on the average over the sphere, [height, 2·height];
+        influence: How much each direction matters to the images, 1 on the average over the sphere, [height, 2·height];
             of cells of some 9°, each of which few rays stand for, so it varies by a third between them.
     """
 
     radiance: np.ndarray = field(repr=False)
-    exposure: np.ndarray = field(repr=False)
+    influence: np.ndarray = field(repr=False)
 
     @property
     def determined(self) -> np.ndarray:
         """Which directions the images determined, bool of shape [height, 2·height]."""
-        return self.exposure >= FAINTEST
+        return self.influence >= FAINTEST
 
     @property
     def undetermined_share(self) -> float:
         """Part of the sphere that the images did not determine."""
-        return float(pixel_solid_angles(len(self.exposure)) @ (~self.determined).sum(axis=1) / (4 * np.pi))
+        return float(pixel_solid_angles(len(self.influence)) @ (~self.determined).sum(axis=1) / (4 * np.pi))
 
     def picture(self) -> Picture:
         """The light at the automatic exposure of what is determined; gray stripes over the rest."""
@@ -95,11 +95,11 @@ def found_light(
     radiance = map_of(light)
     towards = equirectangular_directions(len(radiance))
     cells = CellBasis(fibonacci(_CELLS)).functions(towards.reshape(-1, 3))
-    exposure = cells @ exposure_of_cells(problem, setting, values)
-    return FoundLight(radiance.astype(np.float32), exposure.reshape(towards.shape[:2]).astype(np.float32))
+    influence = cells @ influence_of_cells(problem, setting, values)
+    return FoundLight(radiance.astype(np.float32), influence.reshape(towards.shape[:2]).astype(np.float32))
 
 
-def exposure_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
+def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
     """How much light from each of 512 cells matters to the images, 1 on the average, shape [cell]."""
     cells = Light(None, directions=_CELLS)
     free = [cells if isinstance(each, Light) else each for each in problem.free]
@@ -110,5 +110,5 @@ def exposure_of_cells(problem: Problem, setting: Setting, values: Mapping[str, V
     images = model.images({**values, cells.name: {"log_radiance": logs}})
     (model.weights[..., None] * images[..., :3]).sum().backward()
     assert logs.grad is not None
-    exposure = np.maximum(logs.grad.sum(dim=1).cpu().numpy().astype(np.float64), 0)
-    return exposure / (exposure.mean() or 1.0)
+    influence = np.maximum(logs.grad.sum(dim=1).cpu().numpy().astype(np.float64), 0)
+    return influence / (influence.mean() or 1.0)

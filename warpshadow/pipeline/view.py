@@ -23,8 +23,8 @@ from warpshadow.stages.receivers import Receivers, find_receivers, number_receiv
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import expose_moving
-from warpshadow.stages.textures.sample import expose_albedo
+from warpshadow.stages.slopes import moving_radiance
+from warpshadow.stages.textures.sample import textured_radiance
 
 
 class View(LitPoints):
@@ -130,12 +130,12 @@ class View(LitPoints):
         materials = self.materials.replaced(albedo, textures)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
         if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
-            found = (Node("reflectance", None, idle="found as samples are exposed"),)
+            found = (Node("reflectance", None, idle="found with the radiance"),)
             reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
-            given = fragments, self.assembly.faces, *reflecting, self._exposed_white(lit)
-            samples = Node("exposure", expose_albedo, *given, items=words, keeps=False, beside=found)
+            given = fragments, self.assembly.faces, *reflecting, self._white_radiance_of(lit)
+            samples = Node("radiance", textured_radiance, *given, items=words, keeps=False, beside=found)
         else:
-            samples = self._exposed(lit, reflected.samples)
+            samples = self._radiance(lit, reflected.samples)
         averaged = self._averaged(samples, is_moving=clip.requires_grad)
         return averaged
 
@@ -165,7 +165,7 @@ class View(LitPoints):
         division = Node("ratio", divide, *seen, items=self._samples, keeps=False)
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, keeps=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
-        films = [self._averaged(self._exposed(lit, each), is_moving=is_moving) for each in (drawn, inverse)]
+        films = [self._averaged(self._radiance(lit, each), is_moving=is_moving) for each in (drawn, inverse)]
         return Node("photograph", compose, photograph, *films, self._averaged(rest), keeps=False)
 
     def white(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
@@ -173,7 +173,7 @@ class View(LitPoints):
 
         Albedo and textures matter where light bounces.
         """
-        return self._exposed_white(self.shading(light, self.materials.replaced(albedo, textures)))
+        return self._white_radiance_of(self.shading(light, self.materials.replaced(albedo, textures)))
 
     def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another of the same cameras, among what blocks light in this one."""
@@ -187,13 +187,13 @@ class View(LitPoints):
 
         return other.kept("in another scene", self, exchanged)
 
-    def _exposed(self, lit: Node, reflected: Node) -> Node:
+    def _radiance(self, lit: Node, reflected: Node) -> Node:
         """Node of the samples."""
-        samples_of = functools.partial(Node, "exposure", items=self._samples, keeps=False)
+        samples_of = functools.partial(Node, "radiance", items=self._samples, keeps=False)
         if self.clip_positions.requires_grad:
             moving = self.silhouettes, self.clip_positions
-            return samples_of(_expose_moving, self.receivers_node, lit, reflected, *moving)
-        return samples_of(_expose, self.receivers_node, lit, reflected)
+            return samples_of(_moving_radiance, self.receivers_node, lit, reflected, *moving)
+        return samples_of(_radiance, self.receivers_node, lit, reflected)
 
     def _averaged(self, samples: Node, *, is_moving: bool = False) -> Node:
         """Node of the pixels of samples, or of samples and edge colors of what moves."""
@@ -204,10 +204,10 @@ class View(LitPoints):
             return Node("averaging", _same, smoothed, idle="a pixel has one sample", keeps=False)
         return samples_of("averaging", film.average, smoothed, self._across)
 
-    def _exposed_white(self, lit: Node) -> Node:
+    def _white_radiance_of(self, lit: Node) -> Node:
         """Node of the samples if every surface were white; kept with the last shading."""
         if self._white[0] is not lit:
-            self._white = lit, Node("", _expose_white, self.receivers_node, lit)
+            self._white = lit, Node("", _white_radiance, self.receivers_node, lit)
         return self._white[1]
 
     # ------------------------------------------------------------------------------------------ in words
@@ -267,24 +267,24 @@ def _same(value: object) -> object:
     return value
 
 
-def _expose(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:
-    return film.expose(receivers.fragments, receivers.faces, lit, reflected)
+def _radiance(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:
+    return film.sample_radiance(receivers.fragments, receivers.faces, lit, reflected)
 
 
-def _expose_moving(
+def _moving_radiance(
     receivers: Receivers, lit: wp.array, reflected: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
     seen = receivers.fragments, receivers.faces, lit, reflected
-    return expose_moving(*seen, silhouettes, clip_positions, receivers.of_vertices)
+    return moving_radiance(*seen, silhouettes, clip_positions, receivers.of_vertices)
 
 
-def _smooth_moving(exposed: tuple[wp.array, wp.array], silhouettes: Silhouettes, clip_positions: wp.array) -> wp.array:
-    samples, edge_colors = exposed
+def _smooth_moving(radiance: tuple[wp.array, wp.array], silhouettes: Silhouettes, clip_positions: wp.array) -> wp.array:
+    samples, edge_colors = radiance
     return smooth_silhouettes(samples, silhouettes, clip_positions, edge_colors)
 
 
-def _expose_white(receivers: Receivers, lit: wp.array) -> wp.array:
+def _white_radiance(receivers: Receivers, lit: wp.array) -> wp.array:
     _, height, width = receivers.fragments.face_ids.shape
     white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=lit.device)
-    return film.expose(receivers.fragments, receivers.faces, lit, white)
+    return film.sample_radiance(receivers.fragments, receivers.faces, lit, white)

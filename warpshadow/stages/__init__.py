@@ -5,7 +5,7 @@ A module here is a stage, or what stages share; README.md lists them in their or
 
 from warpshadow.stages.barycentrics import find_barycentrics
 from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.film import average, expose
+from warpshadow.stages.film import average, sample_radiance
 from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.light_samples import LightSamples, even_samples, sample_map
 from warpshadow.stages.nearest_rotation import nearest_rotations
@@ -21,10 +21,10 @@ from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import expose_moving
+from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import Textures, mip_pyramids
-from warpshadow.stages.textures.sample import expose_albedo, sample_albedo
+from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import fill_unseen, seen_texels
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility.directional import transmittance
@@ -47,9 +47,9 @@ __all__ = [
     "directional_transfer",
     "even_samples",
     "exponentiate",
-    "expose",
-    "expose_albedo",
-    "expose_moving",
+    "sample_radiance",
+    "textured_radiance",
+    "moving_radiance",
     "fill_unseen",
     "find_barycentrics",
     "find_edge_colors",

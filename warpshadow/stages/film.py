@@ -14,7 +14,7 @@ _COST, _ADJOINT_COST = 5.0, 10.0
 
 
 @wp.kernel(enable_backward=False)
-def _expose(
+def _radiance(
     first_row: int,
     worker: int,
     # in
@@ -41,7 +41,7 @@ def _expose(
 
 
 @wp.kernel(enable_backward=False)
-def _expose_adjoint(
+def _radiance_adjoint(
     first_row: int,
     worker: int,
     # in
@@ -85,10 +85,10 @@ def _expose_adjoint(
                     adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + by_weights
 
 
-def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
+def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
     """Multiply the light that the samples receive, interpolated from the receivers, with what they reflect.
 
-    Where surfaces move, :func:`warpshadow.stages.slopes.expose_moving` has the better gradient.
+    Where surfaces move, :func:`warpshadow.stages.slopes.moving_radiance` has the better gradient.
 
     Args:
         fragments: What each sample sees.
@@ -109,9 +109,9 @@ def expose(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.
     run_count = height * width // run
     inputs = [*fragments.rows, faces, shading, rows(albedo), run]
     return differentiable(
-        lambda samples: launch(_expose, count * run_count, cost=_COST * run, inputs=inputs, outputs=[rows(samples)]),
+        lambda samples: launch(_radiance, count * run_count, cost=_COST * run, inputs=inputs, outputs=[rows(samples)]),
         lambda adj_samples: launch(
-            _expose_adjoint,
+            _radiance_adjoint,
             run_count,
             cost=_ADJOINT_COST * run * count,
             inputs=[*inputs, rows(adj_samples)],

@@ -20,7 +20,7 @@ from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
-from warpshadow.stages.film import expose
+from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.interpolate import add_to_corners, adj_weights, interpolate
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import (
@@ -149,7 +149,7 @@ def _pull(
                     add_to_corners(adj_clip_positions[view], corners, weights, pull)
 
 
-def expose_moving(
+def moving_radiance(
     fragments: Fragments,
     faces: wp.array,
     shading: wp.array,
@@ -158,7 +158,7 @@ def expose_moving(
     clip_positions: wp.array,
     receivers: wp.array,
 ) -> tuple[wp.array, wp.array]:
-    """Expose samples of surfaces that move: :func:`warpshadow.stages.film.expose` with gradients by mean slopes.
+    """Radiance of samples of moving surfaces: :func:`warpshadow.stages.film.sample_radiance`, by mean slopes.
 
     Args:
         fragments: What each sample sees, of faces of receivers.
@@ -177,7 +177,7 @@ def expose_moving(
     samples that are receivers themselves, whose gradient is that of their points.
     """
     fragments = replace(fragments, barycentrics=_constant(fragments.barycentrics))
-    samples = expose(fragments, faces, shading, albedo)
+    samples = sample_radiance(fragments, faces, shading, albedo)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
     if not clip_positions.requires_grad:
         return samples, edge_colors

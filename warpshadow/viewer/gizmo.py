@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpshadow.scene.scene import Body
-from warpshadow.viewer.look import Place
+from warpshadow.viewer.look import Pose
 from warpshadow.viewer.page_camera import quaternion, rotation
 
 
@@ -22,13 +22,13 @@ def radius(body: Body) -> float:
     return 0.5 * body.scale * float(np.linalg.norm(np.asarray(high, np.float64) - low))
 
 
-def handle_of(place: Place, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
+def handle_of(pose: Pose, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the handles of a body are: quaternion, w first, and position [page units]."""
-    turned = Rotation.from_rotvec(place.rotation, degrees=True)
-    return quaternion(turned), page_scale * (turned.apply(middle(body)) + place.translation)
+    turned = Rotation.from_rotvec(pose.rotation, degrees=True)
+    return quaternion(turned), page_scale * (turned.apply(middle(body)) + pose.translation)
 
 
-def place_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> Place:
+def pose_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> Pose:
     """Where a body is that was dragged by its handles.
 
     Raises:
@@ -36,4 +36,4 @@ def place_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: flo
     """
     turned = rotation(wxyz)
     translation = np.asarray(position, np.float64) / page_scale - turned.apply(middle(body))
-    return Place(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))
+    return Pose(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))

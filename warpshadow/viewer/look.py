@@ -34,7 +34,7 @@ PICTURE, ERROR = "picture", "error against rays"
 
 
 @dataclass(frozen=True)
-class Place:
+class Pose:
     """Where a body is: turned by a rotation, then moved.
 
     Args:
@@ -69,7 +69,7 @@ class Look:
         bounces: Of light; methods that find none leave them out.
         shows: :data:`PICTURE` or :data:`ERROR`.
         shows_light: Whether the light itself is behind the bodies.
-        places: Of the bodies.
+        poses: Of the bodies.
     """
 
     turn: float
@@ -83,7 +83,7 @@ class Look:
     bounces: int
     shows: str
     shows_light: bool
-    places: tuple[Place, ...]
+    poses: tuple[Pose, ...]
 
     def __post_init__(self) -> None:
         """Check it."""
@@ -103,8 +103,8 @@ class Look:
         within("bounces", self.bounces, 0, MOST_BOUNCES)
         check.choice("shows", self.shows, (PICTURE, ERROR))
         check.flag("shows_light", self.shows_light)
-        for place in self.places:
-            check.instance("places", place, Place, "a Place for each body")
+        for pose in self.poses:
+            check.instance("poses", pose, Pose, "a Pose for each body")
 
     @classmethod
     def of(cls, scene: Scene, stops: float = 0.0) -> Look:
@@ -121,7 +121,7 @@ class Look:
             bounces=min(scene.bounces, MOST_BOUNCES),
             shows=PICTURE,
             shows_light=False,
-            places=tuple(Place(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
+            poses=tuple(Pose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
         )
 
     def visibility(self, given: Visibility, quality: Quality | None = None) -> Visibility:
@@ -161,14 +161,14 @@ class Look:
         """The scene as it is shown."""
         settings = self.settings(scene)
         bodies = tuple(
-            dataclasses.replace(body, rotation=np.array(place.rotation), translation=np.array(place.translation))
-            for body, place in zip(settings.bodies, self.places, strict=True)
+            dataclasses.replace(body, rotation=np.array(pose.rotation), translation=np.array(pose.translation))
+            for body, pose in zip(settings.bodies, self.poses, strict=True)
         )
         return dataclasses.replace(settings, bodies=bodies, light=self.light(scene.light))
 
     def has_moved(self, scene: Scene) -> bool:
         """Whether a body is not where the scene has it."""
-        return self.places != Look.of(scene).places
+        return self.poses != Look.of(scene).poses
 
 
 def within(name: str, value: object, least: float, most: float) -> None:

@@ -160,8 +160,8 @@ class Painter:
         """Where bodies are; None where the scene has them."""
         if not look.has_moved(self.scene):
             return None
-        turned = [Rotation.from_rotvec(place.rotation, degrees=True).as_matrix() for place in look.places]
-        moved = [place.translation for place in look.places]
+        turned = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in look.poses]
+        moved = [pose.translation for pose in look.poses]
         scales = [body.scale for body in self.scene.bodies]
 
         def placed() -> Geometry:
@@ -173,7 +173,7 @@ class Painter:
                 )
             )
 
-        return self._geometries.get((key, look.places), placed)
+        return self._geometries.get((key, look.poses), placed)
 
     def _light(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
         return look.light(self.coarse_light if quality.is_moving else self.scene.light)

@@ -16,7 +16,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.scene import METHODS, RECEIVERS
 from warpshadow.viewer import gizmo
-from warpshadow.viewer.look import AS_GIVEN, ERROR, PICTURE, Look, Place
+from warpshadow.viewer.look import AS_GIVEN, ERROR, PICTURE, Look, Pose
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion
 from warpshadow.viewer.painter import Painter, picture
@@ -187,7 +187,7 @@ class Panel:
         self._handles, self._dragged = None, number
         if number is not None:
             body = self._scene.bodies[number]
-            wxyz, position = gizmo.handle_of(self._loop.look.places[number], body, self._scale)
+            wxyz, position = gizmo.handle_of(self._loop.look.poses[number], body, self._scale)
             radius = min(self._scale * gizmo.radius(body), PAGE_RADIUS)  # a ground may go to the horizon
             self._handles = self._server.scene.add_transform_controls(
                 _HANDLES,
@@ -208,22 +208,22 @@ class Panel:
             return
         body = self._scene.bodies[number]
         try:
-            place = gizmo.place_of(event.target.wxyz, event.target.position, body, self._scale)
+            pose = gizmo.pose_of(event.target.wxyz, event.target.position, body, self._scale)
         except ValueError:  # not finite
             self._move_handles(self._loop.look)
             return
 
         def moved(look: Look) -> Look:
-            places = [*look.places]
-            places[number] = place
-            return dataclasses.replace(look, places=tuple(places))
+            poses = [*look.poses]
+            poses[number] = pose
+            return dataclasses.replace(look, poses=tuple(poses))
 
         self._move_spheres(self._loop.update(moved))
 
     def _move_handles(self, look: Look) -> None:
         if self._handles is not None and self._dragged is not None:
             body = self._scene.bodies[self._dragged]
-            wxyz, position = gizmo.handle_of(look.places[self._dragged], body, self._scale)
+            wxyz, position = gizmo.handle_of(look.poses[self._dragged], body, self._scale)
             self._handles.wxyz, self._handles.position = wxyz, position
 
     def _show_spheres(self) -> None:
@@ -253,6 +253,6 @@ class Panel:
 
     def _move_spheres(self, look: Look) -> None:
         for number, handle in list(self._spheres.items()):
-            place: Place = look.places[number]
-            handle.wxyz = quaternion(Rotation.from_rotvec(place.rotation, degrees=True))
-            handle.position = self._scale * np.array(place.translation)
+            pose: Pose = look.poses[number]
+            handle.wxyz = quaternion(Rotation.from_rotvec(pose.rotation, degrees=True))
+            handle.position = self._scale * np.array(pose.translation)

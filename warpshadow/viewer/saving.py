@@ -49,9 +49,9 @@ def as_toml(path: Path, scene: Scene, look: Look, camera: Camera) -> bytes:
             visibility[name] = value
     visibility["method"] = settings.visibility.method
     start = Look.of(scene)
-    for table, body, place, old in zip(tables["body"], settings.bodies, look.places, start.places, strict=True):
-        if place != old:
-            table["rotation"], table["translation"] = list(place.rotation), list(place.translation)
+    for table, body, pose, old in zip(tables["body"], settings.bodies, look.poses, start.poses, strict=True):
+        if pose != old:
+            table["rotation"], table["translation"] = list(pose.rotation), list(pose.translation)
         if look.receivers != AS_GIVEN:
             table["receivers"] = look.receivers
         if look.spheres is not None and body.casts_shadow:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.pipeline import own_factors
 from warpshadow.pipeline.assembly import Assembly
+from warpshadow.pipeline.bounces import own_factors
 from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.own_shadows import OwnShadows
 from warpshadow.stages.sparse import SparseMatrix

@@ -25,24 +25,24 @@ from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.flats.cells import (
     FlatScene,
-    Met,
-    Place,
+    Footprint,
+    OverFlat,
     check_flats,
     fetch,
     fetch_adjoint,
-    find_place,
-    find_place_adjoint,
+    find_footprint,
+    find_footprint_adjoint,
+    find_over_flat,
+    find_over_flat_adjoint,
     find_spot,
     flat_scene,
     front_of,
     front_of_adjoint,
-    meet,
-    meet_adjoint,
     on_side,
     scatter,
+    side_adjoint,
     step,
     step_slope,
-    to_place,
     toward_side,
 )
 from warpshadow.stages.flats.prepared import FlatGrid, Flats
@@ -78,7 +78,7 @@ def _place_receiver(
     flat_count = scene.grids.shape[0]
     side_count = int(0)
     for f in range(flat_count):
-        place = find_place(point, frames, f)
+        place = find_over_flat(point, frames, f)
         own[4 * f] = place.at
         own[4 * f + 1] = place.along_u
         own[4 * f + 2] = place.along_v
@@ -98,7 +98,7 @@ def _place_receiver(
 @wp.func
 def _kept_place(own: wp.array(dtype=wp.vec3), f: int):
     """What is written of a flat."""
-    place = Place()
+    place = OverFlat()
     place.at = own[4 * f]
     place.along_u = own[4 * f + 1]
     place.along_v = own[4 * f + 2]
@@ -133,7 +133,7 @@ def _place_receiver_adjoint(
     adj_point = wp.vec3()
     for f in range(scene.grids.shape[0]):
         place, adj = _kept_place(own, f), _kept_place(adj_own, f)
-        adj_point += find_place_adjoint(point, frames, f, place, adj, instance, adj_frames)
+        adj_point += find_over_flat_adjoint(point, frames, f, place, adj, instance, adj_frames)
     return adj_point
 
 
@@ -167,25 +167,27 @@ def _meet_sides(
         own[cells + 4 * i] = wp.vec3()
         if toward[2] > -scene.radius:
             grid = scene.grids[f]
-            met = meet(grid, scene, on_side(place, is_back), toward, side[2])
-            if met.share > 0.0:
+            footprint = find_footprint(grid, scene, on_side(place, is_back), toward, side[2])
+            if footprint.share > 0.0:
                 covered = float(1.0)
                 radiosity = wp.vec3()
                 sends = grid.sides == 2 or not is_back
                 if sends or grid.is_whole == 0:
                     first_level = _levels_of(grid, is_back)
-                    spot = find_spot(grid, scene, met)
+                    spot = find_spot(grid, scene, footprint)
                     if grid.is_whole == 0:
                         covered = fetch(scene.covered, scene, first_level, spot)[0]
                     if sends:
                         radiosity = fetch(texels, scene, first_level, spot)
                 meets = True
                 own[cells + 4 * i] = wp.vec3(
-                    met.share * covered, met.distance, met.distance * scene.radius * met.per_cosine
+                    footprint.share * covered,
+                    footprint.distance,
+                    footprint.distance * scene.radius * footprint.per_cosine,
                 )
                 own[cells + 4 * i + 1] = radiosity
-                own[cells + 4 * i + 2] = wp.vec3(met.share, covered, met.per_cosine)
-                own[cells + 4 * i + 3] = wp.vec3(met.place[0], met.place[1], 0.0)
+                own[cells + 4 * i + 2] = wp.vec3(footprint.share, covered, footprint.per_cosine)
+                own[cells + 4 * i + 3] = wp.vec3(footprint.center[0], footprint.center[1], 0.0)
     return meets
 
 
@@ -211,11 +213,11 @@ def _meet_sides_adjoint(
             grid = scene.grids[f]
             kept = own[cells + 4 * i + 2]
             spot_place = own[cells + 4 * i + 3]
-            met = Met()
-            met.share = kept[0]
-            met.distance = own[cells + 4 * i][1]
-            met.per_cosine = kept[2]
-            met.place = wp.vec2(spot_place[0], spot_place[1])
+            footprint = Footprint()
+            footprint.share = kept[0]
+            footprint.distance = own[cells + 4 * i][1]
+            footprint.per_cosine = kept[2]
+            footprint.center = wp.vec2(spot_place[0], spot_place[1])
             adj_met = adj_own[cells + 4 * i]  # of coverage, distance, and t ρ / c′
             adj_light = adj_own[cells + 4 * i + 1]  # of share × radiosity
             adj_share = adj_met[0] * kept[1]
@@ -223,38 +225,38 @@ def _meet_sides_adjoint(
             sends = grid.sides == 2 or not is_back
             if sends or grid.is_whole == 0:
                 first_level = _levels_of(grid, is_back)
-                spot = find_spot(grid, scene, met)
+                spot = find_spot(grid, scene, footprint)
                 if grid.is_whole == 0:
                     adj_covered = wp.vec3(adj_met[0] * kept[0], 0.0, 0.0)
-                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, met, spot, adj_covered)
+                    adj_spot += fetch_adjoint(scene.covered, grid, scene, first_level, footprint, spot, adj_covered)
                 if sends:
                     adj_share += wp.dot(adj_light, own[cells + 4 * i + 1])
                     adj = kept[0] * adj_light
-                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, met, spot, adj)
+                    adj_spot += fetch_adjoint(texels, grid, scene, first_level, footprint, spot, adj)
                     if adj_texels:
                         scatter(adj_texels[instance], scene, first_level, spot, adj)
             # a footprint is as wide as t / √c′
-            adj_distance = adj_met[1] + adj_met[2] * scene.radius * met.per_cosine
-            adj_cosine = -met.per_cosine * (
-                adj_met[2] * scene.radius * met.distance * met.per_cosine + 0.5 * adj_spot[2]
+            adj_distance = adj_met[1] + adj_met[2] * scene.radius * footprint.per_cosine
+            adj_cosine = -footprint.per_cosine * (
+                adj_met[2] * scene.radius * footprint.distance * footprint.per_cosine + 0.5 * adj_spot[2]
             )
             if adj_spot[2] != 0.0:
-                adj_distance += adj_spot[2] / met.distance
+                adj_distance += adj_spot[2] / footprint.distance
             place = _kept_place(own, f)
             toward = toward_side(place, is_back, direction)
-            adj_at, adj_toward, adj_presence = meet_adjoint(
+            adj_at, adj_toward, adj_presence = find_footprint_adjoint(
                 grid,
                 scene,
                 toward,
                 side[2],
-                met,
+                footprint,
                 adj_share,
                 adj_distance,
                 adj_cosine,
                 wp.vec2(adj_spot[0], adj_spot[1]),
             )
             before = _kept_place(adj_own, f)
-            adj_place = to_place(place, is_back, direction, adj_at, adj_toward, before)
+            adj_place = side_adjoint(place, is_back, direction, adj_at, adj_toward, before)
             adj_own[sides + i] = adj_own[sides + i] + wp.vec3(0.0, 0.0, adj_presence)
             adj_own[4 * f] = adj_place.at
             adj_own[4 * f + 1] = adj_place.along_u
@@ -263,20 +265,20 @@ def _meet_sides_adjoint(
 
 
 @wp.func
-def _nearness(met: wp.vec3, other: wp.vec3):
+def _nearness(footprint: wp.vec3, other: wp.vec3):
     """How far, in widths, another side is in front of one: −1 wholly behind it, 1 wholly in front."""
-    return (met[1] - other[1]) / (met[2] + other[2] + 1.0e-20)
+    return (footprint[1] - other[1]) / (footprint[2] + other[2] + 1.0e-20)
 
 
 @wp.func
 def _unhidden(i: int, but: int, cells: int, side_count: int, own: wp.array(dtype=wp.vec3)):
     """Part of a side's light that passes the sides in front of it, but for one of them."""
-    met = own[cells + 4 * i]
+    footprint = own[cells + 4 * i]
     part = float(1.0)
     for j in range(side_count):
         other = own[cells + 4 * j]
         if j != i and j != but and other[0] > 0.0:
-            part *= 1.0 - other[0] * step(_nearness(met, other))
+            part *= 1.0 - other[0] * step(_nearness(footprint, other))
     return part
 
 
@@ -285,13 +287,13 @@ def _unhidden_adjoint(
     i: int, adj_part: float, cells: int, side_count: int, own: wp.array(dtype=wp.vec3), adj_own: wp.array(dtype=wp.vec3)
 ):
     """Add to the gradients of what a cell meets."""
-    met = own[cells + 4 * i]
+    footprint = own[cells + 4 * i]
     for j in range(side_count):
         other = own[cells + 4 * j]
         if j != i and other[0] > 0.0:
             adj_factor = adj_part * _unhidden(i, j, cells, side_count, own)
-            nearness = _nearness(met, other)
-            adj_near = -adj_factor * other[0] * step_slope(nearness) / (met[2] + other[2] + 1.0e-20)
+            nearness = _nearness(footprint, other)
+            adj_near = -adj_factor * other[0] * step_slope(nearness) / (footprint[2] + other[2] + 1.0e-20)
             adj_width = -adj_near * nearness
             adj_own[cells + 4 * i] = adj_own[cells + 4 * i] + wp.vec3(0.0, adj_near, adj_width)
             adj_own[cells + 4 * j] = adj_own[cells + 4 * j] + wp.vec3(

@@ -82,8 +82,8 @@ def step_slope(z: float):
 
 
 @wp.struct
-class Place:
-    """Where a receiver is to a flat."""
+class OverFlat:
+    """A receiver as a flat has it: in the flat's own axes."""
 
     at: wp.vec3  # along both axes, and its height [units of the body]
     along_u: wp.vec3  # axes of unit length
@@ -92,9 +92,9 @@ class Place:
 
 
 @wp.func
-def find_place(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
-    """Find the place of a receiver to a flat."""
-    place = Place()
+def find_over_flat(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
+    """Find a receiver in the axes of a flat."""
+    place = OverFlat()
     scale_u = wp.length(frames[3 * f + 1])
     scale_v = wp.length(frames[3 * f + 2])
     if scale_u > 0.0 and scale_v > 0.0:
@@ -111,12 +111,12 @@ def find_place(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
 
 
 @wp.func
-def find_place_adjoint(
+def find_over_flat_adjoint(
     point: wp.vec3,
     frames: wp.array(dtype=wp.vec3),
     f: int,
-    place: Place,
-    adj: Place,
+    place: OverFlat,
+    adj: OverFlat,
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
@@ -185,13 +185,13 @@ def front_presence_slope(grid: FlatGrid, height: float):
 
 
 @wp.func
-def on_side(place: Place, is_back: bool):
+def on_side(place: OverFlat, is_back: bool):
     """Where a receiver is above a side."""
     return wp.vec3(place.at[0], place.at[1], wp.max(wp.where(is_back, -place.at[2], place.at[2]), 0.0))
 
 
 @wp.func
-def toward_side(place: Place, is_back: bool, direction: wp.vec3):
+def toward_side(place: OverFlat, is_back: bool, direction: wp.vec3):
     """Direction along the axes of a flat, and its cosine with a side."""
     along_normal = wp.dot(direction, place.normal)
     return wp.vec3(
@@ -202,18 +202,18 @@ def toward_side(place: Place, is_back: bool, direction: wp.vec3):
 
 
 @wp.func
-def to_place(
-    place: Place,
+def side_adjoint(
+    place: OverFlat,
     is_back: bool,
     direction: wp.vec3,
     adj_at: wp.vec3,
     adj_toward: wp.vec3,
-    adj_place: Place,
+    adj_place: OverFlat,
 ):
-    """Gradient of a place, added to what it is from elsewhere, by those of where a side is to a receiver and cell."""
+    """Add to the gradient of a receiver over a flat, by those of :func:`on_side` and :func:`toward_side`."""
     sign = wp.where(is_back, -1.0, 1.0)
     adj_height = wp.where(sign * place.at[2] > 0.0, sign * adj_at[2], 0.0)
-    adj = Place()
+    adj = OverFlat()
     adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
     adj.along_u = adj_place.along_u + adj_toward[0] * direction
     adj.along_v = adj_place.along_v + adj_toward[1] * direction
@@ -225,26 +225,26 @@ def to_place(
 
 
 @wp.struct
-class Met:
-    """How a cell meets a side of a flat."""
+class Footprint:
+    """What a cell takes of the plane of a flat, as a receiver over one side sees it."""
 
     share: float  # part of the cell that the rectangle takes
     distance: float  # [units of the body]
     per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
-    place: wp.vec2  # in the plane
+    center: wp.vec2  # in the plane
 
 
 @wp.func
-def _is_amid(grid: FlatGrid, met: Met, radius: float):
+def _is_amid(grid: FlatGrid, footprint: Footprint, radius: float):
     """Whether a footprint is so far from the border that it does not matter."""
-    reach = met.distance * radius * met.per_cosine + grid.margin
-    nearest = wp.min(met.place - grid.least)
-    return wp.min(nearest, wp.min(grid.most - met.place)) > reach
+    reach = footprint.distance * radius * footprint.per_cosine + grid.margin
+    nearest = wp.min(footprint.center - grid.least)
+    return wp.min(nearest, wp.min(grid.most - footprint.center)) > reach
 
 
 @wp.func
-def meet(grid: FlatGrid, scene: FlatScene, at: wp.vec3, toward: wp.vec3, presence: float):
-    """Meet a side.
+def find_footprint(grid: FlatGrid, scene: FlatScene, at: wp.vec3, toward: wp.vec3, presence: float):
+    """Find the footprint of a cell on a side.
 
     Args:
         grid: The flat.
@@ -253,55 +253,55 @@ def meet(grid: FlatGrid, scene: FlatScene, at: wp.vec3, toward: wp.vec3, presenc
         toward: Direction of the cell along both axes, and its cosine, above −ρ.
         presence: Part of the side that is there.
     """
-    met = Met()
-    met.share = presence
+    footprint = Footprint()
+    footprint.share = presence
     cosine = toward[2]
     if cosine < scene.radius:
         ratio = cosine * scene.per_radius
         u = 0.5 * ratio + 0.5
         cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
-        met.share *= step(ratio)
-    met.per_cosine = 1.0 / cosine
-    met.distance = at[2] * met.per_cosine
-    met.place = wp.vec2(at[0] + met.distance * toward[0], at[1] + met.distance * toward[1])
-    if not _is_amid(grid, met, scene.radius):
+        footprint.share *= step(ratio)
+    footprint.per_cosine = 1.0 / cosine
+    footprint.distance = at[2] * footprint.per_cosine
+    footprint.center = wp.vec2(at[0] + footprint.distance * toward[0], at[1] + footprint.distance * toward[1])
+    if not _is_amid(grid, footprint, scene.radius):
         for axis in range(2):
-            slope = toward[axis] * met.per_cosine
-            extent = met.distance * scene.radius * wp.sqrt(1.0 + slope * slope) + grid.margin
-            beyond = (grid.most[axis] - met.place[axis]) / extent
-            before = (grid.least[axis] - met.place[axis]) / extent
-            met.share = met.share * (step(beyond) - step(before))
-    return met
+            slope = toward[axis] * footprint.per_cosine
+            extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope) + grid.margin
+            beyond = (grid.most[axis] - footprint.center[axis]) / extent
+            before = (grid.least[axis] - footprint.center[axis]) / extent
+            footprint.share = footprint.share * (step(beyond) - step(before))
+    return footprint
 
 
 @wp.func
-def meet_adjoint(
+def find_footprint_adjoint(
     grid: FlatGrid,
     scene: FlatScene,
     toward: wp.vec3,
     presence: float,
-    met: Met,
+    footprint: Footprint,
     adj_share: float,
     adj_distance: float,
     adj_cosine: float,
-    adj_place: wp.vec2,
+    adj_center: wp.vec2,
 ):
-    """Gradients of ``at``, ``toward`` and ``presence``, from those of what is met and of the mean cosine c′."""
+    """Gradients of ``at``, ``toward`` and ``presence``, from those of the footprint and of the mean cosine c′."""
     radius = scene.radius
     horizon = step(toward[2] * scene.per_radius)
     inside_x = float(1.0)
     inside_y = float(1.0)
     adj_t = adj_distance
     adj_c = adj_cosine
-    adj_x = adj_place[0]
-    adj_y = adj_place[1]
+    adj_x = adj_center[0]
+    adj_y = adj_center[1]
     adj_toward = wp.vec3()
-    if not _is_amid(grid, met, radius):
-        slope = wp.vec2(toward[0], toward[1]) * met.per_cosine
+    if not _is_amid(grid, footprint, radius):
+        slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
         stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
-        extent = met.distance * radius * stretch + wp.vec2(grid.margin, grid.margin)
-        beyond = wp.cw_div(grid.most - met.place, extent)
-        before = wp.cw_div(grid.least - met.place, extent)
+        extent = footprint.distance * radius * stretch + wp.vec2(grid.margin, grid.margin)
+        beyond = wp.cw_div(grid.most - footprint.center, extent)
+        before = wp.cw_div(grid.least - footprint.center, extent)
         inside_x = step(beyond[0]) - step(before[0])
         inside_y = step(beyond[1]) - step(before[1])
         adj_inside = adj_share * presence * horizon * wp.vec2(inside_y, inside_x)
@@ -311,46 +311,46 @@ def meet_adjoint(
         adj_y += at_least[1] - at_most[1]
         adj_extent = wp.cw_mul(at_least, before) - wp.cw_mul(at_most, beyond)
         adj_t += radius * wp.dot(adj_extent, stretch)
-        adj_slope = (met.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
-        adj_toward = wp.vec3(adj_slope[0] * met.per_cosine, adj_slope[1] * met.per_cosine, 0.0)
-        adj_c -= wp.dot(adj_slope, slope) * met.per_cosine
+        adj_slope = (footprint.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
+        adj_toward = wp.vec3(adj_slope[0] * footprint.per_cosine, adj_slope[1] * footprint.per_cosine, 0.0)
+        adj_c -= wp.dot(adj_slope, slope) * footprint.per_cosine
     adj_inside_share = adj_share * inside_x * inside_y
     adj_t += adj_x * toward[0] + adj_y * toward[1]
-    adj_c -= adj_t * met.distance * met.per_cosine
+    adj_c -= adj_t * footprint.distance * footprint.per_cosine
     if toward[2] < radius:
         u = 0.5 * toward[2] * scene.per_radius + 0.5
         adj_c = adj_c * u * u + adj_inside_share * presence * step_slope(2.0 * u - 1.0) * scene.per_radius
-    adj_toward += wp.vec3(adj_x * met.distance, adj_y * met.distance, adj_c)
-    return wp.vec3(adj_x, adj_y, adj_t * met.per_cosine), adj_toward, adj_inside_share * horizon
+    adj_toward += wp.vec3(adj_x * footprint.distance, adj_y * footprint.distance, adj_c)
+    return wp.vec3(adj_x, adj_y, adj_t * footprint.per_cosine), adj_toward, adj_inside_share * horizon
 
 
 # ---------------------------------------------------------------------------------------------------- radiosity
 
 
 @wp.struct
-class Spot:
-    """Where a footprint lies on a grid, and how large it is."""
+class GridSpot:
+    """Where on a grid a footprint lies, and how large it is there."""
 
     texel: wp.vec2  # in texels of the finest level, from its corner
-    slopes: wp.vec2  # of that by the place in the plane
+    slopes: wp.vec2  # of that by the center in the plane
     level: int  # finer of the two levels
     part: float  # of the coarser one
     part_slope: float  # of that by the logarithm of the footprint's width
 
 
 @wp.func
-def find_spot(grid: FlatGrid, scene: FlatScene, met: Met):
+def find_spot(grid: FlatGrid, scene: FlatScene, footprint: Footprint):
     """Find the spot of a footprint."""
-    spot = Spot()
-    x = met.place[0] * grid.per_spread
-    y = met.place[1] * grid.per_spread
+    spot = GridSpot()
+    x = footprint.center[0] * grid.per_spread
+    y = footprint.center[1] * grid.per_spread
     size_x = 1.0 + wp.abs(x)
     size_y = 1.0 + wp.abs(y)
     spot.texel = grid.first + wp.vec2(
         wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
     )
     spot.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
-    width = 2.0 * met.distance * scene.radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * met.per_cosine)
+    width = 2.0 * footprint.distance * scene.radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * footprint.per_cosine)
     while spot.level < grid.level_count - 1 and width >= 2.0:
         spot.level = spot.level + 1
         width *= 0.5
@@ -422,7 +422,7 @@ def _slopes_between(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj: wp.
 
 
 @wp.func
-def fetch(texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: Spot):
+def fetch(texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: GridSpot):
     """Mean over a footprint, in the mip levels from ``first_level`` on."""
     value = _between(texels, _find_corners(scene, first_level + spot.level, spot.texel))
     if spot.part > 0.0:
@@ -437,8 +437,8 @@ def fetch_adjoint(
     grid: FlatGrid,
     scene: FlatScene,
     first_level: int,
-    met: Met,
-    spot: Spot,
+    footprint: Footprint,
+    spot: GridSpot,
     adj: wp.vec3,
 ):
     """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
@@ -452,13 +452,13 @@ def fetch_adjoint(
     adj_x = slopes[0] * spot.slopes[0]
     adj_y = slopes[1] * spot.slopes[1]
     if adj_log != 0.0:
-        adj_x += adj_log * grid.per_spread * _log_slope(met.place[0] * grid.per_spread)
-        adj_y += adj_log * grid.per_spread * _log_slope(met.place[1] * grid.per_spread)
+        adj_x += adj_log * grid.per_spread * _log_slope(footprint.center[0] * grid.per_spread)
+        adj_y += adj_log * grid.per_spread * _log_slope(footprint.center[1] * grid.per_spread)
     return wp.vec3(adj_x, adj_y, adj_log)
 
 
 @wp.func
-def scatter(adj_texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: Spot, adj: wp.vec3):
+def scatter(adj_texels: wp.array(dtype=wp.vec3), scene: FlatScene, first_level: int, spot: GridSpot, adj: wp.vec3):
     """Add to the gradients of texels: the adjoint of :func:`fetch` by what is fetched."""
     part = 1.0 - spot.part
     for coarser in range(2):

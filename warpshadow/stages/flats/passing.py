@@ -20,21 +20,21 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.flats.cells import (
     FlatScene,
-    Met,
-    Place,
+    Footprint,
+    OverFlat,
     check_flats,
     fetch,
     fetch_adjoint,
-    find_place,
-    find_place_adjoint,
+    find_footprint,
+    find_footprint_adjoint,
+    find_over_flat,
+    find_over_flat_adjoint,
     find_spot,
     flat_scene,
     front_of,
     front_of_adjoint,
-    meet,
-    meet_adjoint,
     on_side,
-    to_place,
+    side_adjoint,
     toward_side,
 )
 from warpshadow.stages.flats.prepared import FlatGrid, Flats
@@ -52,21 +52,23 @@ class _Covered:
 
     coverage: float
     part: float  # of the footprint, that the mesh covers
-    met: Met
+    footprint: Footprint
 
 
 @wp.func
-def _cover(scene: FlatScene, grid: FlatGrid, place: Place, is_back: bool, direction: wp.vec3, presence: float):
+def _cover(scene: FlatScene, grid: FlatGrid, place: OverFlat, is_back: bool, direction: wp.vec3, presence: float):
     """What a side of a flat takes of a cell, of the part of it that is there."""
     covered = _Covered()
     cosine = wp.dot(direction, place.normal)
     if presence > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
-        covered.met = meet(grid, scene, on_side(place, is_back), toward_side(place, is_back, direction), presence)
+        covered.footprint = find_footprint(
+            grid, scene, on_side(place, is_back), toward_side(place, is_back, direction), presence
+        )
         covered.part = 1.0
-        if grid.is_whole == 0 and covered.met.share > 0.0:
-            spot = find_spot(grid, scene, covered.met)
+        if grid.is_whole == 0 and covered.footprint.share > 0.0:
+            spot = find_spot(grid, scene, covered.footprint)
             covered.part = fetch(scene.covered, scene, grid.first_level, spot)[0]
-        covered.coverage = covered.met.share * covered.part
+        covered.coverage = covered.footprint.share * covered.part
     return covered
 
 
@@ -74,36 +76,36 @@ def _cover(scene: FlatScene, grid: FlatGrid, place: Place, is_back: bool, direct
 def _cover_adjoint(
     scene: FlatScene,
     grid: FlatGrid,
-    place: Place,
+    place: OverFlat,
     is_back: bool,
     direction: wp.vec3,
     presence: float,
     covered: _Covered,
     adj: float,
-    adj_place: Place,
+    adj_place: OverFlat,
 ):
     """Gradients of the place, added to what it is from elsewhere, and of the presence."""
-    met = covered.met
+    footprint = covered.footprint
     adj_spot = wp.vec3()
     if grid.is_whole == 0:
-        spot = find_spot(grid, scene, met)
-        adj_part = wp.vec3(adj * met.share, 0.0, 0.0)
-        adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, met, spot, adj_part)
+        spot = find_spot(grid, scene, footprint)
+        adj_part = wp.vec3(adj * footprint.share, 0.0, 0.0)
+        adj_spot = fetch_adjoint(scene.covered, grid, scene, grid.first_level, footprint, spot, adj_part)
     adj_distance = float(0.0)
     if adj_spot[2] != 0.0:  # a footprint is as wide as t / √c′
-        adj_distance = adj_spot[2] / met.distance
-    adj_at, adj_toward, adj_presence = meet_adjoint(
+        adj_distance = adj_spot[2] / footprint.distance
+    adj_at, adj_toward, adj_presence = find_footprint_adjoint(
         grid,
         scene,
         toward_side(place, is_back, direction),
         presence,
-        met,
+        footprint,
         adj * covered.part,
         adj_distance,
-        -0.5 * met.per_cosine * adj_spot[2],
+        -0.5 * footprint.per_cosine * adj_spot[2],
         wp.vec2(adj_spot[0], adj_spot[1]),
     )
-    return to_place(place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
+    return side_adjoint(place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
 
 
 @wp.func
@@ -138,7 +140,7 @@ def _add_coverage(
 ):
     """A thread owns a receiver:  C_q + h of both sides of a flat."""
     batch, receiver = split_row(first_row + wp.tid(), points.shape[1])
-    place = find_place(points[batch, receiver], frames[instance_in(batch, frames.shape[0])], f)
+    place = find_over_flat(points[batch, receiver], frames[instance_in(batch, frames.shape[0])], f)
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
@@ -179,12 +181,12 @@ def _add_coverage_adjoint(
     batch, receiver = split_row(first_row + wp.tid(), points.shape[1])
     instance = instance_in(batch, frames.shape[0])
     point = points[batch, receiver]
-    place = find_place(point, frames[instance], f)
+    place = find_over_flat(point, frames[instance], f)
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
     normal = _normal(facing, batch, receiver)
-    adj_place = Place()
+    adj_place = OverFlat()
     adj_front = float(0.0)
     for q in range(directions.shape[0]):
         direction = directions[q]
@@ -205,7 +207,7 @@ def _add_coverage_adjoint(
             adj_covered[batch, receiver, q] = adj_covered[batch, receiver, q] + adj
     adj_height = front_of_adjoint(fronts, grid, place.at[2], adj_front, batch, receiver, f, adj_fronts)
     adj_place.at = adj_place.at + wp.vec3(0.0, 0.0, adj_height)
-    adj_point = find_place_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
+    adj_point = find_over_flat_adjoint(point, frames[instance], f, place, adj_place, instance, adj_frames)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
 

@@ -203,7 +203,7 @@ def _sample(
     white: wp.array2d(dtype=wp.vec4),
     # out
     albedo: wp.array2d(dtype=wp.vec3),
-    exposed: wp.array2d(dtype=wp.vec4),
+    radiance: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples: what they reflect or, if samples of white surfaces are given, their exposure."""
     instance, thread = split_row(first_row + wp.tid(), sampled.texture_ids.shape[1] // sampled.run)
@@ -211,9 +211,9 @@ def _sample(
     of_textures = texels[instance_in(instance, texels.shape[0])]
     for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
         color = _color(sampled, instance, sample, of_vertices, of_textures)
-        if exposed:
+        if radiance:
             light = white[instance_in(instance, white.shape[0]), sample]
-            exposed[instance, sample] = wp.cw_mul(light, wp.vec4(color[0], color[1], color[2], 1.0))
+            radiance[instance, sample] = wp.cw_mul(light, wp.vec4(color[0], color[1], color[2], 1.0))
         else:
             albedo[instance, sample] = color
 
@@ -224,7 +224,7 @@ def _sample_adjoint_by_colors(
     sampled: _Sampled,
     white: wp.array2d(dtype=wp.vec4),
     adj_albedo: wp.array2d(dtype=wp.vec3),
-    adj_exposed: wp.array2d(dtype=wp.vec4),
+    adj_radiance: wp.array2d(dtype=wp.vec4),
     # out
     adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
@@ -235,8 +235,8 @@ def _sample_adjoint_by_colors(
     view = instance_in(instance, sampled.face_ids.shape[0])
     for sample in range(thread * sampled.run, (thread + 1) * sampled.run):
         adj_color = wp.vec3()
-        if adj_exposed:
-            adj = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_exposed[instance, sample])
+        if adj_radiance:
+            adj = wp.cw_mul(white[instance_in(instance, white.shape[0]), sample], adj_radiance[instance, sample])
             adj_color = wp.vec3(adj[0], adj[1], adj[2])
         else:
             adj_color = adj_albedo[instance, sample]
@@ -375,7 +375,7 @@ def sample_albedo(
     )
 
 
-def expose_albedo(
+def textured_radiance(
     fragments: Fragments,
     faces: wp.array,
     vertex_albedo: wp.array,
@@ -383,14 +383,14 @@ def expose_albedo(
     footprints: Footprints,
     white: wp.array,
 ) -> wp.array:
-    """Expose samples as it is found what they reflect, where all else stands still.
+    """Radiance of samples while what they reflect is found, where all else is kept.
 
-    It is :func:`sample_albedo` and :func:`warpshadow.stages.film.expose` in one: neither albedo nor its gradient is
-    written.
+    It is :func:`sample_albedo` and :func:`warpshadow.stages.film.sample_radiance` in one: neither albedo nor its
+    gradient is written.
 
     Args:
         fragments, faces, vertex_albedo, textures, footprints: As for :func:`sample_albedo`.
-        white: The samples if every surface were white, of :func:`warpshadow.stages.film.expose`, vec4 of shape
+        white: The samples if every surface were white, of :func:`warpshadow.stages.film.sample_radiance`, vec4 of shape
             [batch, height, width]; a batch of 1 serves every instance.
 
     Returns:
@@ -404,11 +404,11 @@ def expose_albedo(
     colors = [vertex_albedo, textures.texels]
     sampled = _make_sampled(textures, footprints, fragments, faces)
     return differentiable(
-        lambda exposed: _launch_sample([sampled, *colors, rows(white)], exposed, [None, rows(exposed)]),
-        lambda adj_exposed: launch(
+        lambda radiance: _launch_sample([sampled, *colors, rows(white)], radiance, [None, rows(radiance)]),
+        lambda adj_radiance: launch(
             _sample_adjoint_by_colors,
-            _runs(adj_exposed),
-            inputs=[sampled, rows(white), None, rows(adj_exposed)],
+            _runs(adj_radiance),
+            inputs=[sampled, rows(white), None, rows(adj_radiance)],
             outputs=[array.grad for array in colors],
         ),
         result=wp.empty(shape, dtype=wp.vec4, device=faces.device),
