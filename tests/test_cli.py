@@ -139,10 +139,11 @@ def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     from PIL import Image, ImageSequence
 
-    options = "--turntable", 4, "--background", "environment"
+    options = "--turntable", 4, "--background", "environment", "--fps", 5
     result = run("render", scene, "-o", tmp_path / "turn.gif", *options)
     assert result.exit_code == 0 and "turn.gif: 4 frames" in result.stdout
     with Image.open(tmp_path / "turn.gif") as file:
+        assert file.info["duration"] == 200
         frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(file)]).astype(int)
     loaded = ws.load_scene(scene)
     first = ws.Picture(ws.render(loaded), background=loaded.background())
@@ -195,6 +196,8 @@ def test_render_also_writes_layers(scene, tmp_path):
         ("turn.gif", ("--turntable", 4, "--png", "out.png"), "--png: got it beside --turntable"),
         ("turn.gif", ("--turntable", 4, "--layers"), "--layers: got it beside --turntable"),
         ("turn.gif", ("--camera-path", "no.toml"), "no.toml: no such camera path"),
+        ("turn.gif", ("--turntable", 4, "--fps", 60), "fps: got 60.0, expected 0.1 to 50 for .gif"),
+        ("turn.exr", ("--fps", 12), "--fps: got 12 without --turntable, expected --turntable FRAMES with it"),
     ],
 )
 def test_a_turntable_is_a_video_and_a_video_a_turntable(scene, tmp_path, output, options, part):
@@ -208,14 +211,14 @@ def test_a_background_that_is_none_is_refused_before_the_work(scene, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["out.jpg", "out.JPEG"])
-def test_a_jpeg_has_no_alpha_and_is_on_black(scene, tmp_path, name):
+def test_a_jpeg_has_no_alpha_and_is_on_white(scene, tmp_path, name):
     scene.write_text(SCENE.replace("[16, 12]", "[64, 48]"))
     result = run("render", scene, "-o", tmp_path / "out.exr", "--png", tmp_path / name, "--exposure", 0)
     assert result.exit_code == 0, result.output
     image, picture = ws.read_image(tmp_path / "out.exr"), ws.read_image(tmp_path / name)
     assert picture.shape == (48, 64, 3) and (image[..., 3] == 0).any()
     alpha = image[..., 3:]
-    expected = alpha * np.clip(image[..., :3] / np.maximum(alpha, 1e-9), 0, 1)
+    expected = alpha * np.clip(image[..., :3] / np.maximum(alpha, 1e-9), 0, 1) + 1 - alpha
     assert np.abs(picture - expected).mean() < EIGHT_BITS  # JPEG: in the mean
 
 

@@ -125,9 +125,7 @@ def render(
             "video: .mp4, .gif, .webp.",
         ),
     ],
-    png: Annotated[
-        Optional[Path], typer.Option(help="Also write an sRGB picture: .png, or .jpg, which is on black.")
-    ] = None,
+    png: Annotated[Optional[Path], typer.Option(help="Also write an sRGB picture: .png, or .jpg.")] = None,
     exposure: Annotated[
         Optional[float],
         typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
@@ -136,10 +134,18 @@ def render(
         Literal["clip", "filmic"], typer.Option(help="What becomes of bright color in the picture: cut off, or bent.")
     ] = "clip",
     background: Annotated[
-        str, typer.Option(help="Background of the picture: transparent, environment, or a color: white, #ffcc00.")
+        str,
+        typer.Option(
+            help="Background of the picture or video: environment, a color (white, #ffcc00), or transparent, which "
+            ".jpg files and videos show as white."
+        ),
     ] = "transparent",
     turntable: Annotated[
         Optional[int], typer.Option(help="Write a video of so many frames in which the camera goes around.", min=1)
+    ] = None,
+    fps: Annotated[
+        Optional[float],
+        typer.Option(help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50."),
     ] = None,
     camera_path: Annotated[
         Optional[Path],
@@ -198,10 +204,15 @@ def render(
             _check_output(output, ".exr", instead=remedy if is_picture or is_video else "")
         else:
             _check_output(output, *VIDEO_SUFFIXES)
-            check_video(output)
             for option, value in (("--png", png), ("--layers", layers or None), ("--camera-path", camera_path)):
                 if value is not None and option != video:
                     raise ValueError(f"{option}: got it beside {video}, expected one of them")
+        if fps is not None and turntable is None:
+            expected = "fps in the file" if path is not None else "--turntable FRAMES with it"
+            raise ValueError(f"--fps: got {fps:g} without --turntable, expected {expected}")
+        rate = path.fps if path is not None else 24.0 if fps is None else fps
+        if video is not None:
+            check_video(output, rate)
         if png is not None:
             _check_output(png, *SUFFIXES)
         plain = None if background in _BACKGROUNDS else background
@@ -220,7 +231,7 @@ def render(
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
             frames = _frames(loaded, cameras, where, exposure, tone, background)
-            write_video(output, frames, fps=24.0 if path is None else path.fps)
+            write_video(output, frames, fps=rate)
             _note(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s", is_quiet)
             return
         renderer = Renderer(loaded, device=where, progress=True)

@@ -50,6 +50,14 @@ def test_images_have_the_exposure_of_the_first(tmp_path):
     assert np.abs(read_back(tmp_path / "a.gif")[1] - expected).max() <= 2
 
 
+@pytest.mark.parametrize("name", ["a.gif", "a.webp"])
+def test_what_is_transparent_is_white(tmp_path, name):
+    half = np.full((8, 8, 4), [0.0, 0.0, 0.0, 0.5], np.float32)
+    ws.write_video(tmp_path / name, [np.zeros((8, 8, 4), np.float32), half])
+    empty, shadow = read_back(tmp_path / name)[:, 4, 4].astype(int)
+    assert (empty >= 254).all() and np.abs(shadow - 188).max() <= 2  # half of white, in sRGB
+
+
 @pytest.mark.parametrize(
     ("name", "given", "options", "message"),
     [

@@ -90,14 +90,14 @@ class Picture:
         return file.getvalue()
 
     def opaque(self) -> np.ndarray:
-        """uint8 of shape [height, width, 3], on black where the picture is transparent."""
+        """uint8 of shape [height, width, 3], on white where the picture is transparent."""
         if self.pixels.shape[2] < 4:
             return np.broadcast_to(self.pixels, (*self.pixels.shape[:2], 3))
-        straight = self.pixels / 255
-        return _codes(linear_to_srgb(straight[..., 3:] * srgb_to_linear(straight[..., :3])))
+        color, alpha = srgb_to_linear(self.pixels[..., :3] / 255), self.pixels[..., 3:] / 255
+        return _codes(linear_to_srgb(alpha * color + 1 - alpha))
 
     def write(self, path: AnyPath) -> None:
-        """Write a .png file, or a .jpg or .jpeg file, on black where the picture is transparent.
+        """Write a .png file, or a .jpg or .jpeg file, on white where the picture is transparent.
 
         Raises:
             OSError: where the file cannot be written.

@@ -32,7 +32,7 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
         path: A .gif or .webp file, or an .mp4 file (H.264), for which ``imageio-ffmpeg`` must be installed (the extra
             "video").
         frames: Pictures of one size, or images as :class:`Picture` takes them, which then all have the automatic
-            exposure of the first. What is transparent is black.
+            exposure of the first. What is transparent is white.
         fps: Frames a second, 0.1 to 1000; up to 90 of .webp, and 50 of .gif, whose frames last 10 ms, 20 ms and so on:
             the next is shown when its time is nearest.
 
@@ -40,10 +40,7 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
         ImportError: for an .mp4 file without ``imageio-ffmpeg``.
     """
     path = check.path("path", path)
-    check_video(path)
-    most = _FASTEST[path.suffix.lower()]
-    if not (check.is_number(fps) and _SLOWEST <= fps <= most):
-        raise ValueError(f"fps: got {check.described(fps)}, expected {_SLOWEST} to {most} for {path.suffix}")
+    check_video(path, fps)
     check.instance("frames", frames, Iterable, "pictures, one after another")
     if isinstance(frames, np.ndarray) and frames.ndim != 4:
         raise ValueError(f"frames: got an array of shape {frames.shape}, expected [frame, height, width, channel]")
@@ -58,10 +55,17 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
             _write_animation(unfinished, first, shown, fps, _STEPS[path.suffix.lower()])
 
 
-def check_video(path: Path) -> None:
-    """Raise ValueError unless a file's name is that of a video; ImportError for one that cannot be written here."""
+def check_video(path: Path, fps: float) -> None:
+    """Raise ValueError unless a file is called as videos are, and can have so many frames a second.
+
+    Raises:
+        ImportError: for one that cannot be written here.
+    """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(VIDEO_SUFFIXES)}")
+    most = _FASTEST[path.suffix.lower()]
+    if not (check.is_number(fps) and _SLOWEST <= fps <= most):
+        raise ValueError(f"fps: got {check.described(fps)}, expected {_SLOWEST} to {most} for {path.suffix}")
     if path.suffix.lower() == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401
