@@ -1,6 +1,6 @@
 """Scene files that are written: they read back as the same scene; and the keys that this takes."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -295,8 +295,30 @@ def test_a_body_in_a_file_stands_on_the_ground_where_its_translation_says(load):
     assert body.world_points()[:, 1].min() == pytest.approx(2) and body.scale == 2
 
 
-def test_on_ground_is_true_or_false(refused):
-    refused(TABLES + "on_ground = 1", "on_ground: got 1, expected true or false")
+def test_a_body_in_a_file_may_be_given_a_size_there(load, tmp_path):
+    lines = "rotation = [0, 0, 30]\ntranslation = [1, 2, 3]\non_ground = {size = 3.0}\n"
+    scene = load(TABLES + lines)
+    plain = replace(scene.bodies[0], translation=(0, 0, 0), scale=1.0)
+    standing = plain.on_ground((1, 2, 3), size=3.0)
+    assert scene.bodies[0].scale == standing.scale != 1
+    np.testing.assert_array_equal(scene.bodies[0].translation, standing.translation)
+    ws.write_scene(scene, tmp_path / "written")
+    written = ws.load_scene(tmp_path / "written" / "scene.toml").bodies[0]
+    assert written.scale == standing.scale
+    np.testing.assert_array_equal(written.translation, standing.translation)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("on_ground = 1", "on_ground: got 1, expected true or false, or a table such as {size = 2.0}"),
+        ("on_ground = {size = 0}", "on_ground: size: got 0, expected a positive number"),
+        ("on_ground = {foot = [0, 0, 0]}", "on_ground: key: unknown key 'foot'; known keys are size"),
+        ("scale = 2\non_ground = {size = 1}", "on_ground: size: got it beside the body's scale"),
+    ],
+)
+def test_on_ground_is_true_or_false_or_a_size(refused, lines, message):
+    refused(TABLES + lines, message)
 
 
 def test_the_spheres_that_the_command_line_writes_can_be_named(load, tmp_path):

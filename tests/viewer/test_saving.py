@@ -94,6 +94,19 @@ def test_a_scene_file_of_a_look_that_changes_nothing_is_the_same_scene(path, tmp
     assert_same(ws.load_scene(tmp_path / "saved.toml"), scene)
 
 
+def test_a_body_that_stood_and_a_camera_that_framed_are_where_they_were_moved_to(path, tmp_path):
+    standing = FILE.replace('name = "ball"', "translation = [1.0, 0.0, 0.0]\non_ground = {size = 3.0}")
+    path.write_text(standing.replace("eye = [0.0, 2.0, 5.0]\ntarget = [0.0, 0.5, 0.0]", 'framing = "auto"'))
+    scene = ws.load_scene(path)
+    start = Look.of(scene)
+    moved = dataclasses.replace(start, poses=(Pose((0, 30, 0), (0.1, 1.0, 0)), start.poses[1]))
+    for look in (start, moved):
+        (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, scene.camera))
+        read = ws.load_scene(tmp_path / "saved.toml")
+        assert_same(read, look.scene(scene))
+        assert read.bodies[0].scale == pytest.approx(1.5)
+
+
 def test_other_numbers_of_spheres_take_the_place_of_given_ones(path, tmp_path):
     scene = ws.load_scene(path)
     look = dataclasses.replace(Look.of(scene), spheres=32)

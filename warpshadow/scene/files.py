@@ -3,7 +3,7 @@
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -208,9 +208,16 @@ def _body(table: Table, folder: Path) -> Body:
         with check.located("spheres"):
             place["blockers"] = Spheres.read(path)
         del place["spheres"]
-    stands = check.flag("on_ground", place.pop("on_ground", False))
+    stands = place.pop("on_ground", False)
     body = Body(**place)
-    return body.on_ground(body.translation) if stands else body
+    if isinstance(stands, bool):
+        return body.on_ground(body.translation) if stands else body
+    check.instance("on_ground", stands, Mapping, "true or false, or a table such as {size = 2.0}")
+    with check.located("on_ground"):
+        check.known_keys("key", stands, ("size",))
+        if "size" in stands and "scale" in table:
+            raise ValueError("size: got it beside the body's scale, expected one of them")
+        return body.on_ground(body.translation, **stands)
 
 
 # ---------------------------------------------------------------------------------------------- writing

@@ -119,6 +119,8 @@ def _value(value: object) -> str:
         is_matrix = bool(value) and isinstance(value[0], (list, tuple))
         items = [_value(item) for item in value]
         return "[\n" + "".join(f"    {item},\n" for item in items) + "]" if is_matrix else f"[{', '.join(items)}]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + "}"
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)  # nan, inf: as TOML has them
     return json.dumps(value, ensure_ascii=False)  # of the rest, JSON's notation is TOML's

@@ -15,8 +15,6 @@ from warpshadow.scene.scene import READ_BY, Scene
 from warpshadow.viewer.look import AS_GIVEN, Look
 from warpshadow.viewer.page_camera import PageCamera
 
-_VIEW_KEYS = ("eye", "target", "up", "fov_y", "intrinsics", "rotation", "translation", "size", "near")
-
 
 def saved_camera(scene: Scene, page: PageCamera, page_scale: float) -> Camera:
     """The page's camera on an image as high as the scene's, as wide as the page makes it."""
@@ -35,8 +33,7 @@ def as_toml(path: Path, scene: Scene, look: Look, camera: Camera) -> bytes:
         camera: From where.
     """
     tables = toml_tables.read(path, "scene file")
-    supersampling = {key: value for key, value in tables["camera"].items() if key not in _VIEW_KEYS}
-    tables["camera"] = camera_table(camera) | supersampling
+    tables["camera"] = camera_table(camera) | {"supersampling": scene.supersampling}
     light = tables["light"]
     light["rotation"] = light.get("rotation", 0.0) + look.turn
     light["scale"] = light.get("scale", 1.0) * look.scale
@@ -52,6 +49,8 @@ def as_toml(path: Path, scene: Scene, look: Look, camera: Camera) -> bytes:
     for table, body, pose, old in zip(tables["body"], settings.bodies, look.poses, start.poses, strict=True):
         if pose != old:
             table["rotation"], table["translation"] = list(pose.rotation), list(pose.translation)
+            if table.pop("on_ground", False):  # which may have scaled it
+                table["scale"] = float(body.scale)
         if look.receivers != AS_GIVEN:
             table["receivers"] = look.receivers
         if look.spheres is not None and body.casts_shadow:
