@@ -48,6 +48,36 @@ def test_a_body_has_the_texture_of_its_file(tmp_path, write):
     np.testing.assert_array_equal(ws.load_scene(tmp_path / "scene.toml").bodies[0].texture, TEXTURE)
 
 
+@pytest.mark.parametrize("kind", ["mesh", "scene"])
+def test_a_body_of_trimesh_is_that_of_its_file(tmp_path, kind):
+    of_file = ws.Body(write_glb(tmp_path))
+    loaded = trimesh.load_scene(tmp_path / "a.glb", process=False)
+    body = ws.Body(loaded if kind == "scene" else loaded.to_mesh())
+    np.testing.assert_array_equal(body.mesh.positions, of_file.mesh.positions)
+    np.testing.assert_array_equal(body.mesh.faces, of_file.mesh.faces)
+    np.testing.assert_array_equal(body.mesh.uvs[body.mesh.uv_faces], of_file.mesh.uvs[of_file.mesh.uv_faces])
+    np.testing.assert_array_equal(body.texture, TEXTURE)
+
+
+def test_a_scene_of_trimesh_is_one_mesh_where_its_nodes_are():
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    scene = trimesh.Scene()
+    for x in (0, 3):
+        scene.add_geometry(ball, transform=trimesh.transformations.translation_matrix((x, 0, 0)))
+    mesh = ws.load_mesh(scene)
+    assert mesh.face_count == 2 * len(ball.faces) and mesh.name == "mesh"
+    np.testing.assert_allclose(mesh.bounds, [(-1, -1, -1), (4, 1, 1)])
+
+
+def test_colors_of_vertices_of_trimesh_are_remarked_on_as_those_of_files():
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.visual.vertex_colors = [255, 0, 0, 255]
+    with pytest.warns(UserWarning, match=r"^mesh: colors of vertices dropped, which Body\(albedo=…\) takes"):
+        ws.Body(ball)
+    with pytest.raises(ws.MeshError, match="^mesh: faces: got none"):
+        ws.Body(trimesh.Scene())
+
+
 def test_a_texture_is_multiplied_by_its_factor(tmp_path):
     body = ws.Body(write_glb(tmp_path, factor=[255, 51, 0, 255]))
     np.testing.assert_allclose(body.texture, TEXTURE * (1, 0.2, 0), atol=1e-6)

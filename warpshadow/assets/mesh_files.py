@@ -1,10 +1,12 @@
-"""Mesh files: OBJ, PLY, GLB, STL and USD, read without reordering vertices."""
+"""Mesh files: OBJ, PLY, GLB, STL and USD, read without reordering vertices; and meshes of trimesh."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeGuard
 
 import numpy as np
 
@@ -14,9 +16,30 @@ from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, moved_part, turned_over
 from warpshadow.check import AnyPath
 
+if TYPE_CHECKING:  # it is imported where a file is read by it
+    import trimesh
 
-def load_mesh(path: AnyPath) -> Mesh:
-    """Read an OBJ, PLY, STL, GLB/glTF or USD file as one mesh.
+
+class OfTrimesh(Protocol):
+    """A ``trimesh.Trimesh`` or a ``trimesh.Scene``."""
+
+    @property
+    def metadata(self) -> Mapping[str, object]:
+        """What trimesh knows of it, such as the file."""
+
+
+MeshSource = AnyPath | OfTrimesh
+"""What is read as a mesh."""
+
+
+def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
+    """Whether a value is a mesh or a scene of trimesh."""
+    trimesh = sys.modules.get("trimesh")  # before it is imported, nothing is
+    return trimesh is not None and isinstance(value, (trimesh.Trimesh, trimesh.Scene))
+
+
+def load_mesh(path: MeshSource) -> Mesh:
+    """Read an OBJ, PLY, STL, GLB/glTF or USD file, or take what trimesh has, as one mesh.
 
     Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes
     of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), faces refer
@@ -27,7 +50,8 @@ def load_mesh(path: AnyPath) -> Mesh:
     ``Body(path)`` takes the texture, too.
 
     Args:
-        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file.
+        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the
+            meshes of a ``trimesh.Scene``, which are taken as those of files are.
 
     Returns:
         The mesh, named after the file.
@@ -48,7 +72,7 @@ def load_mesh(path: AnyPath) -> Mesh:
     return mesh
 
 
-def load_textured_mesh(path: AnyPath, *, wanted: bool = True) -> tuple[Mesh, np.ndarray | None]:
+def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, np.ndarray | None]:
     """Read a mesh as :func:`load_mesh` does, and the texture that the file names or holds.
 
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
@@ -75,14 +99,16 @@ def load_textured_mesh(path: AnyPath, *, wanted: bool = True) -> tuple[Mesh, np.
     return mesh, texture
 
 
-def _remark(path: AnyPath, remarks: list[str]) -> None:
+def _remark(path: MeshSource, remarks: list[str]) -> None:
     if remarks:
-        check.warn(f"{path}: {', '.join(remarks)}")
+        check.warn(f"{path if check.is_path(path) else 'mesh'}: {', '.join(remarks)}")
 
 
-def _read(path: AnyPath) -> tuple[Mesh, BaseColor | None, list[str]]:
+def _read(source: MeshSource) -> tuple[Mesh, BaseColor | None, list[str]]:
     """A mesh, the picture that all its faces have, and remarks on what may surprise."""
-    path = check.path("path", path)
+    if is_of_trimesh(source):
+        return _concatenate(_trimesh_parts(source), Path(source.metadata.get("file_name") or "mesh").stem)
+    path = check.path("path", source)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise MeshError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(_READERS)}")
@@ -227,8 +253,16 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
 
     if path.suffix.lower() == ".gltf":
         json.loads(path.read_bytes())  # on bad JSON trimesh would read a model.gltf beside the file instead
-    scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    parts = []
+    return _trimesh_parts(trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False))
+
+
+def _trimesh_parts(given: trimesh.Trimesh | trimesh.Scene) -> list[MeshPart]:
+    """The meshes of a scene of trimesh in world space; or one mesh, as it is."""
+    import trimesh
+
+    if isinstance(given, trimesh.Trimesh):
+        return [_trimesh_part(given)]
+    scene, parts = given, []
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
         shape = scene.geometry[geometry]

@@ -15,7 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh, MeshError
-from warpshadow.assets.mesh_files import load_textured_mesh
+from warpshadow.assets.mesh_files import MeshSource, is_of_trimesh, load_textured_mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, falloff_width
@@ -152,9 +152,9 @@ class Body:
     The path of a file, relative to the current folder, stands for what is in it, as in scene files.
 
     Args:
-        mesh: The mesh, or a file that :func:`warpshadow.load_mesh` reads.
+        mesh: The mesh, or what :func:`warpshadow.load_mesh` reads: a file, or a mesh or a scene of trimesh.
         albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it. By
-            default the texture that the mesh's file has, where all its faces have the same, or gray, 0.8.
+            default the texture that what is read has, where all its faces have the same, or gray, 0.8.
         texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
@@ -194,7 +194,7 @@ class Body:
     @check.keywords(**MEANT, spheres="blockers", path="mesh")
     def __init__(
         self,
-        mesh: Mesh | AnyPath,
+        mesh: Mesh | MeshSource,
         albedo: npt.ArrayLike | AnyPath | None = None,
         texture: npt.ArrayLike | AnyPath | None = None,
         blockers: int | Spheres | AnyPath = 64,
@@ -211,7 +211,7 @@ class Body:
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
         self._read_mesh()
         self._read_files()
-        expected = "a Mesh or the path of a file; Mesh(positions, faces) makes one of arrays"
+        expected = "a Mesh, the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
         object.__setattr__(self, "albedo", self._checked_albedo())
         if self.texture is not None:
@@ -254,12 +254,12 @@ class Body:
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
     def _read_mesh(self) -> None:
-        """Put what the mesh's file holds in place of its path, its texture where no reflectance is given."""
+        """Put what the mesh's file, or trimesh, holds in its place; its texture where no reflectance is given."""
         mesh, texture = self.mesh, None
-        if check.is_path(mesh):
-            path = check.file("mesh", mesh)
+        source = check.file("mesh", mesh) if check.is_path(mesh) else mesh
+        if check.is_path(source) or is_of_trimesh(source):
             with check.located("mesh", MeshError):
-                mesh, texture = load_textured_mesh(path, wanted=self.albedo is None and self.texture is None)
+                mesh, texture = load_textured_mesh(source, wanted=self.albedo is None and self.texture is None)
         vars(self).update(
             mesh=mesh,
             albedo=_GRAY if self.albedo is None else self.albedo,
