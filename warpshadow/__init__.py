@@ -1,7 +1,5 @@
 """warpshadow: differentiable soft shadows on meshes under environment light, in NVIDIA Warp."""
 
-import warp as _wp
-
 from warpshadow import check as _check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.camera import Camera
@@ -86,6 +84,4 @@ def quiet(*, progress: bool = True) -> None:
         progress: Whether progress bars show from now on; False hides all, as ``progress=False`` hides those of a call.
     """
     _show_bars(_check.flag("progress", progress))
-    _wp.config.log_level = getattr(_wp, "LOG_WARNING", 30)
-    _wp.config.quiet = True  # what releases before log_level read
     _start_quietly()

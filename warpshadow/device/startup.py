@@ -9,10 +9,13 @@ _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 def start_quietly() -> None:
-    """Start Warp, and keep its remark that a machine has no GPU, which its native code prints, off the terminal.
+    """Start Warp without its messages, and keep its remark that a machine has no GPU, which its native code prints, off
+    the terminal.
 
-    What else it prints on stderr meanwhile is printed after.
+    Warnings stay. What else it prints on stderr meanwhile is printed after.
     """
+    wp.config.log_level = getattr(wp, "LOG_WARNING", 30)
+    wp.config.quiet = True  # what releases before log_level read
     if sys.stderr is None:  # as of a service
         wp.init()
         return

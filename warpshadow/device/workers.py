@@ -1,0 +1,158 @@
+"""Worker processes: tasks that do not depend on each other, shared out among processes of this machine.
+
+Each process has a share of the threads of :mod:`warpshadow.device.parallel`, does one task after another, and keeps
+what it loaded and compiled. A process that dies, killed or out of memory, takes no other with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection, wait
+from typing import Generic, NamedTuple, TypeVar
+
+from warpshadow.device.parallel import set_thread_count, thread_count
+from warpshadow.device.progress import show_bars
+from warpshadow.device.startup import start_quietly
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_ATTEMPTS = 2
+"""How often a task is begun whose process dies: it may have been killed for what another process took."""
+
+
+class WorkerDied(RuntimeError):
+    """A process ended in the middle of a task, and did so again when another tried."""
+
+
+class Ended(NamedTuple, Generic[Task, Result]):
+    """A task that is over."""
+
+    task: Task
+    result: Result | None
+    """What the function returned; None where it failed."""
+    error: Exception | None
+    """What it raised, or :class:`WorkerDied`."""
+
+
+class _Worker(Generic[Task, Result]):
+    """A process, the task that it has, and how often that was begun."""
+
+    def __init__(self, function: Callable[[Task], Result], threads: int):
+        context = multiprocessing.get_context("spawn")  # a fork would have Warp's locks, but not its threads
+        self.connection, other_end = context.Pipe()
+        self.process = context.Process(target=_serve, args=(other_end, function, threads), daemon=True)
+        self.process.start()
+        other_end.close()  # so that its death is the end of the connection
+        self.has: tuple[Task, int] | None = None
+
+    def begin(self, task: Task, attempt: int) -> None:
+        """Let it do a task; should it be dead, that is noticed as if it died of the task."""
+        self.has = task, attempt
+        with contextlib.suppress(OSError):
+            self.connection.send(task)
+
+    def end(self) -> int | None:
+        """End the process, and return its exit status."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+        return self.process.exitcode
+
+
+def run_tasks(
+    function: Callable[[Task], Result], tasks: Iterable[Task], *, workers: int, threads: int | None = None
+) -> Iterator[Ended[Task, Result]]:
+    """Do tasks in worker processes, which end with this one, however it ends.
+
+    Args:
+        function: What does a task; sent once to each process, so it can be pickled, as tasks and results can.
+        tasks: Taken one by one as processes are free.
+        workers: Number of processes.
+        threads: Threads that kernels and NumPy have in each process; by default an even share of all.
+
+    Yields:
+        The tasks that are over, as they end. A task whose process dies is done once more.
+    """
+    threads = threads or max(1, thread_count() // workers)
+    untried, again = ((task, 1) for task in tasks), deque[tuple[Task, int]]()
+    idle: list[_Worker[Task, Result]] = []
+    busy: dict[object, _Worker[Task, Result]] = {}  # by their connections
+    try:
+        while True:
+            while len(busy) < workers and (following := again.popleft() if again else next(untried, None)):
+                worker = idle.pop() if idle else _Worker(function, threads)
+                worker.begin(*following)
+                busy[worker.connection] = worker
+            if not busy:
+                return
+            for connection in wait([worker.connection for worker in busy.values()]):
+                worker = busy.pop(connection)
+                assert worker.has is not None
+                task, attempt = worker.has
+                try:
+                    result, error = worker.connection.recv()
+                    idle.append(worker)
+                except (EOFError, OSError):
+                    status = worker.end()
+                    if attempt < _ATTEMPTS:
+                        again.append((task, attempt + 1))
+                        continue
+                    result, error = None, WorkerDied(f"its process ended {_in_words(status)}, {_ATTEMPTS} times")
+                yield Ended(task, result, error)
+    finally:
+        for worker in (*busy.values(), *idle):
+            worker.end()
+
+
+def _in_words(status: int | None) -> str:
+    if status is not None and status < 0:
+        return f"by {signal.Signals(-status).name}"
+    return f"with exit status {status}"
+
+
+# ---------------------------------------------------------------------------------------------- in the process
+
+
+def _serve(connection: Connection, function: Callable[[Task], Result], threads: int) -> None:
+    """Do the tasks that come, until the connection ends."""
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the parent, which ends this process
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    start_quietly()
+    show_bars(False)
+    set_thread_count(threads)
+    with threadpool_limits(limits=threads):
+        while True:
+            try:
+                task = connection.recv()
+            except EOFError:
+                return
+            try:
+                connection.send((function(task), None))
+            except Exception as error:  # the function's, or of what cannot be pickled
+                connection.send((None, _sendable(error)))
+
+
+def _sendable(error: Exception) -> Exception:
+    """An error, or what it says, where it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
