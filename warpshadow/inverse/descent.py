@@ -68,6 +68,12 @@ class Result:
     reason: str
     seconds: float
 
+    def __repr__(self) -> str:
+        free = ", ".join(self.values)
+        count = sum(map(len, self.losses))
+        loss = min(self.losses[-1], default=math.nan)
+        return f"Result({free}: {self.reason} after {count} iterations, loss {loss:.3g})"
+
     @functools.cached_property
     def found(self) -> Found:
         """Scene, cameras and exposures."""

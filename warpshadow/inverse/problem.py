@@ -93,6 +93,11 @@ class Problem:
                 each.check_scene(self.scene)
         self.cameras()  # raises for an image of other proportions
 
+    def __repr__(self) -> str:
+        free = ", ".join(free.name for free in self.free)
+        height, width, _ = self.targets[0].image.shape
+        return f"Problem({self.scene!r}, {len(self.targets)} targets of {width} × {height}, free: {free})"
+
     def _numbered(self) -> Iterator[Free]:
         for number, each in enumerate(self.free):
             with check.located(f"free[{number}]"):
