@@ -277,7 +277,8 @@ class TorchRenderer(torch.nn.Module):
         """Place the bodies in the world: x → s R x + t.
 
         Args:
-            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`. Entries of RᵀR
+            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`, which takes
+                radians where a ``Body.rotation`` is in degrees. Entries of RᵀR
                 may differ from those of the identity by 0.05, which a step of 0.01 in each of the nine numbers leaves
                 them; to go on from there, ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].

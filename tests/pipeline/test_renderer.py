@@ -298,9 +298,9 @@ def test_what_a_renderer_is_not_made_of_is_refused_when_it_is_made(options, mess
 @pytest.mark.parametrize(
     ("light", "message"),
     [
-        ("park.exr", r"light: got 'park.exr', expected an EnvironmentMap, as EnvironmentMap.read\(path\)"),
+        ("park.exr", r"light: got 'park.exr', expected an EnvironmentMap \(EnvironmentMap.read\(path\)"),
         ([[1.0, 1.0, 1.0]] * 4, "light: got list of 4 items, expected an EnvironmentMap"),
-        (np.ones(9), r"light: got shape \(9,\), expected \[order², 3\]"),
+        (np.ones(9), r"light: got shape \(9,\), expected an EnvironmentMap .*, or SH coefficients \[order², 3\]"),
     ],
 )
 def test_what_is_no_light_is_refused(light, message):

@@ -10,6 +10,7 @@ in a right-handed world with y up (Mitsuba's convention): the center of the map 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,8 +28,20 @@ from warpshadow.maths import sh
 # Degrees about +y that turn a map of the convention into ours, and so what its center shows.
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
 
+LIGHT = (
+    "an EnvironmentMap (EnvironmentMap.read(path), EnvironmentMap(pixels) of [height, 2·height, 3], "
+    "EnvironmentMap.constant(1.0)), or SH coefficients [order², 3], such as 9 rows"
+)
+"""What functions that take known light say they expect."""
 
 _DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
+
+
+def check_coefficients(name: str, values: np.ndarray) -> None:
+    """Raise ValueError unless an array is one of SH coefficients, finite and of shape [order², 3]."""
+    if values.ndim != 2 or values.shape[1] != 3 or math.isqrt(len(values)) ** 2 != len(values) or not len(values):
+        raise ValueError(f"{name}: got shape {values.shape}, expected {LIGHT}")
+    check.finite(name, values)
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -134,7 +134,8 @@ def _behind(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
             return srgb_to_linear(np.array(ImageColor.getrgb(background)[:3]) / 255)
         except ValueError as error:
             raise ValueError(
-                f"background: got {background!r}, expected a color such as 'white' or '#ffcc00'"
+                f"background: got {background!r}, expected a color such as 'white' or '#ffcc00', or radiance such as "
+                "scene.background()"
             ) from error
     expected = f"a color [3], or an image {list(shape)}"
     behind = check.numbers("background", background, expected=expected, dtype=np.float64)

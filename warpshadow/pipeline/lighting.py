@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.maths import sh
@@ -208,14 +208,10 @@ class Method:
 
 def check_light(light: object) -> None:
     """Raise ValueError for what is no light, or None."""
-    expected = (
-        "an EnvironmentMap, as EnvironmentMap.read(path) reads it, known SH coefficients as an array [order², 3], or "
-        "free coefficients in renderer.basis as a tensor"
-    )
+    expected = f"{LIGHT}, or free coefficients in renderer.basis as a tensor"
     check.instance("light", light, (EnvironmentMap, np.ndarray, wp.array, type(None)), expected)
     if isinstance(light, np.ndarray):
-        check.shape("light", light.shape, ("order²", 3))
-        check.finite("light", light)
+        check_coefficients("light", light)
 
 
 def map_of(light: KnownLight) -> np.ndarray:

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.image import ImageError, read_rgb
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import MeshSource, is_of_trimesh, load_textured_mesh
 from warpshadow.check import AnyPath
@@ -163,7 +164,8 @@ class Body:
             which any number means one sphere touching it from behind. Where light bounces, a body of 0 or none is lit
             and reflects all the same, and takes its light from nobody. If it is not flat, other bodies get that light
             by rays only: a sphere sends light in place of what it blocks.
-        rotation: Axis-angle vector [degrees], shape [3].
+        rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y. (In
+            :mod:`warpshadow.torch` and :mod:`warpshadow.stages` axis-angle vectors are in radians.)
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
@@ -211,7 +213,7 @@ class Body:
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
         self._read_mesh()
         self._read_files()
-        expected = "a Mesh, the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
+        expected = "a Mesh or the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
         check.instance("mesh", self.mesh, Mesh, expected)
         object.__setattr__(self, "albedo", self._checked_albedo())
         if self.texture is not None:
@@ -283,6 +285,8 @@ class Body:
     def _checked_albedo(self) -> np.ndarray:
         count = self.mesh.vertex_count
         expected = "a linear color such as (0.8, 0.1, 0.1), one for each vertex, [vertex, 3], or an .npy file of them"
+        if isinstance(self.albedo, str):
+            raise ValueError(f"albedo: got {self.albedo!r}, expected {expected}{_meant(self.albedo)}")
         albedo = check.numbers("albedo", self.albedo, expected=expected)
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
@@ -351,6 +355,17 @@ def _read_colors(path: Path) -> np.ndarray:
         return np.load(path, allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise ValueError(f"got {path} ({error}), expected an .npy file of [vertex, 3]") from error
+
+
+def _meant(color: str) -> str:
+    """What a color of CSS is in linear RGB, for messages; nothing for other text."""
+    from PIL import ImageColor
+
+    try:
+        linear = srgb_to_linear(np.array(ImageColor.getrgb(color)[:3]) / 255)
+    except ValueError:
+        return ""
+    return f": that color is ({', '.join(f'{value:.4g}' for value in linear)})"
 
 
 def _check_reflectance(name: str, values: np.ndarray) -> None:
@@ -429,14 +444,10 @@ class Scene:
             with check.located("light", ImageError):
                 object.__setattr__(self, "light", EnvironmentMap.read(path))
         if not isinstance(self.light, EnvironmentMap):
-            expected = "an EnvironmentMap, the path of one, or SH coefficients [order², 3]"
-            light = check.numbers("light", self.light, expected=expected)
-            remedies = {0: "EnvironmentMap.constant(radiance) is light from everywhere", 3: "EnvironmentMap(pixels)"}
-            check.shape("light", light.shape, ("order²", 3), remedies.get(light.ndim, ""))
-            check.finite("light", light)
-            order = sh.order_of("light", light)
+            light = check.numbers("light", self.light, expected=f"{LIGHT}, or the path of a map")
+            check_coefficients("light", light)
             with check.located("light"):
-                sh.check_order(order)
+                sh.check_order(sh.order_of("light", light))
             light.setflags(write=False)
             object.__setattr__(self, "light", light)
         check_supersampling(self.supersampling)
