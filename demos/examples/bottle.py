@@ -9,8 +9,6 @@ Starts are 15° and 10% of the diagonal away. Light, the bottle's color and the 
 the picture is masked out. First the bottle is moved until it covers its outline, which was painted by hand. From there
 a fit of the image goes on, with shadows and without. The table's texture is to have few edges, and the inside of the
 bottle is masked out: its print, its gloss and the other orange of its cap are nothing that one color explains.
-
-At the end light and table are fitted to the half of the table in front of the bottle, and predict the half behind.
 """
 
 import argparse
@@ -56,6 +54,7 @@ class Photograph:
         outline: Where the body is seen, 0 to 1, [height, width].
         scene: The body as it is known to stand, and the table, a plane, as one gray.
         texels: Of the table's texture, across and down.
+        clear: Directions from the body's foot in which nothing else casts a shadow, from x towards z [degrees].
     """
 
     image: np.ndarray
@@ -63,6 +62,7 @@ class Photograph:
     outline: np.ndarray
     scene: ws.Scene
     texels: int
+    clear: tuple[float, float] = (-180, 180)
 
     def mask(self, *, inside: bool = True) -> np.ndarray:
         """What counts: the table clear of the outline and of other objects, and the body, or its rim alone."""
@@ -78,15 +78,6 @@ class Photograph:
         """The table well clear of the body."""
         wide = 2 * round(self.image.shape[1] / 137) + 1
         return np.where(ndimage.grey_dilation(self.outline, size=wide) < 0.01, self.mask(), 0).astype(np.float32)
-
-    def near(self) -> np.ndarray:
-        """The pixels whose rays meet the table in front of the body's foot, [height, width]."""
-        camera, body = self.scene.camera, self.scene.bodies[BODY].world_mesh().positions
-        eye, directions = camera.rays()
-        foot = body[body[:, 1].argmin()]
-        away = (camera.rotation[2] * (1, 0, 1))[[0, 2]]
-        points = eye[[0, 2]] - eye[1] * directions[..., [0, 2]] / np.minimum(directions[..., 1:2], -1e-6)
-        return (points - foot[[0, 2]]) @ away < 0
 
 
 # ------------------------------------------------------------------------------------------------ photographs
@@ -140,7 +131,7 @@ def bottle_photograph(folder: Path) -> Photograph:
     others = np.max([_area(points, width, height) for points in _OTHERS], axis=0)
     matte = _area(_MATTE_TABLE, width, height) * (1 - others)
     scene = ws.Scene((body, table), PLAIN, camera, SHADOWS)
-    return Photograph(image, matte, _area(_BOTTLE, width, height), scene, texels=160)
+    return Photograph(image, matte, _area(_BOTTLE, width, height), scene, texels=160, clear=(-60, 120))
 
 
 def stand_in(size: int = 256) -> Photograph:
@@ -200,39 +191,25 @@ def by_image(photo: Photograph, start: ws.Body, visibility: ws.Visibility, itera
     return inverse.fit(problem, [stage], progress=False).scene
 
 
-def prediction(photo: Photograph, visibility: ws.Visibility) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The half of the table behind the body, as light and colors of the half in front have it, at half the size.
+def first_guess(photo: Photograph, seed: int) -> ws.Body:
+    """The body 15° and 10% of its diagonal from where it is known to be."""
+    rng = np.random.default_rng(seed)
+    return displaced(photo.scene.bodies[BODY], rng, degrees=(15, 15), part=(0.1, 0.1))
 
-    The body is where it is known to be. Which texels are light and which dark is seen; how light and how dark is not.
 
-    Returns:
-        The prediction and the photograph, linear RGB [height, width, 3], and where light squares are whole.
-    """
+def open_photograph(data: Path | None) -> Photograph:
+    """The photograph in data/photograph, where it is; the stand-in elsewhere. Says which."""
+    is_real = data is not None and (data / "photograph" / "bottle.png").exists()
+    print("the photograph" if is_real else "no photograph here: a ray-traced stand-in")
+    return bottle_photograph(data / "photograph") if data is not None and is_real else stand_in()
+
+
+def tiles(photo: Photograph) -> np.ndarray:
+    """Which texels of the table are light, as the nearer of two colors, bool of shape [height, width, 1]."""
     whole = painted(photo, **TWO_COLORS)
     colors = _by_brightness(whole.values["texture[0]"]["palette"])
     texels = whole.values["texture[0]"]["texels"]
-    is_light = (texels[:, :, None] - colors).square().sum(dim=-1).argmin(dim=-1).numpy()[..., None] == 1
-    scene = dataclasses.replace(photo.scene, visibility=visibility)
-    scene = changed(scene, TABLE, texture=whole.scene.bodies[0].texture)
-    near = photo.near()
-    target = inverse.Target(photo.image, np.where(near, photo.mask(), 0).astype(np.float32))
-    free = [inverse.Albedo(BODY), inverse.Light(3), inverse.Texture(TABLE, **TWO_COLORS)]
-    problem = inverse.Problem(scene, target, free, HUBER, still=None)
-    stage = inverse.Stage(150, 0.03, _scale(photo, 160), supersampling=1)
-    result = inverse.fit(problem, [stage], progress=False)
-    dark, light = _by_brightness(result.values[f"texture[{TABLE}]"]["palette"]).numpy()
-    camera = photo.scene.camera.resized(0.5)
-
-    def drawn(scene: ws.Scene, dark: np.ndarray, light: np.ndarray) -> np.ndarray:
-        tiles = np.where(is_light, light, dark).astype(np.float32)
-        return ws.render(dataclasses.replace(changed(scene, TABLE, texture=tiles), camera=camera))[..., :3]
-
-    pattern = drawn(dataclasses.replace(unshadowed(photo.scene), light=PLAIN), np.zeros(3), np.ones(3))[..., 0]
-    is_whole = ndimage.minimum_filter(pattern, size=3) > 0.95 * pattern.max()
-    counts = halved(np.where(~near & (photo.outline == 0), photo.mask(), 0)[..., None])[..., 0] == 1
-    if not (is_whole & counts).any():
-        raise ValueError("photo: no light square is seen whole behind the body")
-    return drawn(result.scene, dark, light), halved(photo.image), is_whole & counts
+    return (texels[:, :, None] - colors).square().sum(dim=-1).argmin(dim=-1).numpy()[..., None] == 1
 
 
 def halved(image: np.ndarray) -> np.ndarray:
@@ -258,14 +235,12 @@ def main(data: Path | None, output: Path, starts: int, iterations: int) -> None:
     torch.set_num_threads(1)
     began = time.perf_counter()
     output.mkdir(parents=True, exist_ok=True)
-    is_real = data is not None and (data / "photograph" / "bottle.png").exists()
-    photo = bottle_photograph(data / "photograph") if data is not None and is_real else stand_in()
-    print("the photograph" if is_real else "no photograph here: a ray-traced stand-in")
+    photo = open_photograph(data)
     truth = photo.scene.bodies[BODY]
     errors: dict[str, list[float]] = {"with shadows": [], "without": [], "outline alone": []}
     scenes = []
     for seed in range(starts):
-        start = displaced(truth, np.random.default_rng(seed), degrees=(15, 15), part=(0.1, 0.1))
+        start = first_guess(photo, seed)
         outlined = by_outline(photo, start)
         explained = [by_image(photo, outlined, by, iterations) for by in (SHADOWS, DIRECT)]
         scenes.append(explained[0])
@@ -274,12 +249,6 @@ def main(data: Path | None, output: Path, starts: int, iterations: int) -> None:
         figures = ", ".join(f"{label} {values[-1]:.2f}%" for label, values in errors.items())
         print(f"start {seed}: MDE {distance_error(start, truth):.1f}% → {figures}", flush=True)
     print("median MDE: " + ", ".join(f"{label} {statistics.median(own):.2f}%" for label, own in errors.items()))
-    for label, visibility in (("with shadows", ws.Visibility("ray-traced", samples=256)), ("without", DIRECT)):
-        image, seen, counts = prediction(photo, visibility)
-        gap = np.linalg.norm((image - seen)[counts]) / np.linalg.norm(seen[counts])
-        print(
-            f"light squares behind the body, predicted from those in front, {label}: {100 * gap:.1f}% off", flush=True
-        )
     middle = int(np.argsort(errors["with shadows"])[(starts - 1) // 2])
     sheet = pictures(photo, scenes[middle], errors["with shadows"][middle])
     sheet.save(output / "bottle.jpg", quality=85)

@@ -1,4 +1,4 @@
-"""The demo of a real photograph: what it masks, where it puts the bottle, and that its fits find what they should."""
+"""The demo of a real photograph: what it masks, where it puts the bottle, what fits find, how shadows are measured."""
 
 import dataclasses
 
@@ -7,9 +7,11 @@ import pytest
 
 import warpshadow as ws
 from demos.examples import bottle as demo
+from demos.examples import bottle_light
 from demos.problems import displaced, distance_error, ray_traced, unshadowed
 
 WIDTH, HEIGHT = 144, 96
+IS_LIGHT = (np.indices((4, 4)).sum(axis=0)[..., None] % 2 == 1).repeat(16, axis=0).repeat(16, axis=1)
 
 
 def lump() -> ws.Mesh:
@@ -26,8 +28,7 @@ def photo() -> demo.Photograph:
         [[0, 0.5, 0], [0.15, 0.3, 0], [-0.15, 0.3, 0], [0, -0.1, 0], [0, -0.6, 0]], [0.42] * 4 + [0.36]
     )
     body = ws.Body(lump(), (0.7, 0.3, 0.1), blockers=spheres, translation=(0, 1, 0), rotation=(0, 30, 0))
-    tiles = np.where(np.indices((4, 4)).sum(axis=0)[..., None] % 2, 0.8, 0.1) * np.ones(3)
-    texture = tiles.repeat(16, axis=0).repeat(16, axis=1).astype(np.float32)
+    texture = np.where(IS_LIGHT, np.full(3, 0.8), 0.1).astype(np.float32)
     sky = ws.synthetic_sky((0.8, 0.7, -0.1), sun_strength=3.0, sun_radius=30.0, height=64)
     camera = ws.Camera.look_at((1.2, 4.2, 3.6), (0.3, 0.4, -0.2), fov_y=40, size=(WIDTH, HEIGHT))
     truth = ws.Scene((body, ws.Body(ws.plane(7.0, 16), texture=texture)), sky, camera, demo.SHADOWS)
@@ -65,16 +66,6 @@ def test_masks_leave_out_what_saturates_and_the_inside_of_the_body(photo):
     assert 0.3 * photo.outline.sum() < left_out.sum() < photo.outline.sum()
     assert (photo.outline[left_out] == 1).all()
     assert not photo.around()[photo.outline > 0].any() and photo.around().any()
-
-
-def test_the_near_half_of_the_table_is_in_front_of_the_foot(photo):
-    body = photo.scene.bodies[demo.BODY].world_mesh().positions
-    foot, camera = body[body[:, 1].argmin()], photo.scene.camera
-    forward = camera.rotation[2] * (1, 0, 1)
-    forward /= np.linalg.norm(forward)
-    for distance in (-0.8, -0.2, 0.2, 0.8):
-        column, row = camera.project((foot + distance * forward) * (1, 0, 1)).astype(int)
-        assert photo.near()[row, column] == (distance < 0)
 
 
 def test_the_bottle_is_seen_where_its_given_pose_projects_it(tmp_path):
@@ -116,11 +107,42 @@ def test_the_image_keeps_the_body_nearer_with_shadows_than_without(photo):
     assert with_shadows < 0.85 * without
 
 
+def test_light_squares_are_light_whole_and_on_the_table(photo):
+    squares = bottle_light.light_squares(photo, IS_LIGHT)
+    colors = photo.image[squares.seen].mean(axis=1)
+    assert squares.seen.sum() > 300
+    assert np.percentile(colors, 5) > 3 * np.percentile(photo.image[photo.mask() == 1].mean(axis=1), 10)
+    assert not (squares.seen & (photo.outline > 0)).any()
+
+
+def test_points_of_the_table_are_what_pixels_see_of_it(photo):
+    points = bottle_light.table_points(photo.scene.camera)
+    x, z = points[60, 70]
+    np.testing.assert_allclose(photo.scene.camera.project(np.array([x, 0.0, z])), (70.5, 60.5), atol=1e-3)
+    middle, radius = bottle_light.foot(photo.scene.bodies[demo.BODY])
+    np.testing.assert_allclose(middle, 0, atol=0.1)
+    assert 0.1 < radius < 0.4
+
+
 @pytest.mark.slow
-def test_light_and_table_in_front_predict_light_squares_behind(photo):
-    image, seen, counts = demo.prediction(photo, demo.DIRECT)
-    assert image.shape == seen.shape == (*counts.shape, 3) == (HEIGHT // 2, WIDTH // 2, 3)
-    assert counts.sum() > 50
-    assert not counts[demo.halved(photo.near()[..., None])[..., 0] > 0].any()
-    assert seen[counts].min() > 3 * np.percentile(seen[seen[..., 0] > 0], 10)
-    assert np.linalg.norm((image - seen)[counts]) < 0.1 * np.linalg.norm(seen[counts])
+def test_light_is_found_that_casts_the_shadow_of_the_photograph(photo):
+    seen = bottle_light.light_squares(photo, IS_LIGHT).seen
+    visibility = ws.Visibility(directions=64)
+    found = bottle_light.explained(photo, seen, visibility, iterations=100).scene
+    without = bottle_light.explained(photo, seen, bottle_light.DIRECT, iterations=100).scene
+    unshadowed_gap = bottle_light.gap(photo, without, seen, bottle_light.DIRECT)
+    assert bottle_light.gap(photo, found, seen, visibility) < 0.6 * unshadowed_gap
+    found = dataclasses.replace(found, visibility=visibility)
+    kept = bottle_light.darkening(found, bottle_light.second_body(photo))
+    assert 0.3 < np.nanmin(kept) < 0.8 and np.nanmedian(kept) > 0.9
+    shadow = bottle_light.shadow(bottle_light.by_sector(kept, photo, bottle_light.second_body(photo)))
+    assert abs(abs(shadow.direction) - 180) < 45  # the sun is on the right
+
+
+def test_a_shadow_is_measured_around_its_darkest_sector():
+    kept = np.ones(24)
+    kept[[22, 23, 0, 1]] = 0.75, 0.6, 0.9, 0.7  # over the seam at 180°, with a gap
+    kept[12] = np.nan
+    found = bottle_light.shadow(kept)
+    assert found == bottle_light.Shadow(pytest.approx(172.5), pytest.approx(0.4), 30)
+    assert str(found) == "darkest at 172°, 40% less light, 30° wide"
