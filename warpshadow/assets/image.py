@@ -6,6 +6,7 @@ Row 0 is the top. PNG and JPEG hold sRGB, which is decoded and encoded exactly; 
 from __future__ import annotations
 
 import functools
+import io
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -104,6 +105,31 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
             _write_exr(unfinished, pixels, channels)
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
+
+
+def exr_bytes(channels: Mapping[str, np.ndarray]) -> bytes:
+    """An OpenEXR file of channels, each float32 of shape [height, width], in memory; ZIP compressed."""
+    import OpenEXR
+
+    stream = io.BytesIO()
+    pixels = {name: np.ascontiguousarray(values, np.float32) for name, values in channels.items()}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, pixels).write(stream)
+    return stream.getvalue()
+
+
+def exr_channels(content: bytes) -> dict[str, np.ndarray]:
+    """All channels of an OpenEXR file in memory, as :func:`exr_bytes` makes one.
+
+    Raises:
+        ImageError: for what is none, or is truncated.
+    """
+    import OpenEXR
+
+    try:
+        channels = OpenEXR.File(io.BytesIO(content), separate_channels=True).channels()
+        return {name: channel.pixels for name, channel in channels.items()}
+    except Exception as error:  # its messages and exception types vary with the damage
+        raise ImageError(f"not an OpenEXR file, or a damaged one ({error})") from error
 
 
 def _no_layers(path: Path, layers: object) -> None:

@@ -10,6 +10,7 @@ in a right-handed world with y up (Mitsuba's convention): the center of the map 
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,6 +125,11 @@ class EnvironmentMap:
                 f"{path}: got extension {Path(path).suffix!r}, expected .exr, which holds radiance unclipped"
             )
         write_image(path, self.radiance)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of the radiance, in hexadecimal."""
+        return hashlib.sha256(f"{self.radiance.shape}".encode() + self.radiance.tobytes()).hexdigest()
 
     def rotated(self, degrees: float) -> EnvironmentMap:
         """Turn the light about +y, counter-clockwise seen from above: +90 takes what is at +z to +x.

@@ -1,13 +1,15 @@
 """Random scenes: a data set whose scenes come from a seed and a number, each by itself.
 
 One to three bodies stand or lie on a ground of neutral gray, in colors of their own, under a sky with a sun or under
-a few soft lights; a camera looks at them from above. Scenes are drawn when they are asked for, in any order, in any
-process: the same seed, number and bodies give the same scene.
+a few soft lights, or under maps that are given; a camera looks at them from above. :class:`Ranges` are those of what is
+drawn. Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and
+ranges give the same scene.
 """
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +26,9 @@ from warpshadow.spheres import Spheres
 
 GROUND_SIZE = 10.0  # scene units; a body is about one
 SKY_HEIGHT = 64  # rows
-FOV_Y = 40.0  # degrees
+
+Range = tuple[float, float]
+"""The least and the largest of what is drawn evenly between them; the same twice for what is always the same."""
 
 
 @functools.cache
@@ -56,6 +60,93 @@ def _creased(name: str, shape) -> Mesh:
     return Mesh(np.stack([x, z, -y], axis=1), np.asarray(parted.faces), name=name)
 
 
+@dataclass(frozen=True)
+class Ranges:
+    """What the numbers of random scenes are drawn from.
+
+    Args:
+        count: Number of bodies on the ground.
+        size: Longest edge of a body's bounds before it is turned [scene units].
+        upright: Part of the bodies that are turned about the vertical alone; the others lie in any way.
+        gap: How far apart bodies stand, 1 where those two whose bounds are widest could just touch.
+        albedo: Reflectance of a body without a texture, in each of red, green and blue.
+        ground_albedo: Reflectance of the ground, which is gray.
+        rotation: How far a given map is turned about the vertical [degrees].
+        scale: What the light is multiplied by; drawn evenly in its logarithm.
+        fov_y: Vertical field of view [degrees].
+        elevation: Of the camera above the ground [degrees].
+        distance: Of the camera, 1 where a ball around all bodies just fills the image.
+    """
+
+    count: tuple[int, int] = (1, 3)
+    size: Range = (0.8, 1.4)
+    upright: float = 0.5
+    gap: Range = (1.0, 1.3)
+    albedo: Range = (0.15, 0.9)
+    ground_albedo: Range = (0.4, 0.6)
+    rotation: Range = (0.0, 360.0)
+    scale: Range = (0.25, 4.0)
+    fov_y: Range = (40.0, 40.0)
+    elevation: Range = (20.0, 55.0)
+    distance: Range = (0.9, 1.2)
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            if each.name != "upright":
+                object.__setattr__(self, each.name, _checked_range(each.name, getattr(self, each.name)))
+        if not (check.is_number(self.upright) and 0 <= self.upright <= 1):
+            raise ValueError(f"upright: got {check.described(self.upright)}, expected a part of all, from 0 to 1")
+
+
+_LIMITS: dict[str, tuple[float, float]] = {
+    "count": (1, 6),
+    "size": (0.01, 1.5),
+    "gap": (1.0, 1.5),
+    "albedo": (0.0, 1.0),
+    "ground_albedo": (0.0, 1.0),
+    "rotation": (-check.LARGEST, check.LARGEST),
+    "scale": (1e-9, 1e9),
+    "fov_y": (1.0, 120.0),
+    "elevation": (1.0, 89.0),
+    "distance": (0.5, 100.0),
+}
+"""Between what the ends of each range may be; all bodies stand on the ground, which is ``GROUND_SIZE`` wide."""
+
+
+def _checked_range(name: str, value: object) -> tuple[float, float]:
+    least, most = _LIMITS[name]
+    is_whole = name == "count"
+    expected = f"two {'whole ' * is_whole}numbers from {least:g} to {most:g}, the lesser first"
+    ends = check.numbers(name, value, expected=expected, dtype=np.float64)
+    is_range = ends.shape == (2,) and least <= ends[0] <= ends[1] <= most
+    if not is_range or (is_whole and (ends % 1).any()):
+        raise ValueError(f"{name}: got {check.described(value)}, expected {expected}")
+    low, high = ends.tolist()
+    return (int(low), int(high)) if is_whole else (low, high)
+
+
+class DrawnLight(NamedTuple):
+    """What became of one of the maps that are given."""
+
+    number: int
+    """Which one, from 0."""
+    rotation: float
+    """How far it is turned about +y [degrees]."""
+    scale: float
+    """What its radiance is multiplied by."""
+
+
+class Drawn(NamedTuple):
+    """A scene, and what it was made of."""
+
+    scene: Scene
+    """The bodies, of which the last one is the ground, light and camera."""
+    prototypes: tuple[int, ...]
+    """Which of the given bodies each is, from 0; that of the ground is left out."""
+    light: DrawnLight | None
+    """None where maps are not given."""
+
+
 @dataclass(frozen=True, eq=False)
 class RandomScenes:
     """A data set of random scenes, which indexing draws; torch's samplers and loaders take it as it is.
@@ -65,9 +156,13 @@ class RandomScenes:
         count: Number of scenes; scene ``index`` is the same whatever the count.
         size: Width and height of the images [pixels].
         bodies: What bodies are drawn from; they get new poses, sizes and, if they have no texture, colors.
-            Bodies of one's own: ``[Body(load_mesh("bunny.obj"), blockers=32)]``.
+            Bodies of one's own: ``[Body(load_mesh("bunny.obj"), blockers=32)]``. Like maps, a sequence that may read
+            them when they are asked for.
         visibility: How visibility is computed.
         supersampling: As of a :class:`warpshadow.Scene`.
+        maps: Light to draw from, turned and scaled; by default skies and lamps that are drawn, too.
+        ranges: What numbers are drawn from.
+        bounces: As of a :class:`warpshadow.Scene`.
     """
 
     seed: int = 0
@@ -76,13 +171,16 @@ class RandomScenes:
     bodies: Sequence[Body] = field(default_factory=primitives, repr=False)
     visibility: Visibility = field(default_factory=Visibility)
     supersampling: int = 2
+    maps: Sequence[EnvironmentMap] | None = field(default=None, repr=False)
+    ranges: Ranges = Ranges()
+    bounces: int = 0
 
     def __post_init__(self) -> None:
         check.whole("seed", self.seed, least=0)
         check.whole("count", self.count, least=0)
-        object.__setattr__(self, "bodies", tuple(self.bodies))
-        if not self.bodies:
-            raise ValueError("bodies: got none, expected one or more to draw from")
+        for name, given in (("bodies", self.bodies), ("maps", self.maps)):
+            if given is not None and not len(given):
+                raise ValueError(f"{name}: got none, expected one or more to draw from")
 
     def __len__(self) -> int:
         """Number of scenes."""
@@ -97,49 +195,65 @@ class RandomScenes:
         Raises:
             IndexError: for a number out of range.
         """
+        return self.draw(index).scene
+
+    def draw(self, index: int) -> Drawn:
+        """Draw a scene, as indexing does, and say what it was made of."""
         if not -self.count <= index < self.count:
             raise IndexError(f"index: got {index}, expected a scene from 0 to {self.count - 1}")
         rng = np.random.default_rng([self.seed, index % self.count])
-        bodies = _random_bodies(rng, self.bodies)
-        ground = Body(plane(GROUND_SIZE, 1), albedo=np.full(3, rng.uniform(0.4, 0.6)), blockers=1, receivers="pixel")
-        return Scene(
-            (*bodies, ground),
-            random_light(rng),
-            _random_camera(rng, bodies, self.size),
-            self.visibility,
-            self.supersampling,
-        )
+        ranges = self.ranges
+        bodies, prototypes = _random_bodies(rng, self.bodies, ranges)
+        gray = np.full(3, _drawn(rng, ranges.ground_albedo))
+        ground = Body(plane(GROUND_SIZE, 1), albedo=gray, blockers=1, receivers="pixel")
+        if self.maps is None:
+            light, drawn = random_light(rng, ranges.scale), None
+        else:
+            light, drawn = _turned_map(rng, self.maps, ranges)
+        camera = _random_camera(rng, bodies, self.size, ranges)
+        scene = Scene((*bodies, ground), light, camera, self.visibility, self.supersampling, self.bounces)
+        return Drawn(scene, prototypes, drawn)
+
+
+def _drawn(rng: np.random.Generator, between: Range) -> float:
+    low, high = between
+    return low if low == high else float(rng.uniform(low, high))
 
 
 # ------------------------------------------------------------------------------------------------- bodies
 
 
-def _random_bodies(rng: np.random.Generator, prototypes: Sequence[Body]) -> list[Body]:
-    """One to three bodies on the ground, in a ring in which none touches another."""
-    count = int(rng.integers(1, 4))
-    bodies = [_random_body(rng, prototypes) for _ in range(count)]
+def _random_bodies(
+    rng: np.random.Generator, prototypes: Sequence[Body], ranges: Ranges
+) -> tuple[list[Body], tuple[int, ...]]:
+    """Some bodies on the ground, in a ring in which none touches another; and which they are."""
+    least, most = ranges.count
+    count = int(rng.integers(least, most + 1))
+    bodies, chosen = zip(*(_random_body(rng, prototypes, ranges) for _ in range(count)), strict=True)
     widest = max(_footprint(body) for body in bodies)
-    ring = 0.0 if count == 1 else rng.uniform(1.0, 1.3) * widest / np.sin(np.pi / count)
+    ring = 0.0 if count == 1 else _drawn(rng, ranges.gap) * widest / np.sin(np.pi / count)
     angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count
     places = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
-    return [replace(body, translation=body.translation + place) for body, place in zip(bodies, places, strict=True)]
+    placed = zip(bodies, places, strict=True)
+    return [replace(body, translation=body.translation + place) for body, place in placed], chosen
 
 
-def _random_body(rng: np.random.Generator, prototypes: Sequence[Body]) -> Body:
-    """A body of a random size and color in the middle of the ground, upright half of the time."""
-    prototype = prototypes[int(rng.integers(len(prototypes)))]
-    axis = np.array([0.0, 1.0, 0.0]) if rng.random() < 0.5 else _random_direction(rng)
+def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: Ranges) -> tuple[Body, int]:
+    """A body of a random size and color in the middle of the ground, upright or lying in any way; and which it is."""
+    chosen = int(rng.integers(len(prototypes)))
+    prototype = prototypes[chosen]
+    axis = np.array([0.0, 1.0, 0.0]) if rng.random() < ranges.upright else _random_direction(rng)
     low, high = prototype.mesh.bounds
     body = replace(
         prototype,
-        albedo=rng.uniform(0.15, 0.9, 3),
+        albedo=rng.uniform(*ranges.albedo, 3),
         rotation=rng.uniform(0, 360) * axis,
         translation=np.zeros(3),
-        scale=rng.uniform(0.8, 1.4) / (high - low).max(),
+        scale=_drawn(rng, ranges.size) / (high - low).max(),
     )
     low, high = body.world_mesh().bounds
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    return replace(body, translation=-foot)
+    return replace(body, translation=-foot), chosen
 
 
 def _footprint(body: Body) -> float:
@@ -156,10 +270,23 @@ def _random_direction(rng: np.random.Generator) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- light
 
 
-def random_light(rng: np.random.Generator) -> EnvironmentMap:
+def random_light(rng: np.random.Generator, scale: Range = Ranges.scale) -> EnvironmentMap:
     """Draw light: half of the time a sky with a sun, else a few soft lights; up to four times brighter or darker."""
     draw = _random_sky if rng.random() < 0.5 else _random_lamps
-    return draw(rng).scaled(2 ** rng.uniform(-2, 2))
+    return draw(rng).scaled(_random_scale(rng, scale))
+
+
+def _turned_map(
+    rng: np.random.Generator, maps: Sequence[EnvironmentMap], ranges: Ranges
+) -> tuple[EnvironmentMap, DrawnLight]:
+    drawn = DrawnLight(int(rng.integers(len(maps))), _drawn(rng, ranges.rotation), _random_scale(rng, ranges.scale))
+    return maps[drawn.number].rotated(drawn.rotation).scaled(drawn.scale), drawn
+
+
+def _random_scale(rng: np.random.Generator, between: Range) -> float:
+    """A factor, as often half as large as twice."""
+    low, high = between
+    return float(2 ** _drawn(rng, (np.log2(low), np.log2(high))))
 
 
 def _random_sky(rng: np.random.Generator) -> EnvironmentMap:
@@ -190,14 +317,15 @@ def _random_tint(rng: np.random.Generator) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- camera
 
 
-def _random_camera(rng: np.random.Generator, bodies: Sequence[Body], size: tuple[int, int]) -> Camera:
+def _random_camera(rng: np.random.Generator, bodies: Sequence[Body], size: tuple[int, int], ranges: Ranges) -> Camera:
     """A camera above the ground that has all bodies in view, and some of their shadows."""
     low, high = np.transpose([body.world_mesh().bounds for body in bodies], (1, 0, 2))
     low, high = low.min(axis=0), high.max(axis=0)
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(20, 55))
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(_drawn(rng, ranges.elevation))
     away = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
     reach = np.linalg.norm(high - low) / 2
-    narrowest = FOV_Y * min(1.0, size[0] / size[1])
-    distance = rng.uniform(0.9, 1.2) * reach / np.sin(np.radians(narrowest / 2))
+    fov_y = _drawn(rng, ranges.fov_y)
+    narrowest = fov_y * min(1.0, size[0] / size[1])
+    distance = _drawn(rng, ranges.distance) * reach / np.sin(np.radians(narrowest / 2))
     middle = (low + high) / 2
-    return Camera.look_at(middle + distance * away, middle, fov_y=FOV_Y, size=size)
+    return Camera.look_at(middle + distance * away, middle, fov_y=fov_y, size=size)

@@ -1,0 +1,202 @@
+"""The scenes of a recipe, by their numbers, and which meshes and maps each split draws from."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Generic, NamedTuple, TypeVar
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.mesh_files import MESH_SUFFIXES
+from warpshadow.dataset.recipe import Recipe, RecipeError
+from warpshadow.device.progress import progress_bar
+from warpshadow.scene.random_scenes import Drawn, RandomScenes, primitives
+from warpshadow.scene.scene import AUTO, SPHERE_METHODS, Body
+from warpshadow.spheres import Spheres, fit_spheres
+
+Item = TypeVar("Item")
+
+_MAP_SUFFIXES = (".exr", ".hdr", ".pic")
+
+_KEPT_BODIES = 64
+_KEPT_MAPS = 16
+"""How many files a process keeps in memory; it reads others again when a scene has them."""
+
+_SAID_FAULTS = 10
+"""Files that an error names at most."""
+
+
+class Stock(NamedTuple):
+    """What a split draws from."""
+
+    meshes: tuple[str, ...]
+    """Names of files in the folder of meshes, or of simple shapes."""
+    maps: tuple[str, ...] | None
+    """Names of files in the folder of maps; None where light is drawn."""
+
+
+class DataSet:
+    """The scenes of a recipe. To make one reads each mesh and map once, and fits the spheres that are not fitted yet.
+
+    A mesh or map belongs to a split by a hash of the seed and of what is in it. So a copy under another name is in the
+    same split, and files that are added move no others. To send a data set to other processes is cheap: they read what
+    their scenes have.
+
+    Args:
+        recipe: What it consists of.
+        device: Where spheres are fitted and images rendered.
+        progress: Show progress where something takes longer than a second.
+
+    Attributes:
+        recipe: What it consists of.
+        device: Name of the device.
+        stocks: What each split draws from, by its name.
+        hashes: Of each mesh and map, by ``meshes`` and ``maps`` and then by names.
+
+    Raises:
+        RecipeError: for meshes and maps that cannot be used, all named, and for a split without any.
+    """
+
+    def __init__(self, recipe: Recipe, *, device: wp.DeviceLike = "cpu", progress: bool = True):
+        check.instance("recipe", recipe, Recipe, "a Recipe; load_recipe(path) reads one")
+        where = check.device("device", device)
+        self.recipe, self.device = recipe, str(where)
+        fits = recipe.visibility.method in (*SPHERE_METHODS, AUTO) or "spheres" in recipe.layers
+        self._read_mesh = functools.partial(_read_body, blockers=recipe.blockers, fits=fits, device=self.device)
+        self.hashes: dict[str, dict[str, str]] = {}
+        if recipe.meshes is None:
+            self.hashes["meshes"] = {body.called: body.mesh.content_hash for body in primitives()}
+            self._primitives = [_fitted(body, self.device) if fits else body for body in primitives()]
+        else:
+            self.hashes["meshes"] = _hashes(
+                recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: self._read_mesh(path).mesh.content_hash, progress
+            )
+        if recipe.maps is not None:
+            self.hashes["maps"] = _hashes(
+                recipe.maps, "maps", _MAP_SUFFIXES, lambda path: _read_map(path).content_hash, progress
+            )
+        self.stocks = {split: self._stock(split) for split in recipe.splits}
+
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{split} {len(self.numbers(split))}" for split in self.recipe.splits)
+        return f"DataSet({splits} images of {self.recipe.size[0]} × {self.recipe.size[1]})"
+
+    def _stock(self, split: str) -> Stock:
+        """What a split draws from; RecipeError where that is nothing."""
+        names = {}
+        for kind, hashes in self.hashes.items():
+            owners = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
+            names[kind] = tuple(name for name, owner in owners.items() if owner == split)
+            if not names[kind] and self.numbers(split):
+                counts = ", ".join(f"{each} {list(owners.values()).count(each)}" for each in self.recipe.splits)
+                raise RecipeError(
+                    f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
+                    "another seed, a larger part, or more files"
+                )
+        return Stock(names["meshes"], names.get("maps"))
+
+    def numbers(self, split: str) -> range:
+        """Numbers of the images of a split; those of all splits follow each other."""
+        check.choice("split", split, self.recipe.splits)
+        ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
+        starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *ends]), strict=True))
+        return range(*starts[split])
+
+    def split_of(self, number: int) -> str:
+        """The split of an image, by its number."""
+        check.index("number", number, self.recipe.images, "image")
+        return next(split for split in self.recipe.splits if number in self.numbers(split))
+
+    def scenes(self, split: str) -> RandomScenes:
+        """The scenes of a split, by the numbers of their images: ``scenes(split)[number]``."""
+        recipe, stock = self.recipe, self.stocks[split]
+        bodies: Sequence[Body]
+        if recipe.meshes is None:
+            bodies = [body for body in self._primitives if body.called in stock.meshes]
+        else:
+            bodies = _ReadWhenAsked(recipe.meshes, stock.meshes, self._read_mesh)
+        maps = None if recipe.maps is None else _ReadWhenAsked(recipe.maps, stock.maps or (), _read_map)
+        given = recipe.visibility, recipe.supersampling, maps, recipe.ranges, recipe.bounces
+        return RandomScenes(recipe.seed, recipe.images, recipe.size, bodies, *given)
+
+    def draw(self, number: int) -> Drawn:
+        """Draw the scene of an image."""
+        return self.scenes(self.split_of(number)).draw(number)
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return self.recipe.images
+
+
+def _split_of(recipe: Recipe, content: str) -> str:
+    """The split that what has this hash belongs to."""
+    place = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
+    ends = itertools.accumulate(recipe.splits.values())
+    return next((split for split, end in zip(recipe.splits, ends, strict=True) if place < end), [*recipe.splits][-1])
+
+
+# ---------------------------------------------------------------------------------------------- files
+
+
+class _ReadWhenAsked(Sequence[Item], Generic[Item]):
+    """What is in files of a folder."""
+
+    def __init__(self, folder: Path, names: Sequence[str], read: Callable[[Path], Item]):
+        self._folder, self._names, self._read = folder, names, read
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, place):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is to be said of a file was said when the data set was made
+            return self._read(self._folder / self._names[place])
+
+
+@functools.lru_cache(_KEPT_BODIES)
+def _read_body(path: Path, blockers: int, fits: bool, device: str) -> Body:
+    body = Body(path, blockers=blockers)
+    return _fitted(body, device) if fits else body
+
+
+def _fitted(body: Body, device: str) -> Body:
+    """The body with its spheres; but in place of those of a flat one, what it blocks is found by how it lies."""
+    if isinstance(body.blockers, Spheres) or body.mesh.is_flat:
+        return body
+    return replace(body, blockers=fit_spheres(body.mesh, body.blockers, device=device).spheres)
+
+
+@functools.lru_cache(_KEPT_MAPS)
+def _read_map(path: Path) -> EnvironmentMap:
+    return EnvironmentMap.read(path)
+
+
+def _hashes(
+    folder: Path, what: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
+) -> dict[str, str]:
+    """Hashes of what is in the files below a folder, by their names in it; RecipeError names all faults."""
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    if not paths:
+        raise RecipeError(f"{what}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
+    hashes, faults = {}, []
+    with progress_bar(len(paths), f"reading {what}", "file", wanted=progress) as bar:
+        for path in paths:
+            try:
+                with check.located(str(path)):
+                    hashes[path.relative_to(folder).as_posix()] = hash_of(path)
+            except (ValueError, OSError) as fault:
+                faults.append(str(fault).replace(f"{path}: mesh: {path}: ", f"{path}: "))
+            bar.update()
+    if faults:
+        more = f"\nand {len(faults) - _SAID_FAULTS} more" * (len(faults) > _SAID_FAULTS)
+        said = "\n".join(faults[:_SAID_FAULTS])
+        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{said}{more}")
+    return hashes

@@ -1,0 +1,173 @@
+"""Recipes: TOML that says what a data set consists of, checked key by key (README.md lists the keys)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+from warpshadow import check
+from warpshadow.check import AnyPath
+from warpshadow.scene import toml_tables
+from warpshadow.scene.random_scenes import Ranges
+from warpshadow.scene.scene import Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.toml_tables import Table
+
+LAYERS = ("color", "shadow", "depth", "normals", "bodies", "masks", "spheres", "light")
+"""What may be written of each scene."""
+
+_KEYS = {
+    "bodies": ("meshes", "blockers", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
+    "light": ("maps", "rotation", "scale", "bounces"),
+    "camera": ("size", "supersampling", "fov_y", "elevation", "distance"),
+    "visibility": None,
+    "splits": None,
+}
+"""The tables of a recipe and their keys, but where others know these."""
+
+
+class RecipeError(ValueError):
+    """A recipe that cannot be used: the message says where and what is accepted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """What a data set consists of.
+
+    Args:
+        images: Number of images in all splits together.
+        seed: Number of the data set, 0 or more.
+        shard: Images in a shard; the last one of a split has fewer.
+        layers: What is written of each scene: some of ``LAYERS``.
+        splits: Part of the images, and about that part of the meshes and maps, by the name of the split; their sum
+            is 1.
+        meshes: Folder of meshes, those in its folders, too; None for simple shapes.
+        blockers: Spheres that are fitted to each mesh of the folder.
+        maps: Folder of environment maps; None for skies and lamps that are drawn.
+        size: Width and height of the images [pixels].
+        ranges: What poses, colors, light and cameras are drawn from.
+        visibility, supersampling, bounces: As of a :class:`warpshadow.Scene`.
+    """
+
+    images: int
+    seed: int = 0
+    shard: int = 200
+    layers: tuple[str, ...] = ("color", "shadow", "depth", "normals")
+    splits: Mapping[str, float] = field(default_factory=lambda: {"train": 1.0})
+    meshes: Path | None = None
+    blockers: int = 64
+    maps: Path | None = None
+    size: tuple[int, int] = (128, 128)
+    ranges: Ranges = Ranges()
+    visibility: Visibility = field(default_factory=Visibility)
+    supersampling: int = Scene.supersampling
+    bounces: int = 0
+
+    def __post_init__(self) -> None:
+        check.whole("images", self.images)
+        check.whole("seed", self.seed, least=0)
+        check.whole("shard", self.shard, what="images")
+        check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, LAYERS))}")
+        for layer in self.layers:
+            check.choice("layers", layer, LAYERS)
+        if not self.layers or len(set(self.layers)) < len(self.layers):
+            raise ValueError(f"layers: got {check.described(self.layers)}, expected one or more, each once")
+        object.__setattr__(self, "layers", tuple(self.layers))
+        object.__setattr__(self, "splits", _checked_splits(self.splits))
+        check.whole("blockers", self.blockers, least=0)
+        object.__setattr__(self, "size", check.image_size(self.size))
+        check_supersampling(self.supersampling)
+        check_bounces(self.bounces)
+
+    def plain(self) -> Table:
+        """All that decides the bits of the images but the files' contents, as numbers, text, lists and tables."""
+        plain = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("meshes", "maps")}
+        parts = {"ranges": vars(self.ranges), "visibility": vars(self.visibility), "splits": dict(self.splits)}
+        return plain | parts
+
+
+def _checked_splits(splits: object) -> dict[str, float]:
+    check.instance("splits", splits, Mapping, "parts by names, such as train = 0.8, val = 0.2")
+    parts = {}
+    for name, part in splits.items():  # type: ignore[attr-defined]
+        if not (isinstance(name, str) and name.isidentifier()):
+            raise ValueError(f"splits: got the name {name!r}, expected letters, digits and _ alone")
+        if not (check.is_number(part) and 0 < part <= 1):
+            raise ValueError(f"{name}: got {check.described(part)}, expected a part of all images, above 0 up to 1")
+        parts[name] = float(part)
+    total = math.fsum(parts.values())
+    if abs(total - 1) > 1e-6:
+        raise ValueError(f"splits: got parts with the sum {total:g}, expected 1")
+    return parts
+
+
+def load_recipe(path: AnyPath) -> Recipe:
+    """Read a recipe.
+
+    Args:
+        path: A TOML file; paths in it are relative to it. README.md lists its keys.
+
+    Raises:
+        RecipeError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
+        FileNotFoundError: for a file or folder that is not there.
+    """
+    path = check.path("path", path)
+    with check.located(str(path), RecipeError):
+        return _recipe(toml_tables.read(path, "recipe"), path.parent)
+
+
+def _recipe(given: Table, folder: Path) -> Recipe:
+    plain = ("images", "seed", "shard", "layers")
+    check.known_keys("the recipe", given, (*plain, *_KEYS))
+    tables = {name: _table(given, name) for name in _KEYS}
+    found: Table = {key: given[key] for key in plain if key in given}
+    bodies, light, camera = (dict(tables[name]) for name in ("bodies", "light", "camera"))
+    with check.located("[bodies]"):
+        if "meshes" in bodies:
+            found["meshes"] = _folder(bodies, "meshes", folder)
+        elif "blockers" in bodies:
+            raise ValueError("blockers: got it without meshes, to which they are fitted")
+        found |= {key: bodies.pop(key) for key in ("blockers",) if key in bodies}
+        if "blockers" in found:
+            check.whole("blockers", found["blockers"], least=0)
+        ranges = replace(Ranges(), **bodies)
+    with check.located("[light]"):
+        if "maps" in light:
+            found["maps"] = _folder(light, "maps", folder)
+        elif "rotation" in light:
+            raise ValueError("rotation: got it without maps, which it turns")
+        found |= {key: light.pop(key) for key in ("bounces",) if key in light}
+        check_bounces(found.get("bounces", 0))
+        ranges = replace(ranges, **light)
+    with check.located("[camera]"):
+        found |= {key: camera.pop(key) for key in ("size", "supersampling") if key in camera}
+        check.image_size(found.get("size", Recipe.size))
+        check_supersampling(found.get("supersampling", Recipe.supersampling))
+        found["ranges"] = replace(ranges, **camera)
+    with check.located("[visibility]"):
+        found["visibility"] = Visibility.of(tables["visibility"])
+    if "splits" in given:
+        with check.located("[splits]"):
+            found["splits"] = _checked_splits(tables["splits"])
+    return toml_tables.make(Recipe, found)
+
+
+def _table(given: Table, name: str) -> Table:
+    with check.located(f"[{name}]"):
+        table: Table = given.get(name, {})
+        toml_tables.check_table(table)
+        known = _KEYS[name]
+        if known is not None:
+            check.known_keys("key", table, known)
+        return table
+
+
+def _folder(table: Table, key: str, folder: Path) -> Path:
+    """Take the path of a folder that is there out of a table."""
+    value = table.pop(key)
+    if not isinstance(value, str):
+        raise ValueError(f"{key}: got {check.described(value)}, expected the name of a folder")
+    if not (folder / value).is_dir():
+        raise FileNotFoundError(f"{key}: no such folder: {folder / value}")
+    return folder / value

@@ -1,0 +1,150 @@
+"""Shards: plain .tar files of samples, in the format of WebDataset, each written once, whole, with the same bits."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from warpshadow import check
+from warpshadow.assets import files
+from warpshadow.check import AnyPath
+from warpshadow.dataset.data_set import DataSet
+from warpshadow.dataset.samples import Plain, render_sample
+from warpshadow.device.progress import progress_bar
+
+INDEX = "dataset.json"
+"""The file beside the shards that says what they hold."""
+
+
+class Shard(NamedTuple):
+    """A .tar file of a data set."""
+
+    name: str
+    """Of the file: its split, and its number in that."""
+    numbers: range
+    """Of its images."""
+
+
+def shards_of(data_set: DataSet) -> list[Shard]:
+    """The shards of a data set, split by split."""
+    shards = []
+    for split in data_set.recipe.splits:
+        numbers, length = data_set.numbers(split), data_set.recipe.shard
+        parts = [numbers[start : start + length] for start in range(0, len(numbers), length)]
+        shards += [Shard(f"{split}-{place:06d}.tar", part) for place, part in enumerate(parts)]
+    return shards
+
+
+def write_shards(data_set: DataSet, folder: AnyPath, *, progress: bool = True) -> list[Path]:
+    """Render the images of a data set into shards, those that are not there yet.
+
+    A shard has a temporary name until it is whole. So what was interrupted goes on, at the shards that were begun.
+
+    Args:
+        data_set: What is drawn.
+        folder: Made if it is not there. It gets the shards and ``dataset.json``, which says what they hold.
+        progress: Show progress.
+
+    Returns:
+        The shards, also those that were there.
+
+    Raises:
+        FileExistsError: for a folder of another data set, and for one into which another process writes.
+    """
+    check.instance("data_set", data_set, DataSet, "a DataSet, as DataSet(load_recipe(path)) makes one")
+    folder = check.path("folder", folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    shards = shards_of(data_set)
+    with _held(folder):
+        _begin(folder, describe(data_set))
+        missing = [shard for shard in shards if not (folder / shard.name).exists()]
+        images = sum(len(shard.numbers) for shard in missing)
+        with progress_bar(images, "rendering", "image", wanted=progress) as bar:
+            for shard in missing:
+                for _ in write_shard(data_set, shard, folder):
+                    bar.update()
+    return [folder / shard.name for shard in shards]
+
+
+def write_shard(data_set: DataSet, shard: Shard, folder: Path) -> Iterator[int]:
+    """Render and write a shard, and give the number of each image that is rendered."""
+    with (
+        files.whole(folder / shard.name) as unfinished,
+        tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
+    ):
+        for number in shard.numbers:
+            for ending, content in sorted(render_sample(data_set, number).items()):
+                member = tarfile.TarInfo(f"{number:09d}.{ending}")  # of no user, and of 1970, so of the same bits
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+            yield number
+
+
+# ---------------------------------------------------------------------------------------------- the folder
+
+
+def describe(data_set: DataSet) -> dict[str, Plain]:
+    """What decides the bits of all shards, and what they hold, as ``dataset.json`` has it."""
+    shards = shards_of(data_set)
+    splits: dict[str, Plain] = {}
+    for split, (meshes, maps) in data_set.stocks.items():
+        numbers = data_set.numbers(split)
+        names: list[Plain] = [shard.name for shard in shards if shard.numbers[0] in numbers]
+        splits[split] = {
+            "images": len(numbers),
+            "shards": names,
+            "meshes": list(meshes),
+            "maps": None if maps is None else list(maps),
+        }
+    about = {"recipe": data_set.recipe.plain(), "splits": splits, "hashes": data_set.hashes}
+    plain: dict[str, Plain] = json.loads(json.dumps(about))
+    return plain
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold a folder against other processes."""
+    from filelock import Timeout
+
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(files.locked(folder / INDEX, timeout=0))
+        except Timeout as error:
+            raise FileExistsError(f"{folder}: another process writes into this folder") from error
+        yield
+
+
+def _begin(folder: Path, about: dict[str, Plain]) -> None:
+    """Write the index, or compare it; clear away what was interrupted."""
+    path = folder / INDEX
+    if path.exists():
+        with check.located(str(path)):
+            found = json.loads(path.read_text("utf-8"))
+        if difference := _difference(found, about):
+            raise FileExistsError(
+                f"{folder}: got shards of another data set ({difference}), expected those of this one, or a new folder"
+            )
+    else:
+        if others := sorted(each.name for each in folder.iterdir() if not each.name.startswith(".")):
+            raise FileExistsError(f"{folder}: got a folder with {others[0]} in it, expected a new one or one of shards")
+        with files.whole(path) as unfinished:
+            unfinished.write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
+    for unfinished in folder.glob(".*.unfinished.tar"):
+        unfinished.unlink(missing_ok=True)
+
+
+def _difference(found: Plain, wanted: Plain, where: str = "") -> str:
+    """The first difference of two indices, in words; nothing if there is none."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in [*wanted, *(key for key in found if key not in wanted)]:
+            if key not in found or key not in wanted:
+                return f"{where}{key} is {'new' if key in wanted else 'gone'}"
+            if difference := _difference(found[key], wanted[key], f"{where}{key}: "):
+                return difference
+        return ""
+    return "" if found == wanted else f"{where}was {check.described(found)}, is {check.described(wanted)}"
