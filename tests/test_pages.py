@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 import warpshadow as ws
 from warpshadow.cli import app
+from warpshadow.dataset import Recipe, load_recipe
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import renderer as pipeline_renderer
@@ -215,6 +216,19 @@ def test_the_fit_files_are_some(folder):
     for text in (fit, re.sub(r"^stages = .*\n", "", fit, flags=re.MULTILINE) + stages):
         Path("fit.toml").write_text(text, "utf-8")
         assert load_fit("fit.toml").problem.free
+
+
+def test_the_recipe_is_one(folder):
+    """Of the defaults, but for its folders and splits."""
+    (recipe,) = blocks(ROOT / "warpshadow" / "dataset" / "README.md", "toml")
+    Path("recipe.toml").write_text(recipe, "utf-8")
+    for name in ("meshes", "maps"):
+        Path(name).mkdir()
+    loaded = load_recipe("recipe.toml")
+    assert set(loaded.splits) == {"train", "val", "test"} and loaded.meshes and loaded.maps
+    plain = Recipe(2000)
+    for name in ("seed", "shard", "layers", "blockers", "size", "ranges", "supersampling", "bounces"):
+        assert getattr(loaded, name) == getattr(plain, name), name
 
 
 def test_the_stage_that_a_page_adds_has_an_adjoint(tmp_path, monkeypatch):

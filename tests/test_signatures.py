@@ -17,12 +17,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".mypy_cache" / "users"
 
-FACADES = ("warpshadow", "warpshadow.torch", "warpshadow.inverse", "warpshadow.stages")
+FACADES = ("warpshadow", "warpshadow.torch", "warpshadow.inverse", "warpshadow.dataset", "warpshadow.stages")
 
 OTHERS = {
     "warpshadow.device.cuda_graph": ("Captured", "with_gradients"),
     "warpshadow.device.tape": ("recorded",),
-    "warpshadow.scene.random_scenes": ("RandomScenes",),
+    "warpshadow.scene.random_scenes": ("RandomScenes", "Ranges"),
 }
 """Public names of modules that are not public as a whole."""
 

@@ -501,6 +501,38 @@ def _has_checkpoint(folder: Path) -> bool:
 
 
 @app.command()
+def dataset(
+    recipe: Annotated[Path, typer.Argument(help="Recipe, TOML; warpshadow/dataset/README.md lists its keys.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the shards; what was interrupted there goes on.")
+    ],
+    workers: Annotated[
+        Optional[int], typer.Option(help="Processes that render; by default one a core, on a GPU one.", min=1)
+    ] = None,
+    device: Device = "cpu",
+    is_quiet: Quiet = False,
+) -> None:
+    """Draw random scenes and write their images, with depth, shadows and more, in shards to train networks from.
+
+    Run again, it writes the shards that are missing. The bits are the same for any number of workers.
+    """
+    from warpshadow.dataset import DataSet, load_recipe, write_shards
+
+    with _clear_errors():
+        loaded = load_recipe(recipe)
+        data_set = DataSet(loaded, device=_device(device))
+        start = time.perf_counter()
+        try:
+            shards = write_shards(data_set, output, workers=workers)
+        except KeyboardInterrupt as error:
+            typer.secho(f"interrupted; the same command goes on in {output}", fg="yellow", err=True)
+            raise typer.Exit(INTERRUPTED) from error
+        size = sum(shard.stat().st_size for shard in shards)
+        seconds = time.perf_counter() - start
+        _note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {seconds:.0f} s", is_quiet)
+
+
+@app.command()
 def spheres(
     mesh: Annotated[Path, typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .gltf or .usd.")],
     count: Annotated[Optional[int], typer.Option(help="Number of spheres; 64 by default.", min=1)] = None,

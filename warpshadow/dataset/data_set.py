@@ -69,6 +69,8 @@ class DataSet:
         check.instance("recipe", recipe, Recipe, "a Recipe; load_recipe(path) reads one")
         where = check.device("device", device)
         self.recipe, self.device = recipe, str(where)
+        for kept in (_read_body, _read_map):
+            kept.cache_clear()  # of files as they were
         fits = recipe.visibility.method in (*SPHERE_METHODS, AUTO) or "spheres" in recipe.layers
         self._read_mesh = functools.partial(_read_body, blockers=recipe.blockers, fits=fits, device=self.device)
         self.hashes: dict[str, dict[str, str]] = {}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import TypeAlias
 
 from warpshadow import check
 from warpshadow.check import AnyPath
@@ -13,6 +15,9 @@ from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
 from warpshadow.scene.scene import Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
+
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
+"""What JSON has."""
 
 LAYERS = ("color", "shadow", "depth", "normals", "bodies", "masks", "spheres", "light")
 """What may be written of each scene."""
@@ -80,11 +85,12 @@ class Recipe:
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
 
-    def plain(self) -> Table:
-        """All that decides the bits of the images but the files' contents, as numbers, text, lists and tables."""
-        plain = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("meshes", "maps")}
-        parts = {"ranges": vars(self.ranges), "visibility": vars(self.visibility), "splits": dict(self.splits)}
-        return plain | parts
+    def plain(self) -> dict[str, Plain]:
+        """All that decides the bits of the images but the files' contents, as JSON has it."""
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("meshes", "maps")}
+        tables = {"ranges": vars(self.ranges), "visibility": vars(self.visibility), "splits": dict(self.splits)}
+        plain: dict[str, Plain] = json.loads(json.dumps(given | tables))
+        return plain
 
 
 def _checked_splits(splits: object) -> dict[str, float]:

@@ -16,7 +16,7 @@ import json
 import tarfile
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -26,6 +26,7 @@ from warpshadow.assets.image import exr_bytes, exr_channels
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
+from warpshadow.dataset.recipe import Plain
 from warpshadow.device.tape import unrecorded
 from warpshadow.scene.files import camera_table
 from warpshadow.scene.random_scenes import Drawn
@@ -37,9 +38,6 @@ LIGHT_ORDER = 4
 """Bands of the coefficients that a sample has of its light."""
 
 _WHITE = (1.0, 1.0, 1.0)
-
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
-"""What JSON has."""
 
 
 class Sample(NamedTuple):
@@ -145,7 +143,7 @@ def _about(data_set: DataSet, number: int, drawn: Drawn) -> dict[str, Plain]:
         turned = {"rotation": drawn.light.rotation, "scale": drawn.light.scale}
         light |= {"map": stock.maps[drawn.light.number], **turned}
     if "light" in recipe.layers and isinstance(scene.light, EnvironmentMap):
-        light["sh"] = scene.light.sh(LIGHT_ORDER).astype(np.float64).tolist()
+        light["sh"] = _numbers(scene.light.sh(LIGHT_ORDER))
     return {
         "number": number,
         "split": split,
@@ -156,9 +154,14 @@ def _about(data_set: DataSet, number: int, drawn: Drawn) -> dict[str, Plain]:
 
 
 def _placed(body: Body, mesh: str) -> dict[str, Plain]:
-    albedo = None if body.texture is not None else np.asarray(body.albedo, np.float64).tolist()
+    albedo = None if body.texture is not None else _numbers(body.albedo)
     place = {"rotation": body.rotation.tolist(), "translation": body.translation.tolist(), "scale": float(body.scale)}
     return {"mesh": mesh, "albedo": albedo, **place}
+
+
+def _numbers(values: np.ndarray) -> Plain:
+    """The shortest numbers that read back as the same float32."""
+    return [_numbers(row) for row in values] if values.ndim else float(str(values))
 
 
 # ---------------------------------------------------------------------------------------------- reading

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +15,11 @@ from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
-from warpshadow.dataset.samples import Plain, render_sample
+from warpshadow.dataset.recipe import Plain
+from warpshadow.dataset.samples import render_sample
+from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import progress_bar
+from warpshadow.device.workers import run_tasks
 
 INDEX = "dataset.json"
 """The file beside the shards that says what they hold."""
@@ -40,14 +44,18 @@ def shards_of(data_set: DataSet) -> list[Shard]:
     return shards
 
 
-def write_shards(data_set: DataSet, folder: AnyPath, *, progress: bool = True) -> list[Path]:
-    """Render the images of a data set into shards, those that are not there yet.
+def write_shards(
+    data_set: DataSet, folder: AnyPath, *, workers: int | None = None, progress: bool = True
+) -> list[Path]:
+    """Render the images of a data set into shards, those that are not there yet; bits are the same for any workers.
 
     A shard has a temporary name until it is whole. So what was interrupted goes on, at the shards that were begun.
 
     Args:
         data_set: What is drawn.
         folder: Made if it is not there. It gets the shards and ``dataset.json``, which says what they hold.
+        workers: Processes that render, which share the threads; by default one for each thread, on a GPU one. 1 is this
+            process, on all threads.
         progress: Show progress.
 
     Returns:
@@ -55,6 +63,7 @@ def write_shards(data_set: DataSet, folder: AnyPath, *, progress: bool = True) -
 
     Raises:
         FileExistsError: for a folder of another data set, and for one into which another process writes.
+        ChildProcessError: for an image that a worker could not render; what was written before stays.
     """
     check.instance("data_set", data_set, DataSet, "a DataSet, as DataSet(load_recipe(path)) makes one")
     folder = check.path("folder", folder)
@@ -63,26 +72,52 @@ def write_shards(data_set: DataSet, folder: AnyPath, *, progress: bool = True) -
     with _held(folder):
         _begin(folder, describe(data_set))
         missing = [shard for shard in shards if not (folder / shard.name).exists()]
-        images = sum(len(shard.numbers) for shard in missing)
-        with progress_bar(images, "rendering", "image", wanted=progress) as bar:
+        numbers = [number for shard in missing for number in shard.numbers]
+        rendered = _rendered(data_set, numbers, _worker_count(data_set, workers))
+        with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", wanted=progress) as bar:
             for shard in missing:
-                for _ in write_shard(data_set, shard, folder):
-                    bar.update()
+                with _new_archive(folder / shard.name) as archive:
+                    for number in shard.numbers:
+                        _add(archive, number, next(rendered))
+                        bar.update()
     return [folder / shard.name for shard in shards]
 
 
-def write_shard(data_set: DataSet, shard: Shard, folder: Path) -> Iterator[int]:
-    """Render and write a shard, and give the number of each image that is rendered."""
-    with (
-        files.whole(folder / shard.name) as unfinished,
-        tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
-    ):
-        for number in shard.numbers:
-            for ending, content in sorted(render_sample(data_set, number).items()):
-                member = tarfile.TarInfo(f"{number:09d}.{ending}")  # of no user, and of 1970, so of the same bits
-                member.size = len(content)
-                tar.addfile(member, io.BytesIO(content))
-            yield number
+def _worker_count(data_set: DataSet, workers: int | None) -> int:
+    if workers is not None:
+        return check.whole("workers", workers, what="processes")
+    return thread_count() if data_set.device == "cpu" else 1
+
+
+def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[dict[str, bytes], None, None]:
+    """Render images, and give the files of each in the order of the numbers."""
+    render = functools.partial(render_sample, data_set)
+    if workers == 1:
+        yield from map(render, numbers)
+        return
+    early: dict[int, dict[str, bytes]] = {}
+    with contextlib.closing(run_tasks(render, numbers, workers=workers)) as ended:
+        for number in numbers:
+            while number not in early:
+                done, sample, error = next(ended)
+                if sample is None:
+                    raise ChildProcessError(f"image {done}: {error}") from error
+                early[done] = sample
+            yield early.pop(number)
+
+
+@contextlib.contextmanager
+def _new_archive(path: Path) -> Iterator[tarfile.TarFile]:
+    with files.whole(path) as unfinished, tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as archive:
+        yield archive
+
+
+def _add(archive: tarfile.TarFile, number: int, sample: dict[str, bytes]) -> None:
+    """Write the files of a sample."""
+    for ending, content in sorted(sample.items()):
+        member = tarfile.TarInfo(f"{number:09d}.{ending}")  # of no user, and of 1970: always the same bits
+        member.size = len(content)
+        archive.addfile(member, io.BytesIO(content))
 
 
 # ---------------------------------------------------------------------------------------------- the folder

@@ -13,7 +13,7 @@ import pickle
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from multiprocessing.connection import Connection, wait
 from typing import Generic, NamedTuple, TypeVar
 
@@ -69,7 +69,7 @@ class _Worker(Generic[Task, Result]):
 
 def run_tasks(
     function: Callable[[Task], Result], tasks: Iterable[Task], *, workers: int, threads: int | None = None
-) -> Iterator[Ended[Task, Result]]:
+) -> Generator[Ended[Task, Result], None, None]:
     """Do tasks in worker processes, which end with this one, however it ends.
 
     Args:
