@@ -156,6 +156,16 @@ def test_what_docstrings_refer_to_exists(file):
 # ------------------------------------------------------------------------------------------------ commands
 
 
+def test_extras_that_are_to_be_installed_exist_and_all_of_them_are_one():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    everyones = set(extras) - {"all", "dev"}
+    assert set(re.search(r"\[(.*)\]", extras["all"][0])[1].split(",")) == everyones
+    texts = [path.read_text("utf-8") for path in (*PAGES, *(ROOT / "warpshadow").rglob("*.py"))]
+    named = [match for text in texts for match in re.findall(r"pip install \"(?:warpshadow|\.)\[([\w,]+)\]", text)]
+    named += [match for text in texts for match in re.findall(r"missing\(.*\"(\w+)\"\)", text)]
+    assert len(named) > 5 and {extra for names in named for extra in names.split(",")} <= set(extras)
+
+
 @each_page_of_today
 def test_commands_and_their_options_exist(page):
     for text in code(page):

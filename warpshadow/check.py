@@ -410,6 +410,11 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
         raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")
 
 
+def missing(what: str, package: str, extra: str) -> str:
+    """What messages say where a package of one of our extras is not installed."""
+    return f'{what} needs the package {package}: pip install "warpshadow[{extra}]"'
+
+
 def _suggestion(value: object, choices: list) -> str:
     near = difflib.get_close_matches(str(value), map(str, choices), n=1, cutoff=0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -542,7 +542,7 @@ def test_the_meshes_that_come_with_warp_load(name, vertices, faces):
 
 def test_usd_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(ImportError, match="pip install usd-core"):
+    with pytest.raises(ImportError, match=r'USD needs the package usd-core: pip install "warpshadow\[usd\]"'):
         load_mesh(usd_quad(tmp_path))
 
 

@@ -97,5 +97,7 @@ def test_a_video_lasts_as_long_as_its_frames(tmp_path, suffix, fps):
 
 def test_without_ffmpeg_an_mp4_is_refused_and_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match="imageio-ffmpeg is not installed .the extra 'video'.; .gif and .webp"):
+    with pytest.raises(
+        ImportError, match=r'imageio-ffmpeg: pip install "warpshadow\[video\]"; .gif and .webp need none'
+    ):
         ws.write_video(tmp_path / "a.mp4", frames())

@@ -155,6 +155,6 @@ def test_the_losses_are_plotted_and_without_matplotlib_a_warning_says_why_not(tm
     assert tmp_path / "loss.png" in write_result(result, tmp_path)
     (tmp_path / "loss.png").unlink()
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.warns(UserWarning, match="matplotlib is not installed"):
+    with pytest.warns(UserWarning, match="not drawn, which needs the package matplotlib: pip install"):
         files = write_result(result, tmp_path)
     assert tmp_path / "loss.png" not in files and not (tmp_path / "loss.png").exists()

@@ -314,7 +314,7 @@ def _read_usd(path: Path) -> list[MeshPart]:
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
-        raise ImportError("USD needs the package usd-core: pip install usd-core") from None
+        raise ImportError(check.missing("USD", "usd-core", "usd")) from None
 
     stage = Usd.Stage.Open(str(path))
     time = Usd.TimeCode.EarliestTime()

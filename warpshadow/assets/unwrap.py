@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.topology import edge_neighbors
 
@@ -30,7 +31,7 @@ def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
     try:
         import xatlas
     except ImportError:
-        raise ImportError('unwrapping needs the package xatlas: pip install "warpshadow[unwrap]"') from None
+        raise ImportError(check.missing("unwrapping", "xatlas", "unwrap")) from None
 
     if not (isinstance(size, int) and isinstance(padding, int) and 0 <= padding < size):
         raise MeshError(f"size, padding: got {size} and {padding}, expected integers with 0 <= padding < size")

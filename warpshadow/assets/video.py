@@ -70,9 +70,8 @@ def check_video(path: Path, fps: float) -> None:
         try:
             import imageio_ffmpeg  # noqa: F401
         except ImportError as error:
-            raise ImportError(
-                f"{path}: imageio-ffmpeg is not installed (the extra 'video'); .gif and .webp need none"
-            ) from error
+            missing = check.missing("an .mp4 file", "imageio-ffmpeg", "video")
+            raise ImportError(f"{path}: {missing}; .gif and .webp need none") from error
 
 
 def _shown(frames: Iterable[Picture | np.ndarray]) -> Iterator[np.ndarray]:

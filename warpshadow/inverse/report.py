@@ -125,7 +125,7 @@ def plot_losses(result: Result, path: AnyPath) -> list[Path]:
     try:
         import matplotlib
     except ImportError:
-        check.warn(f"{path}: not drawn, since matplotlib is not installed (the extra 'plot')")
+        check.warn(check.missing(f"{path} is not drawn, which", "matplotlib", "plot"))
         return []
     matplotlib.use("agg")
     from matplotlib import pyplot

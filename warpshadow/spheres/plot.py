@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
@@ -15,7 +16,7 @@ def check_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError:
-        raise ImportError('a picture of spheres needs the package matplotlib: pip install "warpshadow[plot]"') from None
+        raise ImportError(check.missing("a picture of spheres", "matplotlib", "plot")) from None
 
 
 def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:

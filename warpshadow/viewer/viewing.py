@@ -88,7 +88,7 @@ def _viser() -> Iterator[None]:
     try:
         yield
     except ImportError as cause:
-        raise ImportError(f'the viewer needs viser ({cause}); pip install "warpshadow[viewer]"') from cause
+        raise ImportError(f"{check.missing('the viewer', 'viser', 'viewer')} ({cause})") from cause
 
 
 def view(
