@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.placement import misplacements
+from warpshadow.scene.placement import enclosures, misplacements
 
 LIGHT = np.ones((4, 3))
 GROUND = ws.Body(ws.plane(20.0, 2), name="ground", translation=(0, -1, 0))
@@ -88,6 +88,36 @@ def test_a_body_that_floats_or_lies_below_by_more_than_its_size_is_remarked_on(h
 )
 def test_a_body_without_a_ground_below_or_on_another_does_not_float(others):
     assert not misplacements(ws.Scene([ball(3.6), *others], LIGHT))
+
+
+def test_a_body_that_is_broader_than_the_ground_is_remarked_on():
+    large = ws.Body(ws.icosphere(150.0, 1), translation=(0, 150, 0), name="cow")
+    (remark,) = misplacements(ws.Scene([GROUND, large], LIGHT))
+    breadth = float(np.ptp(GROUND.world_points()[:, 0]))
+    assert re.match(rf"body 1 \('cow'\) is 300 broad, and body 0 \('ground'\) below it {breadth:.3g}; ", remark)
+    for ground in (ws.Body(ws.plane(400.0, 2)), ws.Body(ws.infinite_ground())):  # one of two is large enough
+        assert not misplacements(ws.Scene([GROUND, ground, large], LIGHT))
+
+
+def camera_at(*eye):
+    return ws.Camera.look_at(eye, (9, 9, 9), size=(8, 8))
+
+
+def test_a_camera_inside_a_body_is_remarked_on():
+    body = ws.Body(ws.icosphere(1.0, 2), rotation=(10, 20, 30), translation=(1, 2, 3), scale=4.0, name="cow")
+    scene = ws.Scene([GROUND, body], LIGHT)
+    outside, inside = camera_at(1, 2, 7.1), camera_at(1, 2, 6.8)
+    assert not enclosures(scene, [outside])
+    (remark,) = enclosures(scene, [outside, inside])
+    assert re.match(r"camera: its eye \(1, 2, 6.8\) is inside body 1 \('cow'\), which is 8 large; Camera.fr", remark)
+    corner = camera_at(3.6, 4.6, 5.6)  # within the bounds alone
+    assert not enclosures(scene, [corner])
+
+
+def test_a_room_is_not_around_its_camera():
+    outwards = ws.icosphere(1.0, 2)
+    inwards = ws.Mesh(outwards.positions, outwards.faces[:, ::-1])
+    assert not enclosures(ws.Scene([ws.Body(inwards)], LIGHT), [camera_at(0, 0, 0.1)])
 
 
 def test_a_renderer_warns_once_of_all_that_is_out_of_place():

@@ -40,7 +40,7 @@ from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
 from warpshadow.pipeline.view import View
-from warpshadow.scene.placement import misplacements
+from warpshadow.scene.placement import enclosures, misplacements
 from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
@@ -288,7 +288,8 @@ class Renderer:
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
         if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
-            remarks = [view.emptiness(), *(misplacements(self.scene) if is_scenes else [])]
+            of_scene = [*enclosures(self.scene, self.cameras), *misplacements(self.scene)] if is_scenes else []
+            remarks = [view.emptiness(), *of_scene]
             if found := [remark for remark in remarks if remark]:
                 check.warn("; ".join(found))
                 self._has_warned = True

@@ -1,9 +1,12 @@
-"""Where bodies stand: whether one floats above a ground, or lies below it."""
+"""Where bodies stand: whether one floats above a ground, lies below it, is broader, or is around a camera."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
 from warpshadow.scene.scene import Body, Scene
 
@@ -16,15 +19,26 @@ class _Box(NamedTuple):
     low: np.ndarray
     high: np.ndarray
 
+    @property
+    def size(self) -> float:
+        """Longest edge."""
+        return float((self.high - self.low).max())
+
+    @property
+    def breadth(self) -> float:
+        """Longest edge that is level."""
+        return float((self.high - self.low)[[0, 2]].max())
+
     def is_over(self, other: "_Box") -> bool:
         """Whether it shares a place of the plane y = 0 with another."""
         return bool((self.low <= other.high)[[0, 2]].all() and (other.low <= self.high)[[0, 2]].all())
 
 
 def misplacements(scene: Scene) -> list[str]:
-    """Say which bodies are above or below a ground by more than their size, the longest edge of their bounds.
+    """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
-    Grounds are flat and face +y. A body over another that is near enough, a cup on a table, does not float.
+    Grounds are flat and face +y; the size is the longest edge of the bounds. A body over another that is near enough, a
+    cup on a table, does not float.
     """
     boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
     grounds = {number for number, body in enumerate(scene.bodies) if _is_ground(body, boxes[number])}
@@ -33,7 +47,15 @@ def misplacements(scene: Scene) -> list[str]:
         below = [other for other in grounds - {number} if box.is_over(boxes[other])]
         if number in grounds or not below:
             continue
-        size = float((box.high - box.low).max())
+        broadest = max(below, key=lambda other: boxes[other].breadth)
+        if box.breadth > boxes[broadest].breadth:
+            remarks.append(
+                f"body {number} ({body.called!r}) is {box.breadth:.3g} broad, and body {broadest} "
+                f"({scene.bodies[broadest].called!r}) below it {boxes[broadest].breadth:.3g}; on_ground(size=…) makes "
+                "it smaller"
+            )
+            continue
+        size = box.size
         ground = max(below, key=lambda other: boxes[other].high[1])
         others = [other for k, other in enumerate(boxes) if k != number and box.is_over(other)]
         gap = min((box.low[1] - other.high[1] for other in others if other.low[1] <= box.low[1]), default=-np.inf)
@@ -45,6 +67,34 @@ def misplacements(scene: Scene) -> list[str]:
         elif depth > size:
             remarks.append(f"{where} lies {depth:.3g} below {which}")
     return remarks
+
+
+def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
+    """Say of the first camera that is inside of a body of which one.
+
+    A room whose walls face inwards, or are thick, is not around what is in it.
+    """
+    for camera in cameras:
+        for number, body in enumerate(scene.bodies):
+            low, high = body.mesh.bounds
+            eye = (camera.eye - body.translation) @ body.rotation_matrix() / body.scale  # in the body's space
+            if (low < eye).all() and (eye < high).all() and _winding_number(body.mesh, eye) > 0.5:
+                place = ", ".join(f"{coordinate:.3g}" for coordinate in camera.eye)
+                return [
+                    f"camera: its eye ({place}) is inside body {number} ({body.called!r}), which is "
+                    f"{body.scale * (high - low).max():.3g} large; Camera.framing(scene) sees it from outside"
+                ]
+    return []
+
+
+def _winding_number(mesh: Mesh, point: np.ndarray) -> float:
+    """How often a mesh goes around a point: 1 inside a closed one that faces outwards [Van Oosterom, Strackee 1983]."""
+    corners = mesh.positions[mesh.faces].astype(np.float64) - point
+    a, b, c = np.moveaxis(corners, 1, 0)
+    la, lb, lc = np.moveaxis(np.linalg.norm(corners, axis=2), 1, 0)
+    volume = (a * np.cross(b, c)).sum(axis=1)
+    rest = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return float(np.arctan2(volume, rest).sum() / (2 * np.pi))
 
 
 def _is_ground(body: Body, box: _Box) -> bool:
