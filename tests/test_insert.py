@@ -1,6 +1,8 @@
 """Bodies in photographs: shadows are those that a whole render has, and nothing else of the photograph changes."""
 
 import dataclasses
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -49,6 +51,23 @@ def relative_error(got, expected):
 
 
 # ------------------------------------------------------------------------------------------------ what it computes
+
+
+def test_what_is_brighter_than_white_is_said_with_an_exposure_that_is_not():
+    scene = scene_of("none")
+    photograph = np.full((36, 48, 3), 0.5, np.float32)
+    dim = dataclasses.replace(scene, light=SKY.scaled(0.05))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ws.insert(dim, photograph, progress=False)
+        ws.insert(scene, 4 * photograph, exposure=2, progress=False)  # linear beyond white
+    with pytest.warns(UserWarning, match="^[0-9]+% of what is inserted is brighter than white, as is 0% of") as caught:
+        image = ws.insert(scene, photograph, exposure=2, progress=False)
+    covered = ws.Renderer(scene, progress=False).layers().masks[0] > 0.5
+    share, stops = re.match(r"(\d+)% .*--exposure (-?[\d.]+)\)", str(caught[0].message)).groups()
+    assert int(share) == round(100 * float((image[covered].max(axis=1) > 1).mean())) > 10
+    image = ws.insert(scene, photograph, exposure=float(stops), progress=False)
+    assert (image[covered].max(axis=1) > 1).mean() <= 0.01 < (image[covered].max(axis=1) > 2**-0.1).mean()
 
 
 @pytest.mark.parametrize("receivers", ["pixel", "vertex"])

@@ -1,5 +1,6 @@
 """Bodies put into a photograph, by a renderer of any scene."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,12 @@ from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
 from warpshadow.scene.scene import SCENE, Scene
 from warpshadow.tuning.renderer import Renderer
+
+_MOSTLY = 0.5
+"""Part of a pixel that bodies cover, above which it is theirs."""
+
+_TENTH = 0.1
+"""More of what is inserted than of the photograph may be white before that is remarked on."""
 
 
 def insert(
@@ -37,6 +44,10 @@ def insert(
         device: Warp device.
         progress: Show progress where something takes longer than a second.
 
+    Warns:
+        Where more of the bodies is brighter than white, 1, than of the photograph, by a tenth: how much, and the
+        exposure with which 1% is.
+
     Returns:
         Linear RGB, float32 of the photograph's shape; :func:`warpshadow.write_image` writes it as a picture.
 
@@ -51,7 +62,32 @@ def insert(
     given = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
         image: np.ndarray = renderer.insert(given).numpy()[0] * np.float32(gain)
+    drawn = [number for number in range(len(scene.bodies)) if number not in scene.catchers]
+    if remark := _overexposure(image, pixels, renderer.layers().masks[drawn].sum(axis=0), exposure):
+        check.warn(remark)
     return image
+
+
+def _overexposure(image: np.ndarray, photograph: np.ndarray, covered: np.ndarray, exposure: float) -> str | None:
+    """Say how much of the bodies is brighter than white, where that is a tenth more than of the photograph.
+
+    Args:
+        image: With the bodies, linear RGB.
+        photograph: Without; one with values above 1 has no white.
+        covered: Part of each pixel that the bodies cover.
+        exposure: Theirs [stops].
+    """
+    bright = image.max(axis=2)[covered > _MOSTLY]
+    if not len(bright) or photograph.max() > 1:
+        return None
+    share, usual = float((bright > 1).mean()), float((photograph >= 1).any(axis=2).mean())
+    if share <= usual + _TENTH:
+        return None
+    stops = math.floor(10 * (exposure - math.log2(np.percentile(bright, 99)))) / 10
+    return (
+        f"{share:.0%} of what is inserted is brighter than white, as is {usual:.0%} of the photograph; with exposure = "
+        f"{stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
+    )
 
 
 def linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
