@@ -7,7 +7,7 @@ import functools
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,10 +24,11 @@ from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.found_light import FoundLight, found_light
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
+from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
-from warpshadow.inverse.schedule import READY_STAGES, Stage, check_part, check_stages
+from warpshadow.inverse.schedule import Stage, check_part, stages_for
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import Found, Setting
 from warpshadow.scene.scene import Scene
@@ -370,6 +371,7 @@ def default_optimizer(parameters: list[torch.Tensor], lr: float) -> torch.optim.
     return QuasiNewton(parameters, lr) if few else short_adam(parameters, lr)
 
 
+@torch_on_one_thread()
 def fit(
     problem: Problem,
     stages: str | Sequence[Stage] = (Stage(),),
@@ -417,11 +419,7 @@ def fit(
         CheckpointError: for a checkpoint of another problem.
     """
     check.instance("problem", problem, Problem, "a Problem, as Problem(scene, targets, free) makes it")
-    if isinstance(stages, str):
-        check.choice("stages", stages, READY_STAGES)
-        stages = READY_STAGES[stages](problem)
-    stages = tuple(stages) if isinstance(stages, Iterable) else (stages,)
-    check_stages(stages, problem)
+    stages = stages_for(stages, problem)
     if not callable(optimizer):
         raise ValueError(
             f"optimizer: got {check.described(optimizer)}, expected what makes one of tensors and lr, such as "

@@ -19,6 +19,7 @@ from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
+from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.schedule import Stage
 from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
@@ -44,6 +45,7 @@ class Report:
         loss_before, loss_after: With regularizers.
     """
 
+    @torch_on_one_thread()
     def __init__(self, result: Result):
         self.result = result
         model = Model(result.problem, result.setting, Stage())

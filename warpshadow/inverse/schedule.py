@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -80,6 +80,16 @@ def check_part(name: str, value: object, of: str) -> None:
     """Raise ValueError for what is no number from 0 to below 1."""
     if not (check.is_number(value) and 0 <= value < 1):
         raise ValueError(f"{name}: got {value!r}, expected a part {of}, 0 or more and below 1")
+
+
+def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
+    """The stages of a problem: those that are given, or ready-made ones by their name."""
+    if isinstance(stages, str):
+        check.choice("stages", stages, READY_STAGES)
+        return READY_STAGES[stages](problem)
+    chosen = tuple(stages) if isinstance(stages, Iterable) else (stages,)
+    check_stages(chosen, problem)
+    return chosen
 
 
 def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
