@@ -114,3 +114,14 @@ def until(condition, seconds=60):
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_a_script_whose_main_part_would_run_in_its_workers_is_told_so(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from warpshadow.device.workers import run_tasks\nlist(run_tasks(print, [1], workers=1))\n", "utf-8"
+    )
+    result = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("ChildProcessError: a worker process cannot start") and '__name__ == "__main__"' in last

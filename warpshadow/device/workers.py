@@ -24,12 +24,9 @@ from warpshadow.device.startup import start_quietly
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_ATTEMPTS = 2
-"""How often a task is begun whose process dies: it may have been killed for what another process took."""
-
 
 class WorkerDied(RuntimeError):
-    """A process ended in the middle of a task, and did so again when another tried."""
+    """A process ended in the middle of a task, and did so again when others tried."""
 
 
 class Ended(NamedTuple, Generic[Task, Result]):
@@ -52,6 +49,7 @@ class _Worker(Generic[Task, Result]):
         self.process.start()
         other_end.close()  # so that its death is the end of the connection
         self.has: tuple[Task, int] | None = None
+        self.has_started = False
 
     def begin(self, task: Task, attempt: int) -> None:
         """Let it do a task; should it be dead, that is noticed as if it died of the task."""
@@ -68,7 +66,12 @@ class _Worker(Generic[Task, Result]):
 
 
 def run_tasks(
-    function: Callable[[Task], Result], tasks: Iterable[Task], *, workers: int, threads: int | None = None
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    *,
+    workers: int,
+    threads: int | None = None,
+    attempts: int = 2,
 ) -> Generator[Ended[Task, Result], None, None]:
     """Do tasks in worker processes, which end with this one, however it ends.
 
@@ -77,9 +80,13 @@ def run_tasks(
         tasks: Taken one by one as processes are free.
         workers: Number of processes.
         threads: Threads that kernels and NumPy have in each process; by default an even share of all.
+        attempts: How often a task is begun whose process dies: it may have been killed for what another process took.
 
     Yields:
-        The tasks that are over, as they end. A task whose process dies is done once more.
+        The tasks that are over, as they end.
+
+    Raises:
+        ChildProcessError: where no process can start.
     """
     threads = threads or max(1, thread_count() // workers)
     untried, again = ((task, 1) for task in tasks), deque[tuple[Task, int]]()
@@ -99,13 +106,22 @@ def run_tasks(
                 task, attempt = worker.has
                 try:
                     result, error = worker.connection.recv()
+                    if not worker.has_started:  # the first that it says
+                        worker.has_started = True
+                        busy[connection] = worker
+                        continue
                     idle.append(worker)
                 except (EOFError, OSError):
                     status = worker.end()
-                    if attempt < _ATTEMPTS:
+                    if not worker.has_started and status is not None and status >= 0:
+                        raise ChildProcessError(
+                            "a worker process cannot start, as it says above; a script that starts some has what it "
+                            'does under if __name__ == "__main__":'
+                        ) from None
+                    if attempt < attempts:
                         again.append((task, attempt + 1))
                         continue
-                    result, error = None, WorkerDied(f"its process ended {_in_words(status)}, {_ATTEMPTS} times")
+                    result, error = None, WorkerDied(f"its process ended {_in_words(status)}, {attempts} times")
                 yield Ended(task, result, error)
     finally:
         for worker in (*busy.values(), *idle):
@@ -123,23 +139,31 @@ def _in_words(status: int | None) -> str:
 
 def _serve(connection: Connection, function: Callable[[Task], Result], threads: int) -> None:
     """Do the tasks that come, until the connection ends."""
-    from threadpoolctl import threadpool_limits
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the parent, which ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    set_up(threads)
+    connection.send((None, None))
+    while True:
+        try:
+            task = connection.recv()
+        except EOFError:
+            return
+        try:
+            connection.send((function(task), None))
+        except Exception as error:  # the function's, or of what cannot be pickled
+            connection.send((None, _sendable(error)))
+
+
+def set_up(threads: int) -> None:
+    """Make this process one that does tasks, with so many threads, and says nothing."""
+    from threadpoolctl import threadpool_limits
+    from tqdm import tqdm
+
+    tqdm.set_lock(threading.RLock())  # in place of a semaphore, which outlives a process that is killed
     start_quietly()
     show_bars(False)
     set_thread_count(threads)
-    with threadpool_limits(limits=threads):
-        while True:
-            try:
-                task = connection.recv()
-            except EOFError:
-                return
-            try:
-                connection.send((function(task), None))
-            except Exception as error:  # the function's, or of what cannot be pickled
-                connection.send((None, _sendable(error)))
+    threadpool_limits(limits=threads)
 
 
 def _sendable(error: Exception) -> Exception:
