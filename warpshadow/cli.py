@@ -35,10 +35,6 @@ app = typer.Typer(
 DIVERGED = 3
 INTERRUPTED = 130
 
-# Files in the folder of a fit, beside its results.
-_CHECKPOINT = "checkpoint"
-_PREVIEW = "preview.png"
-
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
@@ -401,11 +397,25 @@ def _device(name: str) -> wp.Device:
 
 @app.command()
 def fit(
-    file: Annotated[Path, typer.Argument(help="Fit file, TOML; warpshadow/inverse/README.md lists its keys.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern in quotes, a folder "
+            "with files called fit.toml, or a .txt file with a path on each line."
+        ),
+    ],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="Folder for the results, and for the checkpoint that a fit goes on from."),
     ],
+    workers: Annotated[
+        Optional[int],
+        typer.Option(help="Of many fits: how many at a time, which share the cores; by default one a core.", min=1),
+    ] = None,
+    ray: Annotated[
+        Optional[str],
+        typer.Option(help="Of many fits: Ray cluster to run them on, HOST:PORT, or auto for that of this machine."),
+    ] = None,
     preview: Annotated[
         bool, typer.Option(help="Show target, image and difference in FOLDER/preview.png while the fit runs.")
     ] = True,
@@ -422,21 +432,32 @@ def fit(
 
     The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
     became NaN or Inf, and the folder has the best values before that.
+
+    Of many fits each has a folder in the folder, and table.csv says how they ended; those that have ended are not done
+    again. One that fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
     """
     from warpshadow.inverse import checkpoint as checkpoints
     from warpshadow.inverse.fit_file import load_fit
+    from warpshadow.inverse.folder import CHECKPOINT, PREVIEW, check_folder
+    from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report
 
+    if is_of_many(file):
+        options = {"workers": workers, "ray": ray, "device": device, "checkpoint_seconds": checkpoint_seconds}
+        _fit_many(file, output, view, is_quiet, **options)
+        return
     with _clear_errors(), _resumable(output):
+        if workers is not None or ray is not None:
+            raise ValueError(f"--workers, --ray: got the fit file {file}, expected a pattern, a folder or a .txt file")
         where = _device(device)
-        _check_folder(output)
+        check_folder(output)
         loaded = load_fit(file)
         output.mkdir(exist_ok=True)
-        state = checkpoints.load(output / _CHECKPOINT)
+        state = checkpoints.load(output / CHECKPOINT)
         was_over = state is not None and state["reason"] is not None
         if state is not None and not was_over:
-            _note(f"going on from {output / _CHECKPOINT}", is_quiet)
-        elif state is None and (output / _PREVIEW).exists():
+            _note(f"going on from {output / CHECKPOINT}", is_quiet)
+        elif state is None and (output / PREVIEW).exists():
             _note(f"no checkpoint in {output} yet; the fit begins anew", is_quiet)
         viewer = FitViewer(port=port) if view else None
         if viewer is not None:
@@ -444,9 +465,9 @@ def fit(
             viewer.open(browser)
         result = loaded.run(
             device=str(where),
-            checkpoint=output / _CHECKPOINT,
+            checkpoint=output / CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
-            preview=output / _PREVIEW if preview else None,
+            preview=output / PREVIEW if preview else None,
             view=False if viewer is None else viewer,
             progress=True,
         )
@@ -456,7 +477,7 @@ def fit(
         ending = "diverged" if has_diverged else result.reason
         ending += f" after {sum(map(len, result.losses))} iterations"
         if was_over and (output / SUMMARY).exists():
-            last = datetime.fromtimestamp((output / _CHECKPOINT).stat().st_mtime)
+            last = datetime.fromtimestamp((output / CHECKPOINT).stat().st_mtime)
             remedy = f"remove {output} or choose another folder by -o to start anew"
             _note(f"already {ending} (on {last:%Y-%m-%d at %H:%M}); {remedy}", is_quiet)
         else:
@@ -472,32 +493,48 @@ def fit(
         raise typer.Exit(DIVERGED)
 
 
+def _fit_many(where: Path, output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
+    """Do many fits, and name those that have no good end."""
+    from warpshadow.inverse.many import TABLE, find_fits, fit_many
+
+    with _clear_errors():
+        if view:
+            raise ValueError(f"--view: got many fits, {where}; expected one, which a page can show")
+        if output.exists() and not output.is_dir():
+            raise NotADirectoryError(f"{output}: got a file, expected a folder")
+        files.check_folder(output if output.is_dir() else output.parent)
+        try:
+            endings = fit_many(find_fits(where), output, **options)
+        except KeyboardInterrupt as error:
+            typer.secho("interrupted; the same command goes on from the checkpoints", fg="yellow", err=True)
+            raise typer.Exit(INTERRUPTED) from error
+    for ending in endings:
+        for warning in ending.warnings:
+            typer.secho(f"warning: {ending.name}: {warning}", fg="yellow", err=True)
+    for ending in endings:
+        if not ending.is_good:
+            typer.secho(f"error: {ending.name} {ending.reason}: {ending.error}", fg="red", err=True)
+    reasons = [ending.reason for ending in endings]
+    counts = ", ".join(f"{reasons.count(reason)} {reason}" for reason in dict.fromkeys(reasons))
+    _note(f"{output / TABLE}: {counts}", is_quiet)
+    if "failed" in reasons:
+        raise typer.Exit(1)
+    if "diverged" in reasons:
+        raise typer.Exit(DIVERGED)
+
+
 @contextlib.contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
     """Say how a fit goes on when the user interrupts it."""
+    from warpshadow.inverse.folder import CHECKPOINT, has_checkpoint
+
     try:
         yield
     except KeyboardInterrupt as error:
-        is_kept = _has_checkpoint(folder)
-        kept = f"; the same command goes on from {folder / _CHECKPOINT}" if is_kept else " before a checkpoint"
+        is_kept = has_checkpoint(folder)
+        kept = f"; the same command goes on from {folder / CHECKPOINT}" if is_kept else " before a checkpoint"
         typer.secho(f"interrupted{kept}", fg="yellow", err=True)
         raise typer.Exit(INTERRUPTED) from error
-
-
-def _check_folder(path: Path) -> None:
-    """Find out before the work whether a fit may write into a folder."""
-    if path.exists() and not path.is_dir():
-        raise NotADirectoryError(f"{path}: got a file, expected a folder")
-    files.check_folder(path if path.is_dir() else path.parent)
-    if not path.is_dir() or _has_checkpoint(path):
-        return
-    others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != _PREVIEW)
-    if others:
-        raise FileExistsError(f"{path}: got a folder with {others[0]} in it, expected a new one or that of this fit")
-
-
-def _has_checkpoint(folder: Path) -> bool:
-    return any(folder.glob(f"{_CHECKPOINT}*"))
 
 
 @app.command()

@@ -57,13 +57,13 @@ class _Within:
 
 
 @contextlib.contextmanager
-def progress_bar(total: int, what: str, unit: str, *, wanted: bool = True, stays: bool = False) -> Iterator[Any]:
+def progress_bar(total: int | None, what: str, unit: str, *, wanted: bool = True, stays: bool = False) -> Iterator[Any]:
     """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
 
     None shows where stderr is neither a terminal nor a notebook's.
 
     Args:
-        total: Number of units.
+        total: Number of units; None where it is not known.
         what: What is done, such as "shading".
         unit: What is counted, such as "receiver".
         wanted: Whether to show it.

@@ -15,6 +15,7 @@ from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.views import CameraPose, Exposure
 from warpshadow.inverse.loss import Loss
+from warpshadow.inverse.many import Ending, find_fits, fit_many
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.report import write_result
@@ -27,6 +28,7 @@ __all__ = [
     "CameraPose",
     "CheckpointError",
     "Deformation",
+    "Ending",
     "Exposure",
     "Fit",
     "FitFileError",
@@ -46,7 +48,9 @@ __all__ = [
     "Texture",
     "default_optimizer",
     "deformation_stages",
+    "find_fits",
     "fit",
+    "fit_many",
     "load_fit",
     "pose_stages",
     "short_adam",

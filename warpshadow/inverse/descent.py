@@ -97,6 +97,15 @@ class Result:
         """The cameras of the views."""
         return self.found.cameras
 
+    @property
+    def figures(self) -> dict[str, list[float]]:
+        """What was found where that is a few numbers, by the names that scene files have for it."""
+        figures: dict[str, list[float]] = {}
+        for free in self.problem.free:
+            for key, numbers in free.figures(self.found).items():
+                figures[key] = np.ravel(numbers).astype(float).tolist()
+        return figures
+
     def images(self, values: Mapping[str, Values] | None = None) -> np.ndarray:
         """Images of the views, [view, height, width, 4], of the result or of other values."""
         model = Model(self.problem, self.setting, Stage())

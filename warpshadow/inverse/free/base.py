@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.world import Found, Setting, World
@@ -59,6 +61,10 @@ class Free(abc.ABC):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Put final values into what is found."""
 
+    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+        """What was found, as scene files call it, where that is a few numbers."""
+        return {}
+
     def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Regularizer, to be added to the loss; None for none. Differentiable: values."""
         return None
@@ -93,6 +99,12 @@ class FreeOfBody(Free):
     def name(self) -> str:
         """What values and messages call it."""
         return f"{self.key}[{self.body}]"
+
+    def called(self, found: Found) -> str:
+        """What its body is called, or where others are called that, its number."""
+        names = [body.called for body in found.scene.bodies]
+        own = names[self.number]
+        return own if names.count(own) == 1 else f"body_{self.number}"
 
     def numbered(self, scene: Scene) -> FreeOfBody:
         """The same of the body's number."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
@@ -97,3 +99,9 @@ class Pose(FreeOfBody):
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
         vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
         found.change_body(self.number, rotation=vector, translation=translation, scale=float(scale))
+
+    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+        """The pose."""
+        body = found.scene.bodies[self.number]
+        names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
+        return {f"{self.called(found)}.{name}": getattr(body, name) for name in names}

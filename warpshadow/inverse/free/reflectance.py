@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
@@ -66,6 +68,11 @@ class Albedo(FreeOfBody):
         """Color the body."""
         color = values["color"].cpu().numpy()
         found.change_body(self.number, albedo=color if self.per_vertex else color[0])
+
+    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+        """The color, of a body that has one."""
+        body = found.scene.bodies[self.number]
+        return {} if self.per_vertex else {f"{self.called(found)}.albedo": body.albedo}
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
@@ -32,6 +34,10 @@ class Exposure(Free):
     def settle(self, values: Values, setting: Setting, found: Found) -> None:
         """Factors of the views."""
         found.exposures = values["log"].exp().tolist()
+
+    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+        """A factor of each view."""
+        return {"exposure": found.exposures}
 
 
 @dataclass(frozen=True)
@@ -85,3 +91,12 @@ class CameraPose(Free):
             for view, camera in enumerate(found.cameras)
         ]
         found.scene = replace(found.scene, camera=found.cameras[0])
+
+    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+        """World to camera of each view, and its focal length [pixels]."""
+        figures = {
+            "camera.rotation": [camera.rotation for camera in found.cameras],
+            "camera.translation": [camera.translation for camera in found.cameras],
+        }
+        focal = {"camera.focal": [camera.intrinsics[0, 0] for camera in found.cameras]} if self.focal else {}
+        return figures | focal

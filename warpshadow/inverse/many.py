@@ -1,0 +1,350 @@
+"""Many fits: each in a folder of its own, on workers of this machine or of a Ray cluster.
+
+A fit that is interrupted goes on from its checkpoint. One that has ended leaves a record, the last file that it writes,
+by which it is known and not done again; the table is made of these records.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import glob
+import hashlib
+import itertools
+import json
+import math
+import os
+import pickle
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePath
+
+import torch
+
+from warpshadow import check
+from warpshadow.assets import files
+from warpshadow.check import AnyPath
+from warpshadow.device.cluster import run_on_ray
+from warpshadow.device.parallel import thread_count
+from warpshadow.device.progress import progress_bar
+from warpshadow.device.workers import run_tasks
+from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.descent import FitWarning, default_optimizer
+from warpshadow.inverse.fit_file import Fit, load_fit
+from warpshadow.inverse.folder import CHECKPOINT, check_folder
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.report import Report
+from warpshadow.inverse.schedule import Stage, stages_for
+
+TABLE = "table.csv"
+"""The file, in the folder of all results, that says how each fit ended."""
+
+_FIT_FILE = "fit.toml"  # what a folder is searched for
+_RECORD = "ending.json"
+_ATTEMPTS = 4  # begins of a fit whose workers are killed
+_PATIENCE = 60.0
+"""How long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How one of many fits ended.
+
+    Args:
+        name: Of the fit, and of its folder.
+        reason: "converged", "finished" (all iterations done), "diverged" (something became NaN or Inf; the folder has
+            the best values before that) or "failed" (it left no result).
+        error: What became NaN or Inf, or why it failed.
+        iterations: Of all stages.
+        loss_before, loss_after: With regularizers.
+        seconds: From when its last worker began with it.
+        parameters: What was found, as scene files call it, where that is a few numbers: "bunny.translation", …
+        warnings: What was warned of.
+    """
+
+    name: str
+    reason: str
+    error: str = ""
+    iterations: int | None = None
+    loss_before: float | None = None
+    loss_after: float | None = None
+    seconds: float | None = None
+    parameters: dict[str, list[float]] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it converged or finished."""
+        return self.reason in ("converged", "finished")
+
+
+def fit_many(
+    fits: Iterable[AnyPath | Fit | Problem] | Mapping[str, AnyPath | Fit | Problem],
+    folder: AnyPath,
+    stages: str | Sequence[Stage] = (Stage(),),
+    *,
+    optimizer: Callable[..., torch.optim.Optimizer] = default_optimizer,
+    tolerance: float = 1e-4,
+    seed: int = 0,
+    workers: int | None = None,
+    ray: str | None = None,
+    device: str = "cpu",
+    checkpoint_seconds: float = 10.0,
+    progress: bool = True,
+) -> list[Ending]:
+    """Do many fits, several at a time; called again, it does what has not ended, from its checkpoints.
+
+    A script that calls it does so under ``if __name__ == "__main__":``, as workers import it.
+
+    Args:
+        fits: Problems, fits, or fit files, by name; those without names are called 000000, 000001, …, so each has to
+            come at the same place when it is called again. They are asked for as workers become free.
+        folder: Made if it is not there. Each fit gets a folder of its name in it, with what
+            :meth:`~warpshadow.inverse.report.Report.write` writes; table.csv says how each ended.
+        stages, optimizer, tolerance, seed: Of problems, as :func:`warpshadow.inverse.fit` takes them. Fits and fit
+            files have their own.
+        workers: How many fits at a time; on this machine by default one for each of ``ws.thread_count()`` threads,
+            which they share, or on a GPU one; with ``ray`` as many as the cluster has cores.
+        ray: Address of a Ray cluster, "HOST:PORT" or "auto", whose machines see the same files under the same paths.
+        device: Where to compute.
+        checkpoint_seconds: Time between checkpoints [s].
+        progress: Show progress.
+
+    Returns:
+        How each ended, in the order of ``fits``. One that fails, diverges, or whose workers are killed four times costs
+        only itself.
+
+    Raises:
+        CheckpointError: while other fits are written into the folder.
+        ConnectionError: where the Ray cluster cannot be reached.
+    """
+    if workers is not None:
+        check.whole("workers", workers)
+    is_on_gpu = check.device("device", device).is_cuda
+    check.nonnegative("checkpoint_seconds", checkpoint_seconds)
+    folder = Path(folder).absolute()
+    if isinstance(fits, Mapping):
+        _check_names(fits)
+    named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", each) for k, each in enumerate(fits))
+    folder.mkdir(exist_ok=True)
+    names: list[str] = []
+    endings: dict[str, Ending] = {}
+    total = len(fits) if isinstance(fits, Sized) else None
+
+    with (
+        checkpoints.alone(folder / TABLE),
+        progress_bar(total, "fitting", "fit", wanted=progress, stays=True) as bar,
+    ):
+
+        def note(ending: Ending) -> None:
+            endings[ending.name] = ending
+            others = sum(not each.is_good for each in endings.values())
+            bar.set_postfix_str(f"{others} failed or diverged" if others else "", refresh=False)
+            bar.update()
+
+        def jobs() -> Iterator[_Job]:
+            for name, given in named:
+                names.append(name)
+                each = given
+                if isinstance(each, Problem):
+                    each = Fit(each, stages_for(stages, each), optimizer, tolerance, seed)
+                elif not isinstance(each, Fit):
+                    each = Path(each).absolute()
+                job = _Job(name, folder, each, _digest(each), device, checkpoint_seconds)
+                ending = job.recorded()
+                if ending is None:
+                    yield job
+                else:
+                    note(ending)
+
+        try:
+            if ray is not None:
+                ended = run_on_ray(_do, jobs(), ray, workers=workers, attempts=_ATTEMPTS, is_on_gpu=is_on_gpu)
+            else:
+                few = min(workers or (1 if is_on_gpu else thread_count()), total or math.inf)
+                ended = run_tasks(_do, jobs(), workers=int(few), attempts=_ATTEMPTS)
+            with contextlib.closing(ended):
+                for job, ending, error in ended:
+                    note(ending or Ending(job.name, "failed", str(error)))
+        finally:
+            in_order = [endings[name] for name in names if name in endings]
+            write_table(in_order, folder / TABLE)
+    return in_order
+
+
+# ------------------------------------------------------------------------------------------------ one of them
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One of many fits, as a worker is told of it."""
+
+    name: str
+    results: Path  # the folder of all
+    fit: Fit | Path
+    digest: str  # of all that decides it
+    device: str
+    checkpoint_seconds: float
+
+    @property
+    def folder(self) -> Path:
+        return self.results / self.name
+
+    def recorded(self) -> Ending | None:
+        """How it ended before."""
+        path = self.folder / _RECORD
+        if not path.exists():
+            return None
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return Ending(**record["ending"]) if record["of"] == self.digest else None
+
+    def record(self, ending: Ending) -> None:
+        """Note how it ended."""
+        with files.whole(self.folder / _RECORD) as unfinished:
+            record = {"of": self.digest, "ending": dataclasses.asdict(ending)}
+            unfinished.write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def _digest(fit: Fit | Path) -> str:
+    """A digest of a fit file's text, empty where there is none; or of a fit."""
+    if isinstance(fit, Path):
+        return hashlib.sha256(fit.read_bytes()).hexdigest() if fit.is_file() else ""
+    decides = f"{fit.problem.fingerprint()} {fit.stages!r} {fit.tolerance!r} {fit.seed}".encode()
+    return hashlib.sha256(decides + pickle.dumps(fit.optimizer)).hexdigest()
+
+
+def _do(job: _Job) -> Ending:
+    """Do a fit, whatever becomes of it."""
+    start = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        try:
+            ending = _ended(job)
+        except (ValueError, OSError, ImportError) as error:  # mistakes in what was given
+            ending = Ending(job.name, "failed", str(error) if error.args else type(error).__name__)
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            message = f"{type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+            ending = Ending(job.name, "failed", message)
+    said = dict.fromkeys(str(each.message) for each in caught if not issubclass(each.category, FitWarning))
+    ending = replace(ending, seconds=round(time.perf_counter() - start, 3), warnings=[*said])
+    if ending.reason != "failed":
+        job.record(ending)
+    return ending
+
+
+def _ended(job: _Job) -> Ending:
+    """Do a fit, in its folder."""
+    from filelock import Timeout
+
+    loaded = load_fit(job.fit) if isinstance(job.fit, Path) else job.fit
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    check_folder(job.folder)
+    job.folder.mkdir(exist_ok=True)
+    try:
+        with files.locked(job.folder / _RECORD, timeout=_PATIENCE):
+            result = loaded.run(
+                device=job.device,
+                checkpoint=job.folder / CHECKPOINT,
+                checkpoint_seconds=job.checkpoint_seconds,
+                progress=False,
+            )
+            report = Report(result)
+            report.write(job.folder)
+    except Timeout as error:
+        raise checkpoints.CheckpointError(f"{job.folder}: another process is writing it") from error
+    is_good = result.reason in ("converged", "finished")
+    return Ending(
+        job.name,
+        result.reason if is_good else "diverged",
+        "" if is_good else result.reason,
+        sum(map(len, result.losses)),
+        report.loss_before,
+        report.loss_after,
+        parameters=result.figures,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ the table
+
+
+def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
+    """Write how fits ended as CSV, a row for each; parameters of several numbers have a column for each number."""
+    rows = []
+    for ending in endings:
+        row = dataclasses.asdict(ending)
+        said, parameters = row.pop("warnings"), row.pop("parameters")
+        for name, numbers in parameters.items():
+            row |= {f"{name}[{k}]" if len(numbers) > 1 else name: number for k, number in enumerate(numbers)}
+        rows.append(row | {"warnings": "; ".join(said)})
+    columns = [column for column in dict.fromkeys(itertools.chain.from_iterable(rows)) if column != "warnings"]
+    with files.whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*columns, "warnings"])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+# ------------------------------------------------------------------------------------------------ names
+
+
+def is_of_many(where: AnyPath) -> bool:
+    """Whether a path is a pattern, a folder or a list of fit files, rather than one of them."""
+    path = Path(where)
+    return path.is_dir() or path.suffix == ".txt" or (glob.has_magic(os.fspath(where)) and not path.is_file())
+
+
+def find_fits(where: AnyPath) -> dict[str, Path]:
+    """Find fit files and name them, whatever others there are.
+
+    A name is the file's path without its suffix: from the first folder of the pattern that has a wildcard; from the
+    searched folder; from the list's folder. Where the pattern says what the last part is, and for files called
+    fit.toml, that part is left out.
+
+    Args:
+        where: A pattern, such as "photos/*/fit.toml" or "fits/**/*.toml"; a folder, which is searched for files called
+            fit.toml; or a list, a .txt file with a path on each line, relative to it.
+
+    Returns:
+        Files by name, in the order of names; those of a list in its own.
+
+    Raises:
+        FileNotFoundError: where there are none.
+        ValueError: where the results of two would be in one folder.
+    """
+    path, text = Path(where), os.fspath(where)
+    if path.is_dir():
+        start, found, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
+    elif path.suffix == ".txt":
+        lines = (line.strip() for line in check.file("file", path).read_text(encoding="utf-8").splitlines())
+        start, found, last = path.parent, [path.parent / line for line in lines if line], _FIT_FILE
+    else:
+        start = Path(*itertools.takewhile(lambda part: not glob.has_magic(part), path.parts))
+        found = sorted(each for each in map(Path, glob.glob(text, recursive=True)) if each.is_file())
+        last = path.name
+    if not found:
+        raise FileNotFoundError(f"{where}: no fit file, expected some")
+    named: dict[str, Path] = {}
+    for file in found:
+        relative = PurePath(os.path.relpath(file, start))
+        inner = relative.parent if file.name == last else relative.with_suffix("")
+        name = "/".join(part for part in inner.parts if part != "..") or start.resolve().name
+        if name in named:
+            raise ValueError(f"{where}: got {named[name]} and {file}, whose results would both be called {name!r}")
+        named[name] = file
+    _check_names(named)
+    return named
+
+
+def _check_names(names: Collection[str]) -> None:
+    """Raise ValueError unless each name is that of a folder of its own."""
+    for name in names:
+        path = PurePath(name)
+        if not name or path.is_absolute() or ".." in path.parts or path == PurePath(TABLE):
+            raise ValueError(f"fits: got the name {name!r}, expected that of a folder in the folder of results")
+        for outer in path.parents:
+            if str(outer) in names:
+                raise ValueError(f"fits: got the names {str(outer)!r} and {name!r}, of which one is in the other")
