@@ -159,6 +159,17 @@ def test_several_catchers_catch_and_shadow_each_other_as_in_the_photograph():
 # ------------------------------------------------------------------------------------------------ images of scenes
 
 
+def test_shadows_are_caught_pixel_by_pixel():
+    """By a ground that would have its receivers at its vertices in a renderer that is kept."""
+    photograph = np.full((36, 48, 3), 0.5, np.float32)
+    images = [
+        ws.insert(scene_of(bodies=[ball(), ground(receivers=receivers)]), photograph)
+        for receivers in ("auto", "pixel", "vertex")
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert np.abs(images[0] - images[2]).max() > 1e-3
+
+
 def test_in_an_image_catchers_are_shadows_in_the_coverage():
     gray = ws.EnvironmentMap(SKY.radiance.mean(axis=2, keepdims=True).repeat(3, axis=2))
     scene = dataclasses.replace(scene_of(), light=gray)

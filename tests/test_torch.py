@@ -89,7 +89,7 @@ def image_of(renderer: TorchRenderer, name: str, values: dict[str, torch.Tensor]
 def test_the_image_is_the_renderers(device, method, supersampling):
     scene = small_scene(method, supersampling=supersampling)
     image = TorchRenderer(scene, device=torch_device(device))()
-    expected = ws.render(scene, device=device)
+    expected = ws.Renderer(scene, device=device).render()
     assert image.dtype == torch.float32 and image.device == torch.device(torch_device(device))
     assert np.abs(image.cpu().numpy() - expected).max() < FLOAT32 * expected.max()
 
@@ -100,7 +100,7 @@ def test_free_light_in_the_methods_own_basis_is_the_scenes_light(method):
     scene = dataclasses.replace(small_scene(method), light=light)
     renderer = TorchRenderer(scene)
     coefficients = torch.from_numpy(renderer.basis.coefficients(light))
-    expected = ws.render(scene)
+    expected = ws.Renderer(scene).render()
     assert np.abs(renderer(coefficients).numpy() - expected).max() < FLOAT32 * 5 * np.abs(expected).max()
 
 
@@ -131,7 +131,7 @@ def test_albedo_as_tensors_gives_the_same_image_as_in_the_scene(renderer):
     assert (renderer(albedo=[of_vertices, None]) - expected).abs().max() < FLOAT32 * 3
     flat = renderer(albedo=[None, torch.tensor([0.2, 0.4, 0.6])])
     scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=None, albedo=(0.2, 0.4, 0.6))))
-    assert np.abs(flat.numpy() - ws.render(scene)).max() < FLOAT32 * 3
+    assert np.abs(flat.numpy() - ws.Renderer(scene).render()).max() < FLOAT32 * 3
 
 
 def test_vertex_albedo_of_the_second_body_stays_with_it():
@@ -141,7 +141,7 @@ def test_vertex_albedo_of_the_second_body_stays_with_it():
     scene = dataclasses.replace(scene, bodies=(ground, dataclasses.replace(ball, albedo=colors)))
     renderer = TorchRenderer(dataclasses.replace(scene, bodies=(ground, ball)))
     image = renderer(albedo=[None, torch.from_numpy(colors)])
-    assert np.abs(image.numpy() - ws.render(scene)).max() < FLOAT32 * 3
+    assert np.abs(image.numpy() - ws.Renderer(scene).render()).max() < FLOAT32 * 3
 
 
 def test_writing_into_an_image_does_not_change_the_next_one():

@@ -181,6 +181,7 @@ def render(
 ) -> None:
     """Render a scene file to an image with soft shadows."""
     from warpshadow.assets.image import write_image
+    from warpshadow.pipeline.choice_of_receivers import for_picture
     from warpshadow.pipeline.renderer import Renderer
     from warpshadow.scene.camera_path import CameraPath
     from warpshadow.scene.files import load_scene
@@ -223,6 +224,7 @@ def render(
         loaded = resolved(parsed, device=where, progress=True)
         if parsed.visibility.method == AUTO:
             _note(f"auto: {describe(loaded)}", is_quiet)
+        loaded = for_picture(loaded)
         start = time.perf_counter()
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)

@@ -4,7 +4,8 @@
 
 Without ``--data`` the meshes are those that ship with Warp and a few shapes, under synthetic skies. ``--data`` adds the
 meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder. Each scene is a body of 2 units on a ground of
-6 units, 256 × 256; the figure is the relative L2 error over wholly covered pixels, in percent.
+6 units, 256 × 256; the figure is the relative L2 error over wholly covered pixels, in percent. The ground is shaded at
+its vertices, as by any ``ws.Renderer``; ``ws.render`` does it by pixel.
 """
 
 import argparse
@@ -91,7 +92,7 @@ def load_skies(data: Path | None) -> list[tuple[str, ws.EnvironmentMap]]:
 
 
 def render(scene: ws.Scene, visibility: ws.Visibility) -> np.ndarray:
-    return ws.render(dataclasses.replace(scene, visibility=visibility), progress=True)
+    return ws.Renderer(dataclasses.replace(scene, visibility=visibility)).render()
 
 
 if __name__ == "__main__":

@@ -338,7 +338,7 @@ def measure(
     equal = {}
     for setting, own in zip(compared, measured, strict=True):
         if setting.scene.bounces or setting.scene is compared[default_among(measured)].scene:
-            error = image_error(ws.render(setting.scene), path_truth)
+            error = image_error(ws.Renderer(setting.scene).render(), path_truth)
             longer = time_at_error(path_times, path_errors, error)
             equal[own.label] = {
                 "error": error,

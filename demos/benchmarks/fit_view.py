@@ -59,7 +59,7 @@ def main(rounds: int, iterations: int) -> None:
     ws.quiet()
     scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky())
     scene = dataclasses.replace(scene, camera=scene.camera.resized(0.5))
-    problem = inverse.Problem(scene, inverse.Target(ws.render(scene)), inverse.Pose(0))
+    problem = inverse.Problem(scene, inverse.Target(ws.Renderer(scene).render()), inverse.Pose(0))
     times: dict[str, list[np.ndarray]] = {"no page": [], "a page that is not open": [], "an open page": []}
     tests = str(Path(__file__).parents[2] / "tests" / "viewer")
     seconds(problem, 3, False)

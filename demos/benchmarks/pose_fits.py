@@ -168,7 +168,7 @@ def main(count: int, size: int, ways: list[str]) -> None:
     print(f"{cpu_text().splitlines()[0]}; seconds by the clock and by the processor")
     print(f"{'pose':10} {'way':6} {'it.':>4}   {'first':>13}   {'last':>13}   {'end':>13}   {'MDE [%]':>8}")
     truth = bunny_on_ground(2 * size)
-    cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], TURN))), ws.render(truth))}
+    cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], TURN))), ws.Renderer(truth).render())}
     truth = bunny_on_ground(size)
     wanted = ray_traced(truth)
     for seed in range(count):

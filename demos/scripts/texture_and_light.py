@@ -13,7 +13,7 @@ bunny = ws.Body(warp.examples.get_asset_directory() + "/bunny.usd", albedo=(0.5,
 bodies = [bunny, ws.Body(ws.plane(4.0), texture=pattern, name="floor")]
 camera = ws.Camera.look_at((-0.6, 4.6, 3.2), (0, 0.35, 0), fov_y=46, size=(96, 96))
 skies = [ws.synthetic_sky(sun, sun_strength=2.0, sun_radius=10.0) for sun in ((0.6, 0.6, 0.4), (-0.7, 0.5, 0.2))]
-morning, evening = (torch.from_numpy(ws.render(ws.Scene(bodies, sky, camera))) for sky in skies)
+morning, evening = (torch.from_numpy(ws.Renderer(ws.Scene(bodies, sky, camera)).render()) for sky in skies)
 
 
 def fitted(draw, free, target, steps=200):

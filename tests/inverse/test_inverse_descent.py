@@ -62,7 +62,7 @@ def moved_scene(scene: ws.Scene) -> ws.Scene:
 
 def small_problem(*free, scene: ws.Scene | None = None, **options) -> Problem:
     scene = small_scene() if scene is None else scene
-    target = Target(ws.render(moved_scene(scene)))
+    target = Target(ws.Renderer(moved_scene(scene)).render())
     return Problem(scene, target, free or (Pose(0), Albedo(0), Light(2)), **{"still": None} | options)
 
 
@@ -123,11 +123,13 @@ def test_stages_go_from_coarse_to_fine_and_from_soft_to_sharp_and_carry_the_best
 
 @pytest.mark.parametrize("change", [{"softness": 2.0}, {"directions": 128}])
 def test_a_stage_sees_shadows_of_its_own_softness_and_directions(problem, change):
-    seen = ws.render(dataclasses.replace(problem.scene, visibility=ws.Visibility(**{"directions": 64} | change)))
+    seen = ws.Renderer(
+        dataclasses.replace(problem.scene, visibility=ws.Visibility(**{"directions": 64} | change))
+    ).render()
     loss = Recorded()
     fit(small_problem(Pose(0), loss=loss), [Stage(1, **change)])
     assert np.abs(loss.seen[0][0].numpy() - seen).max() < 3e-6 * seen.max()
-    assert np.abs(seen - ws.render(problem.scene)).max() > 1e-2
+    assert np.abs(seen - ws.Renderer(problem.scene).render()).max() > 1e-2
 
 
 def test_the_rate_falls_along_a_cosine_to_a_tenth():
@@ -145,16 +147,16 @@ def test_where_the_last_step_led_counts():
 def test_a_stage_of_a_part_of_a_pixel_rounds_and_corrects_its_camera():
     """The scene explains its own image at sizes that are no whole part of it; by intrinsics times the scale, worse."""
     scene = dataclasses.replace(small_scene(size=(61, 47)), supersampling=4)
-    problem = Problem(scene, Target(ws.render(scene)), Pose(0))
+    problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0))
     setting = problem.setting(torch.device("cpu"))
     for scale in (1 / 2, 0.3, 1 / 4):
         model = Model(problem, setting, Stage(scale=scale))
         image, target = model.images(problem.start(setting))[0].detach().numpy(), model.targets[0].numpy()
         assert image.shape == target.shape == (round(47 * scale), round(61 * scale), 4)
         intrinsics = np.diag([scale, scale, 1]) @ scene.camera.intrinsics
-        uncorrected = ws.render(
+        uncorrected = ws.Renderer(
             dataclasses.replace(scene, camera=dataclasses.replace(model.cameras[0], intrinsics=intrinsics))
-        )
+        ).render()
         assert np.abs(image - target).mean() < 0.5 * np.abs(uncorrected - target).mean()
 
 
@@ -218,7 +220,7 @@ def test_a_fit_names_what_is_wrong_with_it(problem, options, message):
 def test_a_stage_has_its_own_supersampling(problem):
     loss = Recorded()
     fit(small_problem(Pose(0), loss=loss), [Stage(1, supersampling=3)])
-    seen = ws.render(dataclasses.replace(problem.scene, supersampling=3))
+    seen = ws.Renderer(dataclasses.replace(problem.scene, supersampling=3)).render()
     assert np.abs(loss.seen[0][0].numpy() - seen).max() < 3e-6 * seen.max()
 
 
@@ -261,7 +263,7 @@ def stretched_problem() -> Problem:
     ball = dataclasses.replace(ball, mesh=mesh)
     scene = dataclasses.replace(small_scene(), bodies=(ball, ground))
     moved = dataclasses.replace(ball, rotation=(0, 15, 0), translation=(0.2, 1.05, 0.1))
-    target = Target(ws.render(dataclasses.replace(scene, bodies=(moved, ground))))
+    target = Target(ws.Renderer(dataclasses.replace(scene, bodies=(moved, ground))).render())
     return Problem(scene, target, Pose(0), still=None)
 
 
@@ -378,7 +380,7 @@ def test_a_fit_does_not_depend_on_exposure():
 @pytest.mark.slow
 def test_a_fit_at_its_goal_has_converged_as_soon_as_that_can_be_said():
     scene = small_scene()
-    problem = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
+    problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0), still=None)
     for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * WINDOW)):
         result = fit(problem, [Stage(500)], tolerance=1e-3, optimizer=optimizer)
         assert result.reason == "converged"
@@ -397,7 +399,7 @@ def test_a_loss_of_zero_has_converged():
 @pytest.mark.slow
 def test_a_stage_that_has_converged_makes_way_for_the_next():
     scene = small_scene()
-    problem = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
+    problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0), still=None)
     result = fit(problem, [Stage(500), Stage(3)], tolerance=1e-3, optimizer=short_adam)
     assert [len(losses) for losses in result.losses] == [2 * WINDOW, 3] and result.reason == "finished"
     result = fit(problem, [Stage(500, tolerance=0.5), Stage(3)], tolerance=0.0, optimizer=short_adam)
@@ -407,7 +409,7 @@ def test_a_stage_that_has_converged_makes_way_for_the_next():
 def test_a_swing_through_a_low_loss_is_not_convergence():
     """Adam overshoots; that the loss was low for a moment does not mean that it falls no more."""
     scene = small_scene()
-    problem = Problem(scene, Target(1.6 * ws.render(scene)[..., :3]), Exposure(), still=None)
+    problem = Problem(scene, Target(1.6 * ws.Renderer(scene).render()[..., :3]), Exposure(), still=None)
     result = fit(problem, [Stage(150, learning_rate=0.2)], optimizer=short_adam)
     assert result.found.exposures[0] == pytest.approx(1.6, rel=1e-3)
 
@@ -444,7 +446,7 @@ def test_what_becomes_infinite_ends_the_fit_with_the_values_before(case):
     calm = fit(problem, stages[:1], optimizer=optimizer)
     assert min(result.losses[-1]) <= min(calm.losses[0])
     assert all(torch.isfinite(tensor).all() for own in result.values.values() for tensor in own.values())
-    assert np.isfinite(ws.render(result.scene)).all() and np.isfinite(result.images()).all()
+    assert np.isfinite(ws.Renderer(result.scene).render()).all() and np.isfinite(result.images()).all()
     assert np.array_equal(result.images(), calm.images())
 
 
@@ -538,7 +540,7 @@ def test_a_fit_that_has_ended_is_not_computed_again(tmp_path):
 @pytest.mark.slow
 def test_a_converged_and_a_diverged_fit_stay_so(tmp_path):
     scene = small_scene()
-    goal = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
+    goal = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0), still=None)
     converged = [fit(goal, [Stage(500)], tolerance=1e-3, checkpoint=tmp_path / "a") for _ in range(2)]
     assert same(*converged) and converged[1].reason == "converged"
     diverged = []

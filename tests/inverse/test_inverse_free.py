@@ -204,7 +204,7 @@ def test_the_scene_that_is_found_has_the_images_of_the_fit(scene, case):
     got = images_of(problem, setting, values)
     assert np.abs(got - images_of(problem, setting, start)).max() > 1e-3  # what is to be found is not nothing
     for view, seen_by in enumerate(found.cameras):
-        expected = ws.render(dataclasses.replace(found.scene, camera=seen_by))
+        expected = ws.Renderer(dataclasses.replace(found.scene, camera=seen_by)).render()
         assert np.abs(got[view] - expected).max() < POSED * expected.max()
     assert found.scene.camera is found.cameras[0]
 
@@ -249,7 +249,7 @@ def test_two_views_are_the_images_of_two_cameras(scene):
     problem, setting, values = prepared(scene, [Pose(BALL)], blank(VIEWS))
     images = images_of(problem, setting, values)
     for view in range(VIEWS):
-        expected = ws.render(dataclasses.replace(scene, camera=camera(view)))
+        expected = ws.Renderer(dataclasses.replace(scene, camera=camera(view))).render()
         assert np.abs(images[view] - expected).max() < FLOAT32 * expected.max()
     assert np.abs(images[0] - images[1]).max() > 0.1
 
@@ -259,8 +259,8 @@ def test_spheres_that_a_still_scene_does_not_need_are_in_what_is_found(scene):
     problem = Problem(scene, blank(), [Albedo(BALL)], still=ws.Visibility("ray-traced", samples=16))
     setting = problem.setting(torch.device("cpu"))
     found = problem.found(problem.start(setting), setting)
-    expected = ws.render(scene)
-    assert np.abs(ws.render(found.scene) - expected).max() < FLOAT32 * expected.max()
+    expected = ws.Renderer(scene).render()
+    assert np.abs(ws.Renderer(found.scene).render() - expected).max() < FLOAT32 * expected.max()
 
 
 def test_a_texture_starts_from_a_color_and_at_another_size(scene):
@@ -270,7 +270,7 @@ def test_a_texture_starts_from_a_color_and_at_another_size(scene):
     problem, setting, values = prepared(plain, [Texture(GROUND, size=(7, 9))])
     texels = values["texture[1]"]["texels"]
     assert texels.shape == (7, 9, 3) and torch.allclose(texels, torch.tensor(color))
-    assert np.abs(images_of(problem, setting, values)[0] - ws.render(plain)).max() < FLOAT32 * 3
+    assert np.abs(images_of(problem, setting, values)[0] - ws.Renderer(plain).render()).max() < FLOAT32 * 3
     halved = Texture(GROUND, size=(3, 5)).start(setting_of(scene))["texels"].numpy()
     assert np.allclose(halved, ground.texture.reshape(3, 2, 5, 3).mean(axis=1), atol=1e-6)
 
@@ -431,7 +431,9 @@ def test_the_gradient_of_the_loss_is_its_central_difference(soft_scene, dim_scen
 
 def test_every_free_number_of_a_posed_body_has_an_influence(scene):
     """So that no rotation is passed over: the lump's shadow shows all three."""
-    problem, setting, start = prepared(scene, [Pose(BALL, scale=True)], [Target(ws.render(scene)[..., :3] * 0.7)])
+    problem, setting, start = prepared(
+        scene, [Pose(BALL, scale=True)], [Target(ws.Renderer(scene).render()[..., :3] * 0.7)]
+    )
     values = moved(start, 0.01)
     leaves = [tensor.requires_grad_() for tensor in values["pose[0]"].values()]
     loss_of(problem, setting)(values).backward()
@@ -489,7 +491,7 @@ def test_each_recovers_the_truth(scene, dim_scene, case):
 def test_light_is_found_to_the_last_coefficient_by_a_method_of_second_order(scene):
     """The loss is a square of the light, badly conditioned as the camera sees few normals."""
     light = scene.light + np.random.default_rng(4).normal(size=scene.light.shape) * 0.3
-    image = ws.render(dataclasses.replace(scene, light=light))
+    image = ws.Renderer(dataclasses.replace(scene, light=light)).render()
     problem = Problem(scene, Target(image), Light(3), still=None)
     result = fit(problem, [Stage(20, learning_rate=1.0)], optimizer=torch.optim.LBFGS)
     assert np.abs(result.scene.light - light).max() < 0.02

@@ -49,7 +49,7 @@ def run(*free, views=1, scene=None, **options):
     scene = scene or make_scene()
     cameras = [ws.Camera.look_at((0.5 * view, 2, 3), (0, 0.4, 0), size=(16, 12)) for view in range(views)]
     aside = [replace(camera, translation=camera.translation + (0.1, 0, 0)) for camera in cameras]
-    images = [1.2 * ws.render(replace(scene, camera=camera)) for camera in aside]
+    images = [1.2 * ws.Renderer(replace(scene, camera=camera)).render() for camera in aside]
     targets = [Target(image, camera=camera) for image, camera in zip(images, cameras, strict=True)]
     return fit(Problem(scene, targets, free, still=DIRECTIONAL), [Stage(4)], **options)
 
@@ -61,7 +61,7 @@ def rendered_again(folder, result):
     for view in summary["view"]:
         exposure = np.float32([view["exposure"]] * 3 + [1])
         camera = parse_camera({key: value for key, value in view.items() if key != "exposure"})
-        images.append(exposure * ws.render(replace(scene, camera=camera)))
+        images.append(exposure * ws.Renderer(replace(scene, camera=camera)).render())
     return np.stack(images)
 
 
@@ -130,7 +130,7 @@ def test_the_summary_says_how_the_fit_ended(tmp_path):
 
 def test_the_loss_after_is_that_of_the_values_at_full_size_whatever_the_stages_were(tmp_path):
     scene = make_scene()
-    problem = Problem(scene, Target(1.2 * ws.render(scene)), Albedo(0), still=DIRECTIONAL)
+    problem = Problem(scene, Target(1.2 * ws.Renderer(scene).render()), Albedo(0), still=DIRECTIONAL)
     coarse = fit(problem, [Stage(4, scale=0.25)])
     with torch.no_grad():
         images = torch.tensor(coarse.images())

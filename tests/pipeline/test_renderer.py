@@ -14,6 +14,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import by_spheres, groups
 from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.tuning.point_sample import PointSample
 
@@ -318,8 +319,8 @@ def test_the_texels_of_a_body_without_a_texture_are_refused():
 
 def test_supersampling_averages_samples(device):
     fine_camera = CAMERA.resized(4)
-    fine = ws.render(scene_of("directional", camera=fine_camera, supersampling=1), device=device)
-    coarse = ws.render(scene_of("directional", supersampling=4), device=device)
+    fine = Renderer(scene_of("directional", camera=fine_camera, supersampling=1), device=device).render()
+    coarse = Renderer(scene_of("directional", supersampling=4), device=device).render()
     expected = fine.reshape(32, 4, 32, 4, 4).mean(axis=(1, 3))
     assert np.abs(coarse - expected).max() < FLOAT32
     assert ((coarse[..., 3] > 0) & (coarse[..., 3] < 1)).any()
@@ -521,6 +522,24 @@ def test_in_large_images_faces_may_be_larger(size, largest):
         sheet = ws.Body(ws.plane(2.0, quads), blockers=0)
         scene = ws.Scene((sheet,), ws.EnvironmentMap.constant(), camera)
         assert chosen_receivers(scene) == [expected]
+
+
+@pytest.mark.slow
+def test_in_a_picture_shadows_end_sharply_on_a_coarse_ground():
+    """On faces of 13 pixels, under a sun of 2 degrees of radius."""
+    sun = ws.synthetic_sky((0.5, 0.6, 0.4), sun_radius=2, sun_strength=3, height=128)
+    scene = scene_of("directional", ball(), ground(12), light=sun, camera=CAMERA.resized(2))
+    truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=512)))
+    kept, once = (relative_error(image, truth) for image in (Renderer(scene).render(), ws.render(scene)))
+    assert chosen_receivers(scene) == ["vertex", "vertex"] and kept > 0.05  # measured 6.2%
+    assert once < 0.03  # measured 2.4%
+
+
+def test_in_a_picture_only_flat_bodies_that_leave_it_open_are_shaded_by_pixel():
+    bodies = ball(), ground(12), ground(12, receivers="vertex")
+    scene = for_picture(scene_of("directional", *bodies))
+    assert [body.receivers for body in scene.bodies] == ["auto", "pixel", "vertex"]
+    assert for_picture(scene) is scene
 
 
 def test_what_moves_does_not_change_the_choice_and_a_copy_makes_the_same():

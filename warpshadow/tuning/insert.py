@@ -12,6 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
+from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.scene.scene import SCENE, Scene
 from warpshadow.tuning.renderer import Renderer
 
@@ -58,7 +59,7 @@ def insert(
     pixels = linear_photograph(photograph)
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
-    renderer = Renderer(replace(scene, camera=camera), device=device, progress=progress)
+    renderer = Renderer(for_picture(replace(scene, camera=camera)), device=device, progress=progress)
     given = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
         image: np.ndarray = renderer.insert(given).numpy()[0] * np.float32(gain)

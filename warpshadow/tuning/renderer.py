@@ -9,6 +9,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
+from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.scene.scene import AUTO, SCENE, Scene
 from warpshadow.tuning import tune
 
@@ -46,6 +47,10 @@ class Renderer(renderer.Renderer):
 def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True) -> np.ndarray:
     """Render a scene once; for several images of it, keep a :class:`Renderer`.
 
+    Flat bodies, such as grounds, are shaded by pixel unless they say otherwise, so that shadows have smooth edges
+    there. A renderer that is kept has vertices, which take less time, where faces are small: its own
+    :meth:`Renderer.render` is the image to compare with its others. ``Body(…, receivers="pixel")`` has both the same.
+
     Args:
         scene: The scene.
         device: Warp device.
@@ -54,4 +59,5 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """
-    return Renderer(scene, device=device, progress=progress).render()
+    check.instance("scene", scene, Scene, SCENE)
+    return Renderer(for_picture(scene), device=device, progress=progress).render()

@@ -18,6 +18,7 @@ from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
@@ -152,7 +153,10 @@ class Painter:
     def _renderer(self, look: Look, quality: Quality) -> tuple[Hashable, Renderer]:
         """The renderer of what is shown, and by what it is known."""
         scene = look.settings(self.scene, quality)
-        settings = scene.visibility, scene.bounces, scene.supersampling, look.spheres, look.receivers
+        if not quality.is_moving:
+            scene = for_picture(scene)
+        choices = look.spheres, look.receivers, quality.is_moving
+        settings = scene.visibility, scene.bounces, scene.supersampling, *choices
         key = (*vars(settings[0]).values(), *settings[1:])
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
