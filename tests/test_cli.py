@@ -827,6 +827,16 @@ def test_every_command_can_be_quiet(scene, tmp_path, fit_file):
     fails("render", tmp_path / "no.toml", "-o", tmp_path / "out.exr", "-q", parts=("no.toml",))
 
 
+@pytest.mark.parametrize("command", ["render", "view"])
+def test_an_interrupt_is_one_line_and_status_130(scene, tmp_path, monkeypatch, command):
+    def interrupt(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpshadow.scene.files.load_scene", interrupt)
+    result = run(command, scene, *(("-o", tmp_path / "out.exr") if command == "render" else ()))
+    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
+
+
 def test_the_version_is_printed():
     result = run("--version")
     assert result.exit_code == 0 and result.stdout == f"warpshadow {ws.__version__}\n"

@@ -93,9 +93,12 @@ def main(
 
 @contextlib.contextmanager
 def _clear_errors() -> Iterator[None]:
-    """Turn errors in what the user gave into one line and exit status 1."""
+    """Turn errors in what the user gave into one line and exit status 1, and an interrupt into one and 130."""
     try:
         yield
+    except KeyboardInterrupt as error:
+        typer.secho("interrupted", fg="yellow", err=True)  # at once: threads and kernels take a second to end
+        raise typer.Exit(INTERRUPTED) from error
     except (ValueError, OSError, ImportError) as error:
         message = error if error.args else type(error).__name__
         typer.secho(f"error: {message}", fg="red", err=True)
