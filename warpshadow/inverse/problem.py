@@ -20,7 +20,7 @@ from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import Found, Setting
-from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.blockers import blocking_planes, scene_blockers
 from warpshadow.scene.scene import METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
 from warpshadow.tuning.tune import resolved
 
@@ -140,10 +140,8 @@ class Problem:
 
     def _planes(self, scene: Scene) -> set[int]:
         """Bodies that block light as planes, not by spheres, also in the scene that is found."""
-        if scene.visibility.method != "directional":
-            return set()
         reshaped = {free.number for free in self.free if isinstance(free, (Deformation, Radii))}
-        return {number for number, body in enumerate(scene.bodies) if number not in reshaped and body.mesh.is_flat}
+        return set(blocking_planes(scene)) - reshaped
 
     def start(self, setting: Setting) -> dict[str, Values]:
         """Values of what is free, by its name, where the scene has them."""

@@ -17,7 +17,7 @@ from warpshadow.pipeline.lighting import KnownLight, map_of
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import Blocking, OwnLookup
 from warpshadow.pipeline.static import Rows, Static
-from warpshadow.spheres import Spheres
+from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.flats.passing import flat_coverage, past_coverage
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
@@ -92,10 +92,8 @@ class Directional(SphereMethod):
 
     @functools.cached_property
     def blocking_flats(self) -> tuple[int, ...]:
-        """Flat bodies that cast shadows, but for those with spheres of the user's own, unless light bounces."""
-        scene, casting = self.assembly.scene, self.assembly.casting
-        has_given = [isinstance(body.blockers, Spheres) and not scene.bounces for body in scene.bodies]
-        return tuple(number for number in self.flats.numbers if number in casting and not has_given[number])
+        """Those of the scene."""
+        return blocking_planes(self.assembly.scene)
 
     def past_flats(self, group: Group, seen: Seen, taken: Cells) -> Seen:
         """Transmittance past the flat bodies around a group, too."""

@@ -5,6 +5,7 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
+from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 
@@ -20,6 +21,22 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
         return [Spheres.concatenate([])] * len(scene.bodies)
     grounds = _ground_spheres(scene)
     return [_body_spheres(body, ground, device, progress) for body, ground in zip(scene.bodies, grounds, strict=True)]
+
+
+def blocking_planes(scene: Scene) -> tuple[int, ...]:
+    """Find the bodies that block light as the planes in which they lie, in place of their spheres.
+
+    By method "directional" these are flat bodies that cast shadows, but for those with spheres of the user's own,
+    unless light bounces.
+    """
+    if scene.visibility.method != "directional":
+        return ()
+    has_given = [isinstance(body.blockers, Spheres) and not scene.bounces for body in scene.bodies]
+    return tuple(
+        number
+        for number, body in enumerate(scene.bodies)
+        if body.mesh.is_flat and body.casts_shadow and not has_given[number]
+    )
 
 
 def fitted_counts(scene: Scene) -> dict[int, int]:
@@ -78,12 +95,7 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
         return None
     seen_from = np.concatenate(others)
     height = np.mean((seen_from - middle) @ normal)
-    a, b, c = np.moveaxis(corners - seen_from.mean(axis=0), 1, 0)  # [Van Oosterom and Strackee 1983]
-    length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
-    numerator = (a * np.cross(b, c)).sum(axis=1)
-    denominator = length_a * length_b * length_c
-    denominator += (a * b).sum(axis=1) * length_c + (b * c).sum(axis=1) * length_a + (c * a).sum(axis=1) * length_b
-    solid_angle = 2 * np.abs(np.arctan2(numerator, denominator)).sum()
+    solid_angle = np.abs(solid_angles(corners - seen_from.mean(axis=0))).sum()
     cosine = 1 - solid_angle / (2 * np.pi)
     sine = min(np.sqrt(1 - cosine**2), 0.999)  # beyond, float32 would not place a sphere so large on the plane
     radius = height * sine / (1 - sine)

@@ -8,6 +8,7 @@ import numpy as np
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
+from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import Body, Scene
 
 _LEVEL = 0.99  # cosine of the angle to +y up to which a flat body is a ground
@@ -88,13 +89,9 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
 
 
 def _winding_number(mesh: Mesh, point: np.ndarray) -> float:
-    """How often a mesh goes around a point: 1 inside a closed one that faces outwards [Van Oosterom, Strackee 1983]."""
+    """How often a mesh goes around a point: 1 inside a closed one that faces outwards."""
     corners = mesh.positions[mesh.faces].astype(np.float64) - point
-    a, b, c = np.moveaxis(corners, 1, 0)
-    la, lb, lc = np.moveaxis(np.linalg.norm(corners, axis=2), 1, 0)
-    volume = (a * np.cross(b, c)).sum(axis=1)
-    rest = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return float(np.arctan2(volume, rest).sum() / (2 * np.pi))
+    return float(solid_angles(corners).sum() / (4 * np.pi))
 
 
 def _is_ground(body: Body, box: _Box) -> bool:
