@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.topology import Surface, join_faces
+from warpshadow.assets.topology import CREASE, Surface, join_faces, part_at_creases, shared_edges
 from warpshadow.check import AnyPath
 from warpshadow.maths.plane import plane_normal
 
@@ -37,6 +37,8 @@ class Mesh:
         uvs: Texture coordinates, origin at the lower left of the image, float32, shape [uv, 2], or None.
         uv_faces: Indices of uvs, int32, shape [face, 3], or None.
         name: What messages call the mesh.
+        origins: Where :meth:`creased` parted vertices, the one of the mesh before that each is a copy of, int32, shape
+            [vertex]: ``colors[mesh.origins]``. Files do not have it. By default None.
 
     Raises:
         MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
@@ -47,6 +49,7 @@ class Mesh:
     uvs: np.ndarray | None = field(repr=False)
     uv_faces: np.ndarray | None = field(repr=False)
     name: str
+    origins: np.ndarray | None = field(repr=False)
 
     def __init__(
         self,
@@ -55,16 +58,20 @@ class Mesh:
         uvs: npt.ArrayLike | None = None,
         uv_faces: npt.ArrayLike | None = None,
         name: str = "mesh",
+        origins: npt.ArrayLike | None = None,
     ):
         if (uvs is None) != (uv_faces is None):
             missing = "uvs" if uvs is None else "uv_faces"
             raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
-        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None}
+        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None}
         held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
         held["faces"] = _indices("faces", faces, len(vertices), "vertex")
         if uvs is not None and uv_faces is not None:
             held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
             held["uv_faces"] = _indices("uv_faces", uv_faces, len(corners), "uv")
+        if origins is not None:
+            held["origins"] = np.array(origins, np.int32)
+            check.shape("origins", held["origins"].shape, (len(vertices),))
         for array in held.values():
             if array is not None:
                 array.setflags(write=False)
@@ -143,6 +150,33 @@ class Mesh:
         low, high = (corner.astype(np.float64) for corner in self.bounds)
         scale = check.positive("size", size) / (high - low).max() if (high > low).any() else 1.0
         return self.transformed(scale=scale, translation=-scale * (low + high) / 2)
+
+    def creased(self, angle: float = CREASE) -> Mesh:
+        """Part vertices along sharp edges, so that normals do not round them; spheres are not fitted again.
+
+        Where a file has one vertex for all faces of a corner, normals are smooth there: edges turn dark, or bright.
+        Positions, the winding of faces and uvs stay. Vertices stay the first, and copies follow: ``origins`` says of
+        which, so what there is for each vertex (colors, deformed positions) is ``values[mesh.origins]`` of the new mesh.
+
+        Args:
+            angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
+        """
+        if not (check.is_number(angle) and 0 <= angle <= 180):
+            raise MeshError(f"angle: got {check.described(angle)}, expected degrees from 0 to 180")
+        faces, origins = part_at_creases(self.faces, self.surface, self.positions, angle)
+        return replace(self, positions=self.positions[origins], faces=faces, origins=origins)
+
+    @functools.cached_property
+    def rounds_edges(self) -> bool:
+        """Whether it has many sharp edges whose faces share normals, and so looks as :meth:`creased` would not let it.
+
+        Edges of more than 50° are longer in all than the diagonal of its bounds, and ten times as long as those of 20°
+        to 50°. Of organic meshes, in which angles of all sizes occur, they are not (bunny, cow, monkey, man: at most
+        2.6 times as long). Of voxels, whose normals round the steps on purpose, they are longer than 25 diagonals.
+        """
+        sharp, bent = shared_edges(self.surface, self.positions, (50.0, 20.0))
+        low, high = self.bounds
+        return 1 < sharp / max(float(np.linalg.norm(high - low)), 1e-30) < 25 and bent - sharp < 0.1 * sharp
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""

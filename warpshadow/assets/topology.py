@@ -10,6 +10,9 @@ from warpshadow import check
 
 _NOT_MANIFOLD = -2
 
+CREASE = 30.0
+"""Edges whose faces bend by more are sharp [degrees]."""
+
 
 def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:
     """Find the face on the other side of each edge.
@@ -46,6 +49,80 @@ def _places(positions: np.ndarray) -> np.ndarray:
     places = np.zeros(len(positions), np.int64)
     places[order[1:]] = np.cumsum(is_new)
     return places
+
+
+def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make one vertex of those at the same place, and leave out those without faces: positions, faces.
+
+    The first of them stays, in order: so parted vertices become what they were.
+    """
+    used = np.unique(faces)
+    places = _places(positions[used])
+    _, first, place = np.unique(places, return_index=True, return_inverse=True)
+    kept = np.sort(first)
+    number = np.searchsorted(kept, first)[place]
+    renumbered = np.zeros(len(positions), np.int32)
+    renumbered[used] = number
+    return positions[used[kept]], renumbered[faces]
+
+
+def part_at_creases(faces: np.ndarray, surface: Surface, positions: np.ndarray, angle: float) -> tuple[np.ndarray, ...]:
+    """Part the vertices of faces along sharp edges.
+
+    Faces that meet in a vertex keep it together where edges that are not sharp lead from one to the other around it.
+
+    Args:
+        faces: Indices of positions, shape [face, 3].
+        surface: How they are joined.
+        positions: Vertices, shape [vertex, 3].
+        angle: Edges are sharp where the normals of their faces differ by more [degrees]; borders are, too.
+
+    Returns:
+        The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
+        shape [vertex]: the old ones are the first, in their order.
+    """
+    places, normals = _places(positions)[surface.faces], face_normals(positions[surface.faces])
+    face, edge = np.nonzero(surface.neighbors >= 0)
+    across = surface.neighbors[face, edge]
+    is_smooth = np.einsum("ij,ij->i", normals[face], normals[across]) >= np.cos(np.radians(angle))
+    face, edge, across = face[is_smooth], edge[is_smooth], across[is_smooth]
+    links = []
+    for end in (1, 2):
+        corner = (edge + end) % 3
+        other = (places[across] == places[face, corner][:, None]).argmax(axis=1)
+        links.append((3 * face + corner, 3 * across + other))
+    ends, other_ends = np.concatenate(links, axis=1)
+    count = 3 * len(faces)
+    fan = _connected(ends, other_ends, count).reshape(-1, 3)
+    is_turned = (surface.faces != faces).any(axis=1)
+    keys = faces.astype(np.int64) * count + np.where(is_turned[:, None], fan[:, ::-1], fan)
+    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
+    owner = faces.ravel()[first]
+    is_copy = np.append(False, owner[1:] == owner[:-1])
+    vertex = np.where(is_copy, len(positions) - 1 + np.cumsum(is_copy), owner)
+    origins = np.concatenate([np.arange(len(positions)), owner[is_copy]])
+    return vertex[number].reshape(-1, 3).astype(np.int32), origins.astype(np.int32)
+
+
+def shared_edges(surface: Surface, positions: np.ndarray, angles: tuple[float, ...]) -> tuple[float, ...]:
+    """Length in all of the edges whose faces share both vertices and bend by more than each of some angles [degrees]."""
+    corners = positions[surface.faces].astype(np.float64)
+    face, edge = np.nonzero(surface.neighbors > np.arange(len(corners))[:, None])
+    across, ends = surface.neighbors[face, edge], (edge + [[1], [2]]) % 3
+    first, last = surface.faces[face, ends]
+    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in (first, last)]
+    normals = face_normals(corners)
+    cosines = np.einsum("ij,ij->i", normals[face], normals[across])
+    lengths = np.linalg.norm(np.subtract(*corners[face, ends]), axis=1) * np.logical_and(*is_shared)
+    return tuple(float(lengths[cosines < np.cos(np.radians(angle))].sum()) for angle in angles)
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """Unit normals of faces [face, corner, 3], float64 of shape [face, 3]; 0 where a face has no area."""
+    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(lengths > 0, lengths, 1)
 
 
 class Surface(NamedTuple):

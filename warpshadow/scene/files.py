@@ -40,7 +40,7 @@ _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale", "bounces")
-_PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground")
+_PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground", "creased")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {
     "plane": plane,
     "icosphere": icosphere,
@@ -209,7 +209,11 @@ def _body(table: Table, folder: Path) -> Body:
             place["blockers"] = Spheres.read(path)
         del place["spheres"]
     stands = place.pop("on_ground", False)
+    angle = place.pop("creased", None)
     body = Body(**place)
+    if angle is not None:
+        with check.located("creased"):
+            body = body.creased(angle)
     if isinstance(stands, bool):
         return body.on_ground(body.translation) if stands else body
     check.instance("on_ground", stands, Mapping, "true or false, or a table such as {size = 2.0}")

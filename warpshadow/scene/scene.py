@@ -17,6 +17,7 @@ from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import MeshSource, is_of_trimesh, load_textured_mesh
+from warpshadow.assets.topology import CREASE
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, falloff_width
@@ -316,6 +317,15 @@ class Body:
         x, y, z = np.array(self.rotation) / np.linalg.norm(self.rotation)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+    def creased(self, angle: float = CREASE) -> Body:
+        """Part the vertices of its mesh along sharp edges, :meth:`warpshadow.Mesh.creased`; their colors go along.
+
+        Args:
+            angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
+        """
+        mesh = self.mesh.creased(angle)
+        return replace(self, mesh=mesh, albedo=self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins])
 
     @check.keywords(rotation="Body(…, rotation=…).on_ground(…)", scale="size", height="size", translation="foot")
     def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:
