@@ -100,6 +100,13 @@ def refinement(device):
     return stage_2.Refinement(mesh, rng), spheres.astype(np.float32).astype(np.float64)
 
 
+def seen_from(fit, chosen):
+    """Points [receiver, 3] of a refinement, and the directions that they look to [receiver, direction, 3]."""
+    places = fit.places[:, chosen].T.astype(np.float64)
+    frames = places[:, 3:].reshape(-1, 3, 3)
+    return places[:, :3], np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), frames)
+
+
 def differences(loss, spheres, step):
     """Central differences of a loss by centers and logarithms of radii."""
     result = np.zeros_like(spheres)
@@ -185,8 +192,7 @@ def test_soft_transmittance_and_loss_agree_with_float64(refinement):
     chosen = np.arange(0, fit.RECEIVERS, 97)
     width = 0.1
     got = fit.transmittance(spheres, chosen, width)
-    points = fit.points.numpy()[chosen].astype(np.float64)
-    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    points, directions = seen_from(fit, chosen)
     np.testing.assert_allclose(got, twin_transmittance(points, directions, spheres, width), atol=2e-4)
 
 
@@ -195,12 +201,11 @@ def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
     fit, spheres = refinement
     chosen = np.arange(0, fit.RECEIVERS, 61)
     width = 0.1
-    points = fit.points.numpy()[chosen].astype(np.float64)
-    directions = np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), fit.frames.numpy()[chosen])
+    points, directions = seen_from(fit, chosen)
 
     def loss(balls):
         error = twin_transmittance(points, directions, balls, width) - fit.visibility[chosen]
-        return ((error @ fit.metric.astype(np.float64)) * fit.weights[chosen] * error).sum() / len(chosen)
+        return (fit.weights[chosen] * (error @ fit.lights.astype(np.float64)) ** 2).sum() / len(chosen)
 
     got_loss, got = fit.gradient(spheres, chosen, width)
     assert got_loss == pytest.approx(loss(spheres), rel=1e-4)

@@ -87,12 +87,12 @@ class BundleCones(NamedTuple):
     sine: np.ndarray
 
 
-def bundle_cones(directions: np.ndarray, width: float = 0.0) -> BundleCones:
-    """Bound every run of 4 directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
+def bundle_cones(directions: np.ndarray, width: float = 0.0, length: int = BUNDLE) -> BundleCones:
+    """Bound every run of ``length`` directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
 
     All three together must stay within 180°, where cosines order angles; a bundle that is too wide culls nothing.
     """
-    bundles = directions.reshape(-1, BUNDLE, 3)
+    bundles = directions.reshape(-1, length, 3)
     axes = bundles.mean(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
     cosine = np.minimum(np.einsum("bqx,bx->bq", bundles, axes).min(axis=1), 1.0)

@@ -73,18 +73,20 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
     left = np.concatenate(shares).astype(np.float32)
 
     reach = balls[:, 3] + 0.1 * spacing
-    squares = (balls[:, :3] ** 2).sum(axis=1)[:, None] + (samples**2).sum(axis=1) - 2 * balls[:, :3] @ samples.T
-    covers = (squares < reach[:, None] ** 2).astype(np.float32)
+    squares = (samples**2).sum(axis=1)[:, None] + (balls[:, :3] ** 2).sum(axis=1) - 2 * samples @ balls[:, :3].T
+    covers = (squares < reach**2).astype(np.float32)  # [sample, ball]
+    gain = left @ covers
     picked = np.zeros(len(balls), bool)
     chosen = []
     for _ in range(min(count, len(balls))):
-        gain = np.where(picked, -1.0, covers @ left)
-        best = int(np.argmax(gain))
+        best = int(np.argmax(np.where(picked, -1.0, gain)))
         if gain[best] < 1e-4:  # nothing left to cover: descent will find work for the rest
             best = int(rng.choice(np.flatnonzero(~picked)))
         picked[best] = True
         chosen.append(best)
-        left *= 1 - 0.9 * covers[best]
+        covered = np.flatnonzero(covers[:, best])
+        gain -= 0.9 * left[covered] @ covers[covered]
+        left[covered] *= 0.1
     return balls[chosen], balls
 
 

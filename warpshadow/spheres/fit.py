@@ -17,6 +17,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.cache import cache_path, remembered
 from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.topology import welded
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
@@ -27,7 +28,7 @@ from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
-ALGORITHM_VERSION = 3
+ALGORITHM_VERSION = 4
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
 
 COVER_STEPS = 200
@@ -108,10 +109,8 @@ def is_fitted(mesh: Mesh, count: int, *, device: wp.DeviceLike = "cpu") -> bool:
 
 def _job(mesh: Mesh, seed: int, steps: int, device: wp.Device) -> tuple[_Job, np.ndarray, float]:
     """What decides a fit of a mesh; the middle of its bounds and their diagonal."""
-    positions = np.asarray(mesh.positions, np.float64)
-    faces = np.asarray(mesh.faces, np.int32)
-    used, renumbered = np.unique(faces, return_inverse=True)
-    positions, faces = positions[used], renumbered.reshape(-1, 3).astype(np.int32)
+    positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
+    positions = positions.astype(np.float64)
     corners = positions[faces]
     if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
         raise ValueError("mesh: got only faces without area, expected a surface")

@@ -5,14 +5,20 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
 from warpshadow.stages.visibility.cones import BLEND, make_cone
 
 _cone = make_cone(1)
 _Lane, _Vectors = lane_type(1), vectors_type(1)
 
+_TEST_COST = 2.0
+"""Nanoseconds that a sphere costs for a ray."""
+
 
 @wp.kernel(enable_backward=False)
 def _exact_occlusion(
+    first_row: int,
+    worker: int,
     # in
     points: wp.array2d[wp.vec3],
     directions: wp.array[wp.vec3],
@@ -22,7 +28,8 @@ def _exact_occlusion(
     occlusion: wp.array3d[wp.uint8],
 ):
     """Each thread owns one ray: a receiver and a direction."""
-    batch, vertex, direction = wp.tid()
+    row, direction = wp.tid()
+    batch, vertex = split_row(first_row + row, points.shape[1])
     blocked = wp.uint8(0)
     for sphere in range(radii.shape[1]):
         radius = radii[batch, sphere]
@@ -69,5 +76,6 @@ def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, r
     check.shape("radii", radii.shape, centers.shape)
     occlusion = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     inputs = [points, directions, centers, radii]
-    launch(_exact_occlusion, occlusion.shape, inputs=inputs, outputs=[occlusion])
+    cost = _TEST_COST * max(1, radii.shape[1])
+    launch(_exact_occlusion, (points.size, *directions.shape), inputs=inputs, outputs=[occlusion], cost=cost)
     return occlusion

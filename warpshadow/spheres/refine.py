@@ -8,6 +8,7 @@ little are relocated on the way.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
@@ -15,59 +16,177 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.lanes import lane_type, vectors_type
+from warpshadow.device.lanes import (
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    use_vector_registers,
+    vectors_type,
+)
 from warpshadow.device.launch import launch
 from warpshadow.spheres.adam import Adam
+from warpshadow.maths.directions import bundle_cones
+from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.stages.visibility.cones import make_cone
+from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
+from warpshadow.stages.visibility.walk import seen_type
 
-LANES = 16
-"""Directions that a thread handles at once."""
+BUNDLE = 16
+"""Directions of a receiver's hemisphere that are near each other, which a sphere reaches or misses together."""
 
 _RAY_COST = 500.0
 """Nanoseconds that a ray takes."""
 
-_PAIR_COST = 0.5
+_SPHERE_COST = 10.0
+"""Nanoseconds that it takes to see a sphere from a receiver."""
+
+_PAIR_COST = 0.1
 """Nanoseconds that a sphere costs for a receiver and a direction."""
 
-_Lane = lane_type(LANES)
+_Bundle = lane_type(BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
-_Scalar, _Vectors = lane_type(1), vectors_type(1)
-_cone = make_cone(1)
+_PLACE = 12
+"""Numbers that say where a receiver is: its point, and the rows of its frame."""
+
+# ------------------------------------------------------------------------------------------------- cones
+
+
+class _Cones(NamedTuple):
+    """Kernels on what receivers see of spheres."""
+
+    project: wp.Kernel
+    pull: wp.Kernel
+
+
+@functools.cache
+def _make_cones(lanes: int) -> _Cones:
+    Lane, Vectors, Seen = lane_type(lanes), vectors_type(lanes), seen_type(lanes)
+    cone_of, falloff, falloff_pull = make_cone(lanes), make_falloff(lanes), make_falloff_pull(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, total = fn.sqrt, fn.total
+
+    @wp.func(inline=True)
+    def see(places: wp.array2d(dtype=Lane), group: int, ball: wp.vec4):
+        """A sphere as a group of receivers sees it, in their frames."""
+        x = Lane(ball[0]) - places[0, group]
+        y = Lane(ball[1]) - places[1, group]
+        z = Lane(ball[2]) - places[2, group]
+        offset = Vectors(
+            wp.cw_mul(places[3, group], x) + wp.cw_mul(places[4, group], y) + wp.cw_mul(places[5, group], z),
+            wp.cw_mul(places[6, group], x) + wp.cw_mul(places[7, group], y) + wp.cw_mul(places[8, group], z),
+            wp.cw_mul(places[9, group], x) + wp.cw_mul(places[10, group], y) + wp.cw_mul(places[11, group], z),
+        )
+        seen = Seen()
+        seen.offset = offset
+        seen.curvature = 1.0 / ball[3]
+        seen.cone = cone_of(offset, seen.curvature)
+        seen.share = Lane(1.0)
+        return seen
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def project(
+        first_row: int,
+        worker: int,
+        # in
+        places: wp.array2d(dtype=Lane),
+        balls: wp.array(dtype=wp.vec4),
+        cos_width: float,
+        sin_width: float,
+        caps: wp.array2d(dtype=wp.float32),
+        # out
+        axes: wp.array2d(dtype=wp.vec3),
+        edges: wp.array2d(dtype=wp.vec3),
+        reached: wp.array2d(dtype=wp.int32),
+    ):
+        """A thread owns a group of receivers and a sphere: its direction; lo, 1/(hi − lo), opacity; bundles reached."""
+        row, sphere = wp.tid()
+        group = first_row + row
+        seen = see(places, group, balls[sphere])
+        cone = seen.cone
+        sine = sqrt(cone.sine2)
+        low = cos_width * cone.cosine - sin_width * sine
+        outer = cos_width * sine + sin_width * cone.cosine
+        slope, opacity = falloff(cone, sine, low, cos_width, sin_width)
+        bits = Lane(0.0)
+        bit = float(1.0)
+        for bundle in range(caps.shape[0]):
+            along = caps[bundle, 0] * cone.axis.x + caps[bundle, 1] * cone.axis.y + caps[bundle, 2] * cone.axis.z
+            beyond = along - caps[bundle, 3] * low + caps[bundle, 4] * outer
+            bits += bit * wp.min(wp.max(1.0e20 * beyond, Lane(0.0)), Lane(1.0))
+            bit *= 2.0
+        for lane in range(lanes):
+            i = group * lanes + lane
+            axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
+            edges[i, sphere] = wp.vec3(low[lane], slope[lane], opacity[lane])
+            reached[i, sphere] = int(bits[lane])
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def pull(
+        first_row: int,
+        worker: int,
+        # in
+        places: wp.array2d(dtype=Lane),
+        balls: wp.array(dtype=wp.vec4),
+        cos_width: float,
+        sin_width: float,
+        edges: wp.array2d(dtype=wp.vec3),
+        sums: wp.array2d(dtype=_Sums),
+        # out
+        by_balls: wp.array2d(dtype=wp.vec4),
+    ):
+        """A thread owns a group of receivers and a sphere, and sums up the gradients of all of the group."""
+        row, sphere = wp.tid()
+        group = first_row + row
+        seen = see(places, group, balls[sphere])
+        sine = sqrt(seen.cone.sine2)
+        low = cos_width * seen.cone.cosine - sin_width * sine
+        x = Lane()
+        y = Lane()
+        z = Lane()
+        sum_ = Lane()
+        sum_t = Lane()
+        by_opacity = Lane()
+        slope = Lane()
+        for lane in range(lanes):
+            i = group * lanes + lane
+            edge = edges[i, sphere]
+            own = sums[i, sphere]
+            factor = -6.0 * edge[2]
+            x[lane] = factor * own[0]
+            y[lane] = factor * own[1]
+            z[lane] = factor * own[2]
+            sum_[lane] = factor * own[3]
+            sum_t[lane] = factor * own[4]
+            by_opacity[lane] = -own[5]
+            slope[lane] = edge[1]
+        by_offset, by_radius, _ = falloff_pull(
+            seen, sine, low, cos_width, sin_width, slope, by_opacity, sum_, sum_t, Vectors(x, y, z)
+        )
+        by_balls[group, sphere] = wp.vec4(
+            total(
+                wp.cw_mul(places[3, group], by_offset.x)
+                + wp.cw_mul(places[6, group], by_offset.y)
+                + wp.cw_mul(places[9, group], by_offset.z)
+            ),
+            total(
+                wp.cw_mul(places[4, group], by_offset.x)
+                + wp.cw_mul(places[7, group], by_offset.y)
+                + wp.cw_mul(places[10, group], by_offset.z)
+            ),
+            total(
+                wp.cw_mul(places[5, group], by_offset.x)
+                + wp.cw_mul(places[8, group], by_offset.y)
+                + wp.cw_mul(places[11, group], by_offset.z)
+            ),
+            total(by_radius),
+        )
+
+    return _Cones(project, pull)
+
 
 # ------------------------------------------------------------------------------------------------- transmittance
-
-
-@wp.kernel
-def _project_spheres(
-    # in
-    points: wp.array[wp.vec3],
-    frames: wp.array[wp.mat33],
-    chosen: wp.array[int],
-    balls: wp.array2d[wp.vec4],
-    width: float,
-    # out
-    axes: wp.array2d[wp.vec3],
-    edges: wp.array2d[wp.vec3],
-):
-    """Each thread owns a sphere as one receiver sees it: direction in its frame; lo, 1/(hi − lo), opacity."""
-    i, sphere = wp.tid()
-    receiver = chosen[i]
-    ball = balls[i, sphere]
-    radius = ball[3]
-    toward = frames[receiver] * (wp.vec3(ball[0], ball[1], ball[2]) - points[receiver])
-    cone = _cone(_Vectors(_Scalar(toward[0]), _Scalar(toward[1]), _Scalar(toward[2])), 1.0 / radius)
-    cosine = cone.cosine[0]
-    sine2 = cone.sine2[0]
-    sine = wp.sqrt(sine2)
-    lo = cosine * wp.cos(width) - sine * wp.sin(width)
-    inner = wp.max(sine * wp.cos(width) - cosine * wp.sin(width), 0.0)
-    hi = wp.sqrt(1.0 - inner * inner)
-    opacity = cone.weight[0] * wp.min((sine2 / (1.0 + cosine)) / (1.0 - 0.5 * (hi + lo)), 1.0)
-    if toward[2] < -radius - width * wp.length(toward):
-        opacity = 0.0  # wholly below the horizon
-    axes[i, sphere] = wp.vec3(cone.axis.x[0], cone.axis.y[0], cone.axis.z[0])
-    edges[i, sphere] = wp.vec3(lo, 1.0 / (hi - lo), opacity)
 
 
 @wp.kernel(enable_backward=False)
@@ -77,25 +196,26 @@ def _transmit(
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[wp.vec3],
-    directions: wp.array2d[_Lane],
+    reached: wp.array2d[int],
+    directions: wp.array2d[_Bundle],
     # out
-    transmittance: wp.array2d[_Lane],
+    transmittance: wp.array2d[_Bundle],
 ):
-    """Each thread owns one receiver and a lane of directions."""
-    row, q = wp.tid()
+    """Each thread owns one receiver and a bundle of directions."""
+    row, bundle = wp.tid()
     i = first_row + row
-    x = directions[0, q]
-    y = directions[1, q]
-    z = directions[2, q]
-    passing = _Lane(1.0)
+    x = directions[0, bundle]
+    y = directions[1, bundle]
+    z = directions[2, bundle]
+    passing = _Bundle(1.0)
     for sphere in range(axes.shape[1]):
-        edge = edges[i, sphere]
-        if edge[2] > 0.0:
+        if (reached[i, sphere] >> bundle) & 1 != 0:
+            edge = edges[i, sphere]
             axis = edge[1] * axes[i, sphere]
-            t = axis[0] * x + axis[1] * y + axis[2] * z - _Lane(edge[0] * edge[1])
-            t = wp.min(wp.max(t, _Lane(0.0)), _Lane(1.0))
-            passing = wp.cw_mul(passing, _Lane(1.0) - edge[2] * wp.cw_mul(wp.cw_mul(t, t), _Lane(3.0) - 2.0 * t))
-    transmittance[i, q] = passing
+            t = axis[0] * x + axis[1] * y + axis[2] * z - _Bundle(edge[0] * edge[1])
+            t = wp.min(wp.max(t, _Bundle(0.0)), _Bundle(1.0))
+            passing = wp.cw_mul(passing, _Bundle(1.0) - edge[2] * wp.cw_mul(wp.cw_mul(t, t), _Bundle(3.0) - 2.0 * t))
+    transmittance[i, bundle] = passing
 
 
 # With t = k (u·ω − lo) clamped to [0, 1], k = 1/(hi − lo), s = t²(3 − 2t) and the gradient by log T_q in `upstream`,
@@ -105,34 +225,41 @@ def _transmit(
 # In C++ because its sums stay in vector registers: for 256 receivers × 64 spheres × 128 directions it takes
 # 1.1 ms on one core, Warp's own vectors 5.7 ms.
 _EDGE_SUMS = f"""
-const int count = directions.shape[1] * {LANES};
+const int bundles = directions.shape[1], count = bundles * {BUNDLE};
 const float *x = (const float*)directions.data, *y = x + count, *z = y + count;
 const float *up = (const float*)upstream.data + (size_t)i * count;
 const float ux = axis[0] * edge[1], uy = axis[1] * edge[1], uz = axis[2] * edge[1], u0 = edge[0] * edge[1];
-float s0[{LANES}] = {{0}}, s1[{LANES}] = {{0}}, s2[{LANES}] = {{0}};
-float s3[{LANES}] = {{0}}, s4[{LANES}] = {{0}}, s5[{LANES}] = {{0}};
-for (int q = 0; q < count; q += {LANES}) {{
-    for (int l = 0; l < {LANES}; ++l) {{
-        float t = ux * x[q + l] + uy * y[q + l] + uz * z[q + l] - u0;
+float sum[6][{BUNDLE}] = {{}};
+for (int bundle = 0; bundle < bundles; ++bundle) {{
+    if (!((reached >> bundle) & 1))
+        continue;
+    const int first = bundle * {BUNDLE};
+    for (int l = 0; l < {BUNDLE}; ++l) {{
+        const int q = first + l;
+        float t = ux * x[q] + uy * y[q] + uz * z[q] - u0;
         t = t < 0.f ? 0.f : t;
         t = t > 1.f ? 1.f : t;
         const float s = t * t * (3.f - 2.f * t);
         float passing = 1.f - edge[2] * s;
         passing = passing < 1e-6f ? 1e-6f : passing;
-        const float share = up[q + l] / passing;
+        const float share = up[q] / passing;
         const float g = share * t * (1.f - t);
-        s0[l] += g * x[q + l];
-        s1[l] += g * y[q + l];
-        s2[l] += g * z[q + l];
-        s3[l] += g;
-        s4[l] += g * t;
-        s5[l] += share * s;
+        sum[0][l] += g * x[q];
+        sum[1][l] += g * y[q];
+        sum[2][l] += g * z[q];
+        sum[3][l] += g;
+        sum[4][l] += g * t;
+        sum[5][l] += share * s;
     }}
 }}
 wp::vec_t<6, wp::float32> sums;
-for (int l = 0; l < {LANES}; ++l) {{
-    sums[0] += s0[l]; sums[1] += s1[l]; sums[2] += s2[l];
-    sums[3] += s3[l]; sums[4] += s4[l]; sums[5] += s5[l];
+for (int k = 0; k < 6; ++k) {{
+    float eight[8], four[4];
+    for (int l = 0; l < 8; ++l)
+        eight[l] = sum[k][l] + sum[k][l + 8];
+    for (int l = 0; l < 4; ++l)
+        four[l] = eight[l] + eight[l + 4];
+    sums[k] = (four[0] + four[1]) + (four[2] + four[3]);
 }}
 return sums;
 """
@@ -140,36 +267,35 @@ return sums;
 
 @wp.func_native(_EDGE_SUMS)
 def _edge_sums(
-    axis: wp.vec3, edge: wp.vec3, directions: wp.array2d[_Lane], upstream: wp.array2d[_Lane], i: int
+    axis: wp.vec3,
+    edge: wp.vec3,
+    reached: int,
+    directions: wp.array2d[_Bundle],
+    upstream: wp.array2d[_Bundle],
+    i: int,
 ) -> _Sums: ...
 
 
 @wp.kernel(enable_backward=False)
-def _transmit_backward(
+def _transmit_adjoint(
     first_row: int,
     worker: int,
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[wp.vec3],
-    directions: wp.array2d[_Lane],
-    upstream: wp.array2d[_Lane],
+    reached: wp.array2d[int],
+    directions: wp.array2d[_Bundle],
+    upstream: wp.array2d[_Bundle],
     # out
-    by_axes: wp.array2d[wp.vec3],
-    by_edges: wp.array2d[wp.vec3],
+    sums: wp.array2d[_Sums],
 ):
     """Each thread owns a sphere as one receiver sees it."""
     row, sphere = wp.tid()
     i = first_row + row
-    edge = edges[i, sphere]
-    by_axis = wp.vec3(0.0)
-    by_edge = wp.vec3(0.0)
-    if edge[2] > 0.0:
-        sums = _edge_sums(axes[i, sphere], edge, directions, upstream, i)
-        factor = -6.0 * edge[2] * edge[1]
-        by_axis = factor * wp.vec3(sums[0], sums[1], sums[2])
-        by_edge = wp.vec3(-factor * sums[3], factor * sums[4] / (edge[1] * edge[1]), -sums[5])
-    by_axes[i, sphere] = by_axis
-    by_edges[i, sphere] = by_edge
+    own = _Sums()
+    if reached[i, sphere] != 0 and edges[i, sphere][2] > 0.0:
+        own = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
+    sums[i, sphere] = own
 
 
 # ------------------------------------------------------------------------------------------------- receivers
@@ -197,10 +323,11 @@ def _trace_frames(
 
 
 def hemisphere(count: int) -> np.ndarray:
-    """Directions about z with the cosine as density: each stands for as much irradiance [count, 3]."""
+    """Directions about z with the cosine as density, each stands for as much irradiance; in bundles [count, 3]."""
     i = np.arange(count) + 0.5
     radius, azimuth = np.sqrt(i / count), i * np.pi * (1 + np.sqrt(5))
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], axis=1)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], axis=1)
+    return directions[compact_order(directions, runs=(BUNDLE,))]
 
 
 def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -215,7 +342,7 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _light_metric(directions: np.ndarray) -> np.ndarray:
-    """Matrix M of the loss e·M e that errors e of visibility cause under light of several sharpnesses.
+    """Matrix F [direction, light] of the loss |e F|² that errors e of visibility cause under light of several sharpnesses.
 
     The error is smoothed with lobes of 0.6 and 0.25 radians and with the whole hemisphere: the irradiance
     error under lights of that width from anywhere.
@@ -227,16 +354,19 @@ def _light_metric(directions: np.ndarray) -> np.ndarray:
         smooth = np.exp(-0.5 * (angles / lobe) ** 2)
         smooth /= smooth.sum(axis=1, keepdims=True)
         metric += smooth.T @ smooth
-    return (metric / count).astype(np.float32)
+    strengths, lights = np.linalg.eigh(metric / count)
+    matters = strengths > 1e-4 * strengths.max()
+    return (lights[:, matters] * np.sqrt(strengths[matters])).astype(np.float32)
 
 
 class _View(NamedTuple):
     """Spheres as the receivers of a batch see them."""
 
-    chosen: wp.array  # [receiver] int32
-    balls: wp.array  # [receiver, sphere] vec4
+    places: wp.array  # [12, group] lanes
+    balls: wp.array  # [sphere] vec4
     axes: wp.array  # [receiver, sphere] vec3
     edges: wp.array  # [receiver, sphere] vec3
+    reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
 
 
 class Refinement:
@@ -256,21 +386,23 @@ class Refinement:
     RELOCATIONS = 9
 
     def __init__(self, mesh: NormalizedMesh, rng: np.random.Generator):
+        use_vector_registers(__name__)
         self.device, self.rng = mesh.device, rng
         points, normals = self._receivers(mesh)
         frames = _frames(normals, rng)
         directions = hemisphere(self.DIRECTIONS)
         array = partial(wp.array, device=self.device)
-        self.points = array(points.astype(np.float32), dtype=wp.vec3)
-        self.frames = array(frames, dtype=wp.mat33)
-        lanes = np.ascontiguousarray(directions.T, dtype=np.float32).reshape(3, -1, LANES)
-        self.directions = array(lanes, dtype=_Lane)
+        self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
+        bundles = np.ascontiguousarray(directions.T, dtype=np.float32).reshape(3, -1, BUNDLE)
+        self.directions = array(bundles, dtype=_Bundle)
+        self.caps = array(np.column_stack(bundle_cones(directions, max(self.WIDTHS), BUNDLE)), dtype=wp.float32)
         visibility = wp.empty((len(points), self.DIRECTIONS), dtype=wp.uint8, device=self.device)
         rays = array(directions.astype(np.float32), dtype=wp.vec3)
-        inputs = [mesh.mesh.id, self.points, self.frames, rays]
+        starts = array(points.astype(np.float32), dtype=wp.vec3), array(frames, dtype=wp.mat33)
+        inputs = [mesh.mesh.id, *starts, rays]
         launch(_trace_frames, visibility.shape, inputs=inputs, outputs=[visibility], cost=_RAY_COST)
         self.visibility = visibility.numpy().astype(np.float32)
-        self.metric = _light_metric(directions)
+        self.lights = _light_metric(directions)
         # a camera in the open sees a receiver along the rays that escape, so its error counts as often
         openness = (self.visibility / directions[:, 2]).mean(axis=1) / 2
         floor = self.VISIBLE_FLOOR
@@ -305,60 +437,63 @@ class Refinement:
         return np.concatenate([surface, ground, shell]), np.concatenate([surface_normals, ground_normals, toward])
 
     def _project(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> _View:
-        balls = np.broadcast_to(spheres.astype(np.float32), (len(chosen), *spheres.shape))
-        view = _View(
-            wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.device),
-            wp.array(balls, dtype=wp.vec4, device=self.device),
-            wp.empty(balls.shape[:2], dtype=wp.vec3, device=self.device),
-            wp.empty(balls.shape[:2], dtype=wp.vec3, device=self.device),
+        lanes = lane_count(self.device)
+        groups = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
+        places = np.ascontiguousarray(self.places[:, groups]).reshape(_PLACE, -1, lanes)
+        placed = wp.array(places, dtype=lane_type(lanes), device=self.device)
+        balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
+        shape = len(groups), len(spheres)
+        outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
+        launch(
+            _make_cones(lanes).project,
+            (placed.shape[1], len(spheres)),
+            inputs=[placed, balls, np.cos(width), np.sin(width), self.caps],
+            outputs=outputs,
+            cost=_SPHERE_COST * lanes,
         )
-        inputs = [self.points, self.frames, view.chosen, view.balls, width]
-        launch(_project_spheres, balls.shape[:2], inputs=inputs, outputs=[view.axes, view.edges])
-        return view
+        return _View(placed, balls, *outputs)
 
     def _see_through(self, view: _View) -> np.ndarray:
-        transmittance = wp.empty((len(view.chosen), self.directions.shape[1]), dtype=_Lane, device=self.device)
+        count, sphere_count = view.axes.shape
+        transmittance = wp.empty((count, self.directions.shape[1]), dtype=_Bundle, device=self.device)
         launch(
             _transmit,
             transmittance.shape,
-            inputs=[view.axes, view.edges, self.directions],
+            inputs=[view.axes, view.edges, view.reached, self.directions],
             outputs=[transmittance],
-            cost=_PAIR_COST * LANES * view.axes.shape[1],
+            cost=_PAIR_COST * BUNDLE * sphere_count,
         )
-        return transmittance.numpy().reshape(len(view.chosen), -1)
+        return transmittance.numpy().reshape(count, -1)
 
     def transmittance(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
         """Transmittance of spheres [sphere, 4] at the chosen receivers, [receiver, direction]."""
-        return self._see_through(self._project(spheres, chosen, width))
+        return self._see_through(self._project(spheres, chosen, width))[: len(chosen)]
 
     def _loss(self, transmittance: np.ndarray, chosen: np.ndarray) -> tuple[float, np.ndarray]:
-        """Loss of a batch, and its gradient by the transmittance."""
-        error = transmittance - self.visibility[chosen]
-        upstream = (error @ self.metric) * self.weights[chosen]
-        return float(np.vdot(upstream, error)) / len(chosen), upstream * (2 / len(chosen))
+        """Loss of a batch, and its gradient by the errors under the lights, [receiver, light]."""
+        errors = (transmittance - self.visibility[chosen]) @ self.lights
+        weighted = errors * (self.weights[chosen] / len(chosen))
+        return float(np.vdot(weighted, errors)), 2 * weighted
 
     def gradient(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> tuple[float, np.ndarray]:
         """Loss over the chosen receivers, and its gradient by centers and logarithms of radii [sphere, 4]."""
         view = self._project(spheres, chosen, width)
         transmittance = self._see_through(view)
-        loss, by_transmittance = self._loss(transmittance, chosen)
-        upstream = (by_transmittance * transmittance).astype(np.float32).reshape(len(chosen), -1, LANES)
-        inputs = [view.axes, view.edges, self.directions, wp.array(upstream, dtype=_Lane, device=self.device)]
-        by_view = [wp.empty_like(view.axes), wp.empty_like(view.edges)]
-        cost = _PAIR_COST * self.DIRECTIONS
-        launch(_transmit_backward, view.axes.shape, inputs=inputs, outputs=by_view, cost=cost)
-        # every receiver has its own copy of the spheres: sums in a fixed order give the same bits on every run
-        by_balls = wp.zeros_like(view.balls)
-        wp.launch(
-            _project_spheres,
-            dim=view.balls.shape,
-            inputs=[self.points, self.frames, view.chosen, view.balls, width],
-            outputs=[view.axes, view.edges],
-            adj_inputs=[None, None, None, by_balls, 0.0],
-            adj_outputs=by_view,
-            adjoint=True,
-            device=self.device,
-        )
+        upstream = np.zeros_like(transmittance)
+        passing = transmittance[: len(chosen)]
+        loss, by_errors = self._loss(passing, chosen)
+        upstream[: len(chosen)] = (by_errors @ self.lights.T) * passing
+        by_logs = wp.array(upstream.reshape(len(upstream), -1, BUNDLE), dtype=_Bundle, device=self.device)
+        sums = wp.empty(view.axes.shape, dtype=_Sums, device=self.device)
+        inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
+        cost = 2 * _PAIR_COST * self.DIRECTIONS
+        launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
+        # every group of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
+        shape = view.places.shape[1], len(spheres)
+        by_balls = wp.empty(shape, dtype=wp.vec4, device=self.device)
+        inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]
+        lanes = lane_count(self.device)
+        launch(_make_cones(lanes).pull, shape, inputs=inputs, outputs=[by_balls], cost=2 * _SPHERE_COST * lanes)
         gradient = by_balls.numpy().sum(axis=0, dtype=np.float64)
         gradient[:, 3] *= spheres[:, 3]
         return loss, gradient
@@ -374,10 +509,10 @@ class Refinement:
         fresh[:, 3] = np.minimum(fresh[:, 3], 2 * np.median(spheres[:, 3])) * rng.uniform(0.5, 1.1, size=75)
         candidates = np.concatenate([fresh, near])
 
-        alone = [self._alone(sphere, chosen, width) for sphere in spheres]
+        alone = self._alone(np.concatenate([spheres, candidates]), chosen, width)
+        alone, offers = alone[: len(spheres)], alone[len(spheres) :]
         together = np.prod(alone, axis=0)
         without = [self._loss(together / each, chosen)[0] for each in alone]
-        offers = [self._alone(candidate, chosen, width) for candidate in candidates]
         current = self._loss(together, chosen)[0]
         moved = []
         for sphere in np.argsort(without)[:6]:
@@ -391,9 +526,13 @@ class Refinement:
             moved.append(int(sphere))
         return moved
 
-    def _alone(self, sphere: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
-        """Transmittance of one sphere, kept from 0 so that it can be divided out again."""
-        return np.maximum(self.transmittance(sphere[None], chosen, width).astype(np.float64), 1e-6)
+    def _alone(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
+        """Transmittance of each sphere, [sphere, receiver, direction], kept from 0 so that it can be divided out again."""
+        view = self._project(spheres, chosen, width)
+        rows = [each.reshape((-1, 1)) for each in (view.axes, view.edges, view.reached)]  # of one sphere each
+        alone = self._see_through(_View(view.places, view.balls, *rows))
+        alone = alone.reshape(-1, len(spheres), self.DIRECTIONS)[: len(chosen)].swapaxes(0, 1)
+        return np.maximum(alone, np.float32(1e-6))
 
     def run(self, spheres: np.ndarray, balls: np.ndarray, steps: int) -> Iterator[np.ndarray]:
         """Refine spheres by Adam; yields them [sphere, 4] after every step."""
