@@ -308,6 +308,17 @@ def test_a_body_in_a_file_may_be_given_a_size_there(load, tmp_path):
     np.testing.assert_array_equal(written.translation, standing.translation)
 
 
+def test_a_body_in_a_file_may_be_creased(load, refused, tmp_path):
+    """Its colors are those of the file's vertices."""
+    ws.Mesh(np.eye(4)[:, :3], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]).write(tmp_path / "box.obj")
+    np.save(tmp_path / "colors.npy", np.linspace(0, 1, 12, dtype=np.float32).reshape(4, 3))
+    lines = 'mesh = "box.obj"\nalbedo = "colors.npy"\ncreased = '
+    (body,) = load(TABLES[: TABLES.index("primitive")] + lines + "30").bodies
+    assert body.mesh.vertex_count == 12
+    np.testing.assert_array_equal(body.albedo, np.load(tmp_path / "colors.npy")[body.mesh.origins])
+    refused(TABLES + "creased = 200", "creased: angle: got 200, expected degrees from 0 to 180")
+
+
 @pytest.mark.parametrize(
     ("lines", "message"),
     [

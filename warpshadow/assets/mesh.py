@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.topology import CREASE, Surface, join_faces, part_at_creases, shared_edges
+from warpshadow.assets.topology import CREASE, Surface, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
 from warpshadow.maths.plane import plane_normal
 
@@ -70,8 +70,8 @@ class Mesh:
             held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
             held["uv_faces"] = _indices("uv_faces", uv_faces, len(corners), "uv")
         if origins is not None:
-            held["origins"] = np.array(origins, np.int32)
-            check.shape("origins", held["origins"].shape, (len(vertices),))
+            held["origins"] = copied = np.array(origins, np.int32)
+            check.shape("origins", copied.shape, (len(vertices),))
         for array in held.values():
             if array is not None:
                 array.setflags(write=False)
@@ -156,7 +156,7 @@ class Mesh:
 
         Where a file has one vertex for all faces of a corner, normals are smooth there: edges turn dark, or bright.
         Positions, the winding of faces and uvs stay. Vertices stay the first, and copies follow: ``origins`` says of
-        which, so what there is for each vertex (colors, deformed positions) is ``values[mesh.origins]`` of the new mesh.
+        which, so that ``values[mesh.origins]`` are the colors or deformed positions of the new mesh.
 
         Args:
             angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
@@ -168,15 +168,8 @@ class Mesh:
 
     @functools.cached_property
     def rounds_edges(self) -> bool:
-        """Whether it has many sharp edges whose faces share normals, and so looks as :meth:`creased` would not let it.
-
-        Edges of more than 50° are longer in all than the diagonal of its bounds, and ten times as long as those of 20°
-        to 50°. Of organic meshes, in which angles of all sizes occur, they are not (bunny, cow, monkey, man: at most
-        2.6 times as long). Of voxels, whose normals round the steps on purpose, they are longer than 25 diagonals.
-        """
-        sharp, bent = shared_edges(self.surface, self.positions, (50.0, 20.0))
-        low, high = self.bounds
-        return 1 < sharp / max(float(np.linalg.norm(high - low)), 1e-30) < 25 and bent - sharp < 0.1 * sharp
+        """Whether it has many sharp edges whose faces share normals, and looks better :meth:`creased`."""
+        return rounds_edges(self.surface, self.positions)
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""

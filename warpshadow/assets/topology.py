@@ -104,17 +104,23 @@ def part_at_creases(faces: np.ndarray, surface: Surface, positions: np.ndarray, 
     return vertex[number].reshape(-1, 3).astype(np.int32), origins.astype(np.int32)
 
 
-def shared_edges(surface: Surface, positions: np.ndarray, angles: tuple[float, ...]) -> tuple[float, ...]:
-    """Length in all of the edges whose faces share both vertices and bend by more than each of some angles [degrees]."""
+def rounds_edges(surface: Surface, positions: np.ndarray) -> bool:
+    """Whether many sharp edges have faces that share vertices, and so normals.
+
+    Edges of more than 50° are longer in all than the diagonal of the bounds, and ten times as long as those of 20° to
+    50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as long (bunny, cow, monkey,
+    man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
+    """
     corners = positions[surface.faces].astype(np.float64)
     face, edge = np.nonzero(surface.neighbors > np.arange(len(corners))[:, None])
     across, ends = surface.neighbors[face, edge], (edge + [[1], [2]]) % 3
-    first, last = surface.faces[face, ends]
-    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in (first, last)]
+    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in surface.faces[face, ends]]
     normals = face_normals(corners)
     cosines = np.einsum("ij,ij->i", normals[face], normals[across])
     lengths = np.linalg.norm(np.subtract(*corners[face, ends]), axis=1) * np.logical_and(*is_shared)
-    return tuple(float(lengths[cosines < np.cos(np.radians(angle))].sum()) for angle in angles)
+    sharp, bent = (lengths[cosines < np.cos(np.radians(angle))].sum() for angle in (50, 20))
+    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+    return bool(diagonal < sharp < 25 * diagonal and bent - sharp < 0.1 * sharp)
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:

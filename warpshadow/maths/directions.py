@@ -88,9 +88,10 @@ class BundleCones(NamedTuple):
 
 
 def bundle_cones(directions: np.ndarray, width: float = 0.0, length: int = BUNDLE) -> BundleCones:
-    """Bound every run of ``length`` directions [Q, 3] with a cone, to be compared with hemispheres widened by ``width`` [rad].
+    """Bound every run of ``length`` directions [Q, 3] with a cone.
 
-    All three together must stay within 180°, where cosines order angles; a bundle that is too wide culls nothing.
+    It is compared with hemispheres widened by ``width`` [rad]. All three together must stay within 180°, where cosines
+    order angles; a bundle that is too wide culls nothing.
     """
     bundles = directions.reshape(-1, length, 3)
     axes = bundles.mean(axis=1)

@@ -40,6 +40,7 @@ from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.static import Static
 from warpshadow.pipeline.view import View
+from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
 from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
@@ -288,8 +289,10 @@ class Renderer:
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
         if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
-            of_scene = [*enclosures(self.scene, self.cameras), *misplacements(self.scene)] if is_scenes else []
-            remarks = [view.emptiness(), *of_scene]
+            remarks = [view.emptiness()]
+            if is_scenes:
+                remarks += enclosures(self.scene, self.cameras)
+                remarks += [*misplacements(self.scene), *rounded_edges(self.scene)]
             if found := [remark for remark in remarks if remark]:
                 check.warn("; ".join(found))
                 self._has_warned = True

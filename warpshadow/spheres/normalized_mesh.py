@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warpshadow.assets.topology import CREASE, join_faces, part_at_creases
+from warpshadow.assets.topology import CREASE, join_faces, part_at_creases, rounds_edges
 from warpshadow.device.launch import launch
 from warpshadow.stages.normals import vertex_normals
 
@@ -50,7 +50,7 @@ def normalize(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 class NormalizedMesh:
     """A mesh in the frame of the fit, ready to be sampled and queried; open meshes, too.
 
-    Normals do not round sharp edges.
+    Normals do not round the edges of boxes.
 
     Args:
         positions: Vertex positions [diagonals of the bounding box], float32, shape [vertex, 3].
@@ -60,8 +60,10 @@ class NormalizedMesh:
 
     def __init__(self, positions: np.ndarray, faces: np.ndarray, device: wp.Device):
         self.device = device
-        faces, origins = part_at_creases(faces, join_faces(positions, faces, None), positions, CREASE)
-        positions = positions[origins]
+        surface = join_faces(positions, faces, None)
+        if rounds_edges(surface, positions):
+            faces, origins = part_at_creases(faces, surface, positions, CREASE)
+            positions = positions[origins]
         self.positions, self.faces = positions, faces
         points = wp.array(positions, dtype=wp.vec3, device=device)
         normals = vertex_normals(points.reshape((1, -1)), wp.array(faces, dtype=wp.vec3i, device=device))

@@ -25,9 +25,9 @@ from warpshadow.device.lanes import (
     vectors_type,
 )
 from warpshadow.device.launch import launch
-from warpshadow.spheres.adam import Adam
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.maths.spatial_sort import compact_order
+from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.stages.visibility.cones import make_cone
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
@@ -342,7 +342,7 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _light_metric(directions: np.ndarray) -> np.ndarray:
-    """Matrix F [direction, light] of the loss |e F|² that errors e of visibility cause under light of several sharpnesses.
+    """Matrix F [direction, light] of the loss |e F|² of errors e of visibility, under light of several sharpnesses.
 
     The error is smoothed with lobes of 0.6 and 0.25 radians and with the whole hemisphere: the irradiance
     error under lights of that width from anywhere.
@@ -527,7 +527,7 @@ class Refinement:
         return moved
 
     def _alone(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
-        """Transmittance of each sphere, [sphere, receiver, direction], kept from 0 so that it can be divided out again."""
+        """Transmittance of each sphere [sphere, receiver, direction], kept from 0 so that it can be divided out."""
         view = self._project(spheres, chosen, width)
         rows = [each.reshape((-1, 1)) for each in (view.axes, view.edges, view.reached)]  # of one sphere each
         alone = self._see_through(_View(view.places, view.balls, *rows))

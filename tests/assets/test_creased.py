@@ -1,0 +1,194 @@
+"""Meshes parted along sharp edges: which vertices are, what stays, and that images have the flat faces of the mesh."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import warpshadow as ws
+from warpshadow.assets.topology import face_normals, welded
+from warpshadow.scene.scene import Body
+from warpshadow.torch import TorchRenderer
+
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+CUBE = ws.Mesh(CORNERS, QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), name="cube")
+"""One vertex for each corner."""
+
+BALL = ws.Spheres(np.zeros((1, 3)), [1.0])
+
+
+def tube(sides: int) -> ws.Mesh:
+    """A closed prism that is nearly a cylinder, its caps fans about their middles."""
+    azimuth = 2 * np.pi * np.arange(sides) / sides
+    rims = [np.column_stack([np.cos(azimuth), np.full(sides, y), np.sin(azimuth)]) for y in (-1, 1)]
+    low, after = np.arange(sides), np.roll(np.arange(sides), -1)
+    faces = [
+        np.column_stack([low, low + sides, after + sides]),
+        np.column_stack([low, after + sides, after]),
+        np.column_stack([low, after, np.full(sides, 2 * sides)]),
+        np.column_stack([after + sides, low + sides, np.full(sides, 2 * sides + 1)]),
+    ]
+    return ws.Mesh(np.concatenate([*rims, [[0, -1, 0], [0, 1, 0]]]), np.concatenate(faces), name="tube")
+
+
+def scattered(mesh: ws.Mesh) -> ws.Mesh:
+    """The same with vertices of its own for each face."""
+    return ws.Mesh(mesh.positions[mesh.faces].reshape(-1, 3), np.arange(3 * mesh.face_count).reshape(-1, 3))
+
+
+def smooth_normals(mesh: ws.Mesh) -> np.ndarray:
+    """Normals at the corners of the faces, [face, corner, 3]."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    sums = np.zeros((mesh.vertex_count, 3))
+    for k in range(3):
+        np.add.at(sums, mesh.faces[:, k], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+    return normals[mesh.faces]
+
+
+# ------------------------------------------------------------------------------ meshes
+
+
+def test_a_creased_cube_has_the_normals_of_its_faces():
+    creased = CUBE.creased()
+    assert creased.vertex_count == 24
+    expected = np.repeat(face_normals(creased.positions[creased.faces])[:, None], 3, axis=1)
+    np.testing.assert_allclose(smooth_normals(creased), expected, atol=1e-12)
+    assert not np.allclose(smooth_normals(CUBE), expected, atol=0.5)
+
+
+def test_edges_that_bend_less_stay_smooth():
+    sides = 24
+    mesh = tube(sides)
+    rounded = mesh.creased()
+    assert rounded.vertex_count == mesh.vertex_count + 2 * sides  # rims alone are parted
+    assert mesh.creased(10).vertex_count == mesh.vertex_count + 4 * sides
+    assert mesh.creased(91).vertex_count == mesh.vertex_count
+    sideways = smooth_normals(rounded)[: 2 * sides]
+    np.testing.assert_allclose(sideways, rounded.positions[rounded.faces[: 2 * sides]] * [1, 0, 1], atol=0.05)
+
+
+def test_corners_stay_where_they_are_and_copies_know_of_what():
+    rng = np.random.default_rng(3)
+    faces = CUBE.faces.copy()
+    faces[[1, 4, 7]] = faces[[1, 4, 7], ::-1]  # some wind against their neighbors
+    uvs = rng.uniform(size=(3 * len(faces), 2))
+    unused = np.concatenate([CORNERS, [[5, 5, 5]]])
+    mesh = ws.Mesh(unused, faces, uvs, np.arange(3 * len(faces)).reshape(-1, 3), name="box")
+    creased = mesh.creased()
+    assert creased.vertex_count == 25 and creased.name == "box"
+    np.testing.assert_array_equal(creased.positions[creased.faces], mesh.positions[mesh.faces])
+    np.testing.assert_array_equal(creased.origins[creased.faces], mesh.faces)
+    np.testing.assert_array_equal(creased.origins[:9], np.arange(9))
+    np.testing.assert_array_equal(creased.positions, mesh.positions[creased.origins])
+    np.testing.assert_array_equal(creased.uvs, mesh.uvs)
+    np.testing.assert_array_equal(creased.uv_faces, mesh.uv_faces)
+    np.testing.assert_array_equal(creased.surface.neighbors, mesh.surface.neighbors)
+    np.testing.assert_array_equal(creased.transformed(scale=2).origins, creased.origins)
+    assert CUBE.creased().surface.is_closed
+
+
+@pytest.mark.parametrize("angle", [-1, 181, "sharp", True, float("nan"), None])
+def test_angles_are_degrees_from_0_to_180(angle):
+    with pytest.raises(ws.MeshError, match="angle: got .*, expected degrees from 0 to 180"):
+        CUBE.creased(angle)
+
+
+def test_a_mesh_has_the_same_spheres_creased_or_not():
+    """Since what fits are kept by does not know of copies."""
+    for one, other in zip(welded(tube(9).positions, tube(9).faces), _creased_and_welded(tube(9)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    positions, faces = welded(scattered(CUBE).positions, scattered(CUBE).faces)
+    assert len(positions) == 8
+    np.testing.assert_array_equal(positions[faces], CUBE.positions[CUBE.faces])
+
+
+def _creased_and_welded(mesh):
+    creased = mesh.creased()
+    assert creased.vertex_count > mesh.vertex_count
+    return welded(creased.positions, creased.faces)
+
+
+# ------------------------------------------------------------------------------ bodies and images
+
+
+def test_the_colors_of_vertices_go_along():
+    colors = np.random.default_rng(3).uniform(size=(8, 3)).astype(np.float32)
+    body = Body(CUBE, albedo=colors).creased()
+    np.testing.assert_array_equal(body.albedo, colors[body.mesh.origins])
+    assert Body(CUBE, albedo=(0.5, 0.4, 0.3)).creased().albedo.shape == (3,)
+
+
+def scene_of(mesh: ws.Mesh, **options) -> ws.Scene:
+    bodies = (
+        Body(mesh, (0.8, 0.5, 0.3), blockers=BALL, rotation=(10, 25, 5), translation=(0, 1.3, 0), scale=0.7, **options),
+        Body(ws.plane(8.0, 8), blockers=0, receivers="vertex"),
+    )
+    return ws.Scene(bodies, ws.synthetic_sky((0.5, 0.7, 0.3), height=32), ws.Camera.framing(bodies[:1], size=(48, 48)))
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_a_creased_cube_looks_as_one_with_vertices_of_its_own_for_each_face(receivers):
+    creased, apart = (ws.render(scene_of(mesh, receivers=receivers)) for mesh in (CUBE.creased(), scattered(CUBE)))
+    np.testing.assert_allclose(creased, apart, atol=2e-5)
+    with pytest.warns(UserWarning, match="sharp edges"):
+        shared = ws.render(scene_of(CUBE, receivers=receivers))
+    np.testing.assert_array_equal(creased[..., 3], shared[..., 3])  # the silhouettes are the same
+
+
+@pytest.mark.parametrize("method", ["ray-traced", "none"])
+def test_so_it_does_by_other_methods(method):
+    creased, apart = (
+        ws.render(dataclasses.replace(scene_of(mesh), visibility=ws.Visibility(method=method)))
+        for mesh in (CUBE.creased(), scattered(CUBE))
+    )
+    np.testing.assert_allclose(creased, apart, atol=2e-5)
+
+
+def pose_gradient(mesh: ws.Mesh, light: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradient of a loss of the image by the place of a body, and its central differences."""
+    renderer = TorchRenderer(dataclasses.replace(scene_of(mesh, receivers="pixel"), light=light))
+    rotations, translations, scales = renderer.scene_poses()
+    row, column = torch.meshgrid(torch.linspace(0, 3, 48), torch.linspace(0, 4, 48), indexing="ij")
+    weights = torch.stack([torch.sin(row + 2 * column), torch.cos(row), torch.sin(column), 0 * row], dim=-1)
+
+    def loss(shift):
+        shifts = translations + torch.stack([shift, torch.zeros(3)])
+        return (weights * renderer(geometry=renderer.placed(rotations, shifts, scales))).sum()
+
+    shift = torch.zeros(3, requires_grad=True)
+    loss(shift).backward()
+    step = 0.02
+    with torch.no_grad():
+        expected = [(loss(step * unit) - loss(-step * unit)) / (2 * step) for unit in torch.eye(3)]
+    return shift.grad, torch.stack(expected)
+
+
+def test_the_gradient_of_a_pose_of_a_creased_cube_is_that_of_differences():
+    """Under the same light from everywhere, so that its color does not jump where its sides meet."""
+    got, expected = pose_gradient(CUBE.creased(), np.array([[3.0] * 3, [0] * 3, [0] * 3, [0] * 3]))
+    assert torch.linalg.norm(got - expected) < 0.03 * torch.linalg.norm(expected)  # measured 0.6%
+
+
+# ------------------------------------------------------------------------------ the warning
+
+
+@pytest.mark.parametrize("mesh", [CUBE, tube(24)], ids=["cube", "tube"])
+def test_a_mesh_whose_sharp_edges_share_normals_costs_a_warning_with_the_remedy(mesh):
+    assert mesh.rounds_edges and not mesh.creased().rounds_edges and not scattered(mesh).rounds_edges
+    with pytest.warns(UserWarning, match=rf"body 0 \('{mesh.name}'\) .*creased"):
+        ws.render(scene_of(mesh))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ws.render(scene_of(mesh.creased()))
+
+
+def test_round_meshes_and_irregular_ones_are_not_remarked_upon():
+    ball = ws.icosphere(1.0, 3)
+    rng = np.random.default_rng(3)
+    lumpy = ws.Mesh(ball.positions * rng.uniform(0.85, 1.15, size=(ball.vertex_count, 1)), ball.faces)
+    for mesh in (ball, ws.icosphere(1.0, 0), ws.icosphere(1.0, 1), ws.plane(2.0, 3), lumpy):
+        assert not mesh.rounds_edges
