@@ -53,23 +53,14 @@ _PLACE = 12
 # ------------------------------------------------------------------------------------------------- cones
 
 
-class _Cones(NamedTuple):
-    """Kernels on what receivers see of spheres."""
-
-    project: wp.Kernel
-    pull: wp.Kernel
-
-
 @functools.cache
-def _make_cones(lanes: int) -> _Cones:
+def _make_see(lanes: int) -> wp.Function:
+    """Make the kernel function of a sphere as a group of receivers sees it, in their frames."""
     Lane, Vectors, Seen = lane_type(lanes), vectors_type(lanes), seen_type(lanes)
-    cone_of, falloff, falloff_pull = make_cone(lanes), make_falloff(lanes), make_falloff_pull(lanes)
-    fn = make_lane_functions(lanes)
-    sqrt, total = fn.sqrt, fn.total
+    cone_of = make_cone(lanes)
 
     @wp.func(inline=True)
     def see(places: wp.array2d(dtype=Lane), group: int, ball: wp.vec4):
-        """A sphere as a group of receivers sees it, in their frames."""
         x = Lane(ball[0]) - places[0, group]
         y = Lane(ball[1]) - places[1, group]
         z = Lane(ball[2]) - places[2, group]
@@ -84,6 +75,14 @@ def _make_cones(lanes: int) -> _Cones:
         seen.cone = cone_of(offset, seen.curvature)
         seen.share = Lane(1.0)
         return seen
+
+    return see
+
+
+@functools.cache
+def _make_project(lanes: int) -> wp.Kernel:
+    Lane = lane_type(lanes)
+    see, falloff, sqrt = _make_see(lanes), make_falloff(lanes), make_lane_functions(lanes).sqrt
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def project(
@@ -121,6 +120,16 @@ def _make_cones(lanes: int) -> _Cones:
             axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
             edges[i, sphere] = wp.vec3(low[lane], slope[lane], opacity[lane])
             reached[i, sphere] = int(bits[lane])
+
+    return project
+
+
+@functools.cache
+def _make_pull(lanes: int) -> wp.Kernel:
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    see, falloff_pull = _make_see(lanes), make_falloff_pull(lanes)
+    fn = make_lane_functions(lanes)
+    sqrt, total = fn.sqrt, fn.total
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def pull(
@@ -183,7 +192,7 @@ def _make_cones(lanes: int) -> _Cones:
             total(by_radius),
         )
 
-    return _Cones(project, pull)
+    return pull
 
 
 # ------------------------------------------------------------------------------------------------- transmittance
@@ -445,7 +454,7 @@ class Refinement:
         shape = len(groups), len(spheres)
         outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
         launch(
-            _make_cones(lanes).project,
+            _make_project(lanes),
             (placed.shape[1], len(spheres)),
             inputs=[placed, balls, np.cos(width), np.sin(width), self.caps],
             outputs=outputs,
@@ -493,7 +502,7 @@ class Refinement:
         by_balls = wp.empty(shape, dtype=wp.vec4, device=self.device)
         inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]
         lanes = lane_count(self.device)
-        launch(_make_cones(lanes).pull, shape, inputs=inputs, outputs=[by_balls], cost=2 * _SPHERE_COST * lanes)
+        launch(_make_pull(lanes), shape, inputs=inputs, outputs=[by_balls], cost=2 * _SPHERE_COST * lanes)
         gradient = by_balls.numpy().sum(axis=0, dtype=np.float64)
         gradient[:, 3] *= spheres[:, 3]
         return loss, gradient
