@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices
@@ -51,6 +52,19 @@ def relative_error(got, expected):
 
 
 # ------------------------------------------------------------------------------------------------ what it computes
+
+
+def test_over_nothing_shadows_are_the_mean_of_what_they_take_of_a_white_photograph():
+    renderer = ws.Renderer(scene_of(), progress=False)
+    black, white = (
+        renderer.insert(wp.full((1, SIZE[1], SIZE[0]), wp.vec3(value), dtype=wp.vec3, device="cpu")).numpy()[0]
+        for value in (0.0, 1.0)
+    )
+    image = renderer.render()
+    np.testing.assert_array_equal(image[..., :3], black)
+    np.testing.assert_allclose(image[..., 3], np.clip(1 - (white - black).mean(axis=2), 0, 1), atol=1e-6)
+    both = ws.Renderer(scene_of(), cameras=[CAMERA, CAMERA.turned(40)], progress=False).render()
+    np.testing.assert_allclose(both[0], image, atol=1e-6)
 
 
 def test_what_is_brighter_than_white_is_said_with_an_exposure_that_is_not():

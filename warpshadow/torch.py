@@ -141,7 +141,8 @@ class TorchRenderer(torch.nn.Module):
                 default the scene's.
             albedo: Reflectance of bodies in linear RGB, one color [3], one for each vertex [vertex, 3], or either in a
                 batch, [batch, 1 or vertex, 3]: a list for all bodies, None for what the scene has, or a mapping for
-                some, by their numbers or names: ``{"bunny": color}``.
+                some, by their numbers or names: ``{"bunny": color}``. Values above 1, which a Body refuses, are taken
+                as they are: free ones may pass 1 on their way.
             textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
                 a list or a mapping likewise.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand

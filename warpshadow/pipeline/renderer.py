@@ -560,17 +560,8 @@ class Renderer:
             [camera, height, width, 4] where cameras were given; the background is 0.
         """
         with unrecorded():
-            images = self._over_nothing(light) if self.scene.catchers else self.draw(light).numpy().copy()
+            images = (self._in_photograph(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
-
-    def _over_nothing(self, light: Light | None) -> np.ndarray:
-        """Images in which catchers are shadows: coverage that is the mean of what they take of a white photograph."""
-        black, white = (
-            self.insert(wp.full((1, *self._size), wp.vec3(value), dtype=wp.vec3, device=self.device), light).numpy()
-            for value in (0.0, 1.0)
-        )
-        coverage = np.clip(1 - (white - black).mean(axis=-1, keepdims=True), 0, 1)
-        return np.concatenate([black, coverage], axis=-1)
 
     @one_at_a_time
     def insert(
@@ -602,13 +593,26 @@ class Renderer:
 
         Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.photograph`.
         """
-        catchers = self.scene.catchers
-        if not catchers:
+        if not self.scene.catchers:
             raise ValueError(
                 "scene: got no body that is a shadow catcher, expected one or more: Body(…, shadow_catcher=True)"
             )
         check.shape("photograph", photograph.shape, ("batch", *self._size))
         check.finite_arrays({"photograph": photograph})
+        return self._in_photograph(photograph, light, albedo, textures, geometry, clip_matrices)
+
+    @one_at_a_time
+    def _in_photograph(
+        self,
+        photograph: wp.array | None,
+        light: Light | None = None,
+        albedo: PerBody[wp.array] | None = None,
+        textures: PerBody[wp.array] | None = None,
+        geometry: Geometry[wp.array] | None = None,
+        clip_matrices: wp.array | None = None,
+    ) -> wp.array:
+        """Images of bodies in a photograph; or over nothing, where the shadows on catchers are coverage, vec4."""
+        catchers = self.scene.catchers
         alone = None
         if geometry is not None:
             geometry = as_geometry("geometry", geometry)
@@ -623,7 +627,8 @@ class Renderer:
         if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
             seen = seen.at_receivers_of(view)
         received = seen.white(light, *reflecting).value(without._call(seen))
-        given = Source("photograph", photograph), Source("light without the others", received)
+        taken = None if photograph is None else Source("photograph", photograph)
+        given = taken, Source("light without the others", received)
         return view.in_photograph(*given, self._catches, light, colors, images).value(self._call(view))
 
     @property

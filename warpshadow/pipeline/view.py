@@ -16,7 +16,7 @@ from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
 from warpshadow.stages import film
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.photograph import Division, compose, divide_samples
+from warpshadow.stages.photograph import Division, compose, divide_samples, over_nothing
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import Fragments, rasterize
 from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
@@ -141,7 +141,7 @@ class View(LitPoints):
 
     def in_photograph(
         self,
-        photograph: Source,
+        photograph: Source | None,
         unshadowed: Source,
         catches: wp.array,
         light: Light | None = None,
@@ -151,7 +151,8 @@ class View(LitPoints):
         """The image in a photograph of what the catchers are: linear RGB, vec3 of shape [batch, height, width].
 
         Args:
-            photograph: Linear RGB, vec3 of shape [batch, height, width].
+            photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
+                vec4.
             unshadowed, catches: As for :func:`warpshadow.stages.photograph.divide_samples`.
             light, albedo, textures: As for :meth:`image`.
         """
@@ -166,7 +167,10 @@ class View(LitPoints):
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, keeps=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
         films = [self._averaged(self._radiance(lit, each), is_moving=is_moving) for each in (drawn, inverse)]
-        return Node("photograph", compose, photograph, *films, self._averaged(rest), keeps=False)
+        films.append(self._averaged(rest))
+        if photograph is None:
+            return Node("photograph", over_nothing, *films, keeps=False)
+        return Node("photograph", compose, photograph, *films, keeps=False)
 
     def white(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """What samples receive, and coverage, vec4 of shape [batch, height · across, width · across].

@@ -125,6 +125,39 @@ def _compose(
     composed[batch, row, column] = wp.vec3(color[0], color[1], color[2]) + wp.cw_mul(taken, factor)
 
 
+@wp.kernel(enable_backward=False)
+def _cover(
+    # in
+    drawn: wp.array3d(dtype=wp.vec4),
+    caught: wp.array3d(dtype=wp.vec4),
+    rest: wp.array3d(dtype=wp.vec4),
+    # out
+    covered: wp.array3d(dtype=wp.vec4),
+):
+    """A thread owns a pixel."""
+    batch, row, column = wp.tid()
+    color = drawn[instance_in(batch, drawn.shape[0]), row, column]
+    a = caught[instance_in(batch, caught.shape[0]), row, column]
+    b = rest[instance_in(batch, rest.shape[0]), row, column]
+    factor = (a[0] + b[0] + a[1] + b[1] + a[2] + b[2]) / 3.0
+    covered[batch, row, column] = wp.vec4(color[0], color[1], color[2], wp.clamp(1.0 - factor, 0.0, 1.0))
+
+
+def over_nothing(drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
+    """Draw bodies over nothing; their shadows are coverage, the mean of what they take of a white photograph.
+
+    Args:
+        drawn, caught, rest: As for :func:`compose`.
+
+    Returns:
+        Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]. Not differentiable.
+    """
+    count = common_batch({"drawn": drawn, "caught": caught, "rest": rest})
+    covered = wp.empty((count, *drawn.shape[1:]), dtype=wp.vec4, device=drawn.device)
+    launch(_cover, covered.shape, inputs=[drawn, caught, rest], outputs=[covered])
+    return covered
+
+
 def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
     """Multiply a photograph by its ratio of light, and put bodies into it.
 
