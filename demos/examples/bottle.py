@@ -1,14 +1,15 @@
 """A real photograph: where a bottle stands, by its outline and by its shadow, on a table of unknown texture.
 
-    python demos/examples/bottle.py --data FOLDER --output out
+    python demos/examples/bottle.py --data FOLDER
 
 FOLDER/photograph has the photograph with mesh, camera and pose, from DLR-RM/3DObjectTracking, M3T (MIT license,
 copyright 2023 Manuel Stoiber, German Aerospace Center). Without it, a ray-traced bunny on tiles stands in.
 
 Starts are 15° and 10% of the diagonal away. Light, the bottle's color and the table's texture are unknown; all else in
-the picture is masked out. First the bottle is moved until it covers its outline, which was painted by hand. From there
-a fit of the image goes on, with shadows and without. The table's texture is to have few edges, and the inside of the
-bottle is masked out: its print, its gloss and the other orange of its cap are nothing that one color explains.
+the picture is masked out. First the bottle is moved until it covers its outline, which was painted by hand. There
+light, color and texture are fitted. Then light and texture stay, and the pose goes on, with shadows and without. The
+inside of the bottle is masked out: its print, its gloss and the other orange of its cap are nothing that one color
+explains. `--priors` compares what the table's texture may be.
 """
 
 import argparse
@@ -29,7 +30,6 @@ from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
-from demos.examples.bunny import contact_sheet
 from demos.problems import DIRECT, changed, displaced, distance_error, placement, ray_traced, unshadowed
 from demos.scenes import on_ground, shipped_mesh
 from warpshadow import inverse
@@ -38,6 +38,13 @@ BODY, TABLE = 0, 1
 SHADOWS = ws.Visibility(directions=64)
 TWO_COLORS: dict[str, Any] = {"palette": 1.0, "colors": 2}
 FEW_EDGES: dict[str, Any] = {"total_variation": 0.05}
+PRIORS: dict[str, dict[str, Any]] = {
+    "anything": {},
+    "few edges": FEW_EDGES,
+    "few colors": TWO_COLORS,
+    "two albedos": TWO_COLORS,  # as recognized, and then they stay
+}
+LIGHT = inverse.Light(None, directions=128)
 RIM = 1 / 96  # of the image's width: what counts of the body, along its outline
 EXPOSURE = 0.25  # of the stand-in: white tiles in the sun do not saturate
 PLAIN = ws.EnvironmentMap.constant(1.0)
@@ -54,7 +61,8 @@ class Photograph:
         outline: Where the body is seen, 0 to 1, [height, width].
         scene: The body as it is known to stand, and the table, a plane, as one gray.
         texels: Of the table's texture, across and down.
-        clear: Directions from the body's foot in which nothing else casts a shadow, from x towards z [degrees].
+        shadows: Directions from the body's foot, from x towards z [degrees]: between each two it casts one shadow, and
+            nothing else does.
     """
 
     image: np.ndarray
@@ -62,7 +70,7 @@ class Photograph:
     outline: np.ndarray
     scene: ws.Scene
     texels: int
-    clear: tuple[float, float] = (-180, 180)
+    shadows: tuple[tuple[float, float], ...] = ((-180, 180),)
 
     def mask(self, *, inside: bool = True) -> np.ndarray:
         """What counts: the table clear of the outline and of other objects, and the body, or its rim alone."""
@@ -127,11 +135,11 @@ def bottle_photograph(folder: Path) -> Photograph:
         rotation=turn.as_rotvec(degrees=True),
         translation=translation,
     )
-    table = ws.Body(ws.plane(9.0, 64), albedo=(0.4, 0.4, 0.4))
+    table = ws.Body(ws.plane(6.6, 64), albedo=(0.4, 0.4, 0.4), translation=(1.6, 0, -1.2))
     others = np.max([_area(points, width, height) for points in _OTHERS], axis=0)
     matte = _area(_MATTE_TABLE, width, height) * (1 - others)
     scene = ws.Scene((body, table), PLAIN, camera, SHADOWS)
-    return Photograph(image, matte, _area(_BOTTLE, width, height), scene, texels=160, clear=(-60, 120))
+    return Photograph(image, matte, _area(_BOTTLE, width, height), scene, texels=160, shadows=((-60, 0), (0, 120)))
 
 
 def stand_in(size: int = 256) -> Photograph:
@@ -180,15 +188,48 @@ def by_outline(photo: Photograph, start: ws.Body) -> ws.Body:
     return inverse.fit(problem, stages, progress=False).scene.bodies[BODY]
 
 
-def by_image(photo: Photograph, start: ws.Body, visibility: ws.Visibility, iterations: int = 30) -> ws.Scene:
-    """The scene, from the body near where it is and all else unknown: pose, color, light and texture of an image."""
-    texture = painted(photo, **FEW_EDGES).scene.bodies[0].texture
+def by_image(
+    photo: Photograph, start: ws.Body, visibility: ws.Visibility, prior: str = "few colors", iterations: int = 100
+) -> ws.Scene:
+    """The scene, from the body near where it is and all else unknown: light, color and texture, and then the pose."""
+    mask = photo.mask(inside=False)
+    unknown: list[inverse.Free] = [inverse.Albedo(BODY), LIGHT]
+    if prior == "two albedos":
+        mask = np.where((photo.outline == 0) & ~whole_squares(photo), 0, mask).astype(np.float32)
+        texture = two_albedos(photo)
+    else:
+        unknown.append(inverse.Texture(TABLE, **PRIORS[prior]))
+        texture = painted(photo, **PRIORS[prior]).scene.bodies[0].texture
+    target = inverse.Target(photo.image, mask)
     scene = dataclasses.replace(photo.scene, visibility=visibility)
     scene = changed(changed(scene, BODY, **placement(start)), TABLE, texture=texture)
-    free = [inverse.Pose(BODY), inverse.Albedo(BODY), inverse.Light(3), inverse.Texture(TABLE, **FEW_EDGES)]
-    problem = inverse.Problem(scene, inverse.Target(photo.image, photo.mask(inside=False)), free, HUBER)
-    stage = inverse.Stage(iterations, 0.01, _scale(photo, 160), supersampling=1)
-    return inverse.fit(problem, [stage], progress=False).scene
+    scale = _scale(photo, 160)
+    for free, stage in (
+        (unknown, inverse.Stage(iterations, 0.03, scale, supersampling=1)),
+        ([inverse.Pose(BODY), inverse.Albedo(BODY)], inverse.Stage(30, 0.01, scale, supersampling=1)),
+    ):
+        scene = inverse.fit(inverse.Problem(scene, target, free, HUBER, still=None), [stage], progress=False).scene
+    return scene
+
+
+def two_albedos(photo: Photograph) -> np.ndarray:
+    """The table as squares of the two colors that it was painted with, [height, width, 3]."""
+    dark, light = _by_brightness(painted(photo, **TWO_COLORS).values["texture[0]"]["palette"]).numpy()
+    return np.where(tiles(photo), light, dark).astype(np.float32)
+
+
+def whole_squares(photo: Photograph) -> np.ndarray:
+    """Where the table's squares are seen well away from their edges, bool of shape [height, width]."""
+    pattern = drawn_pattern(photo, tiles(photo))
+    return (ndimage.minimum_filter(pattern, size=5) > 0.95) | (ndimage.maximum_filter(pattern, size=5) < 0.05)
+
+
+def drawn_pattern(photo: Photograph, is_light: np.ndarray) -> np.ndarray:
+    """How much of each pixel is of light texels, 0 to 1, [height, width]; the body is black."""
+    scene = changed(dataclasses.replace(unshadowed(photo.scene), light=PLAIN), BODY, albedo=np.zeros(3))
+    texture = np.where(is_light, np.ones(3), np.zeros(3)).astype(np.float32)
+    pattern: np.ndarray = ws.render(changed(scene, TABLE, texture=texture))[..., 0]
+    return pattern / max(pattern.max(), 1e-6)
 
 
 def first_guess(photo: Photograph, seed: int) -> ws.Body:
@@ -230,41 +271,27 @@ def _scale(photo: Photograph, width: int) -> float:
 # ------------------------------------------------------------------------------------------------ the comparison
 
 
-def main(data: Path | None, output: Path, starts: int, iterations: int) -> None:
+def main(data: Path | None, starts: int, priors: list[str]) -> None:
     ws.quiet()
     torch.set_num_threads(1)
     began = time.perf_counter()
-    output.mkdir(parents=True, exist_ok=True)
     photo = open_photograph(data)
     truth = photo.scene.bodies[BODY]
-    errors: dict[str, list[float]] = {"with shadows": [], "without": [], "outline alone": []}
-    scenes = []
+    errors: dict[str, list[float]] = {}
     for seed in range(starts):
         start = first_guess(photo, seed)
         outlined = by_outline(photo, start)
-        explained = [by_image(photo, outlined, by, iterations) for by in (SHADOWS, DIRECT)]
-        scenes.append(explained[0])
-        for label, body in zip(errors, [*(scene.bodies[BODY] for scene in explained), outlined], strict=True):
-            errors[label].append(distance_error(body, truth))
-        figures = ", ".join(f"{label} {values[-1]:.2f}%" for label, values in errors.items())
+        bodies = {"outline": outlined}
+        for prior in priors:
+            for label, visibility in (("with shadows", SHADOWS), ("without", DIRECT)):
+                bodies[f"{prior}, {label}"] = by_image(photo, outlined, visibility, prior).bodies[BODY]
+        for label, body in bodies.items():
+            errors.setdefault(label, []).append(distance_error(body, truth))
+        figures = "; ".join(f"{label} {own[-1]:.2f}%" for label, own in errors.items())
         print(f"start {seed}: MDE {distance_error(start, truth):.1f}% → {figures}", flush=True)
-    print("median MDE: " + ", ".join(f"{label} {statistics.median(own):.2f}%" for label, own in errors.items()))
-    middle = int(np.argsort(errors["with shadows"])[(starts - 1) // 2])
-    sheet = pictures(photo, scenes[middle], errors["with shadows"][middle])
-    sheet.save(output / "bottle.jpg", quality=85)
-    print(f"{output / 'bottle.jpg'}; {time.perf_counter() - began:.0f} s in all")
-
-
-def pictures(photo: Photograph, scene: ws.Scene, error: float) -> Image.Image:
-    """The photograph beside what was found, at half the photograph's size."""
-    camera = photo.scene.camera.resized(0.5)
-    visibility = ws.Visibility("ray-traced", samples=1024)
-    image = ws.render(dataclasses.replace(scene, camera=camera, visibility=visibility, supersampling=3))
-    without = ws.render(dataclasses.replace(unshadowed(scene), camera=camera, supersampling=3))
-    seen = np.concatenate([halved(photo.image), np.ones((*image.shape[:2], 1))], axis=-1)
-    return contact_sheet(
-        [[(without, "the same without shadows"), (image, f"found, MDE {error:.1f}%"), (seen, "photograph")]]
-    )
+    for label, own in errors.items():
+        print(f"{label}: median MDE {statistics.median(own):.2f}%, worst {max(own):.2f}%")
+    print(f"{time.perf_counter() - began:.0f} s in all")
 
 
 if __name__ == "__main__":
@@ -272,8 +299,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--data", type=Path, help="folder with photograph/bottle.png; without it, a stand-in is rendered"
     )
-    parser.add_argument("--output", type=Path, default=Path("out"), help="folder for the picture")
     parser.add_argument("--starts", type=int, default=10, help="number of starts")
-    parser.add_argument("--iterations", type=int, default=30, help="of the fit that goes on from the outline")
+    parser.add_argument("--priors", action="store_true", help="compare what the table's texture may be")
     arguments = parser.parse_args()
-    main(arguments.data, arguments.output, arguments.starts, arguments.iterations)
+    main(arguments.data, arguments.starts, list(PRIORS) if arguments.priors else ["few colors"])

@@ -33,6 +33,7 @@ from demos.examples.bottle import (
     TABLE,
     Photograph,
     by_outline,
+    drawn_pattern,
     first_guess,
     halved,
     open_photograph,
@@ -46,7 +47,7 @@ from warpshadow import inverse
 
 FINE = ws.Visibility(directions=256)
 REACH = 1.25  # heights of the body: as far from its foot its shadow tells of the light
-LIGHT = inverse.Light(None, directions=256)
+CELLS = inverse.Light(None, directions=256)
 ALBEDO = 0.8  # of light squares: an image has only its product with the light
 RING = 0.1, 0.4  # around a foot, where shadows are measured, from its edge [heights of the body]
 SECTOR, FEWEST = 15, 20  # of a ring [degrees]; pixels that tell of it
@@ -67,9 +68,7 @@ class Squares:
 
 def light_squares(photo: Photograph, is_light: np.ndarray) -> Squares:
     """The light squares around the body, no farther from its foot than shadows reach; of texels, [height, width, 1]."""
-    texture = np.where(is_light, np.ones(3), np.zeros(3)).astype(np.float32)
-    image = ws.render(changed(dataclasses.replace(unshadowed(photo.scene), light=PLAIN), TABLE, texture=texture))
-    is_whole = ndimage.minimum_filter(image[..., 0], size=5) > 0.95 * image[..., 0].max()
+    is_whole = ndimage.minimum_filter(drawn_pattern(photo, is_light), size=5) > 0.95
     middle, _ = foot(photo.scene.bodies[BODY])
     points = table_points(photo.scene.camera) - middle
     is_near = np.linalg.norm(points, axis=-1) < REACH * height(photo.scene.bodies[BODY])
@@ -108,7 +107,7 @@ def explained(photo: Photograph, where: np.ndarray, visibility: ws.Visibility, i
     """Light and the albedo of light squares, from those where they count, [height, width]."""
     scene = changed(photo.scene, TABLE, albedo=(ALBEDO / 2,) * 3, texture=None)
     target = inverse.Target(photo.image, where)
-    problem = inverse.Problem(scene, target, [LIGHT, inverse.Texture(TABLE, (2, 2))], still=visibility)
+    problem = inverse.Problem(scene, target, [CELLS, inverse.Texture(TABLE, (2, 2), smoothness=0.3)], still=visibility)
     scale = min(1.0, 240 / photo.image.shape[1])
     return inverse.fit(problem, [inverse.Stage(iterations, 0.1, scale, supersampling=1)], progress=False)
 
@@ -159,15 +158,14 @@ def by_sector(kept: np.ndarray, photo: Photograph, body: ws.Body) -> np.ndarray:
 
     Args:
         kept: Part of the light, or NaN, [height, width].
-        photo: Says which sectors are clear of other objects.
+        photo: Whose camera sees it.
         body: Around which there is a ring of its own size.
     """
     middle, radius = foot(body)
     points = table_points(photo.scene.camera) - middle
     distances = (np.linalg.norm(points, axis=-1) - radius) / height(body)
     numbers = np.floor(np.degrees(np.arctan2(points[..., 1], points[..., 0])) / SECTOR)
-    counts = (numbers >= photo.clear[0] / SECTOR) & (numbers < photo.clear[1] / SECTOR)
-    counts &= np.isfinite(kept) & (distances > RING[0]) & (distances < RING[1])
+    counts = np.isfinite(kept) & (distances > RING[0]) & (distances < RING[1])
     rows = [kept[counts & (numbers == number)] for number in range(-180 // SECTOR, 180 // SECTOR)]
     return np.array([np.median(row) if len(row) >= FEWEST else np.nan for row in rows])
 
@@ -190,14 +188,15 @@ class Shadow:
         return f"darkest at {self.direction:.0f}°, {self.depth:.0%} less light, {self.width:.0f}° wide"
 
 
-def shadow(kept: np.ndarray) -> Shadow:
-    """The main shadow of sectors: the darkest one, and those beside it that are at least half as dark."""
-    darkness = np.nan_to_num(1 - kept)
+def shadow(kept: np.ndarray, between: tuple[float, float] = (-180, 180)) -> Shadow:
+    """The darkest sector between two directions [degrees], and those beside it that are half as dark or more."""
+    middles = SECTOR * (np.arange(len(kept)) + 0.5) - 180
+    darkness = np.where((middles > between[0]) & (middles < between[1]), np.nan_to_num(1 - kept), 0)
     count, darkest = len(darkness), int(darkness.argmax())
     around = np.roll(darkness, count // 2 - darkest) >= darkness[darkest] / 2
     right = int(np.argmin(np.append(around[count // 2 :], False)))
     left = int(np.argmin(np.append(around[: count // 2][::-1], False)))
-    return Shadow((darkest + 0.5) * SECTOR - 180, float(darkness[darkest]), (left + right) * SECTOR)
+    return Shadow(float(middles[darkest]), float(darkness[darkest]), (left + right) * SECTOR)
 
 
 def explanation(photo: Photograph, light: ws.EnvironmentMap) -> np.ndarray:
@@ -256,7 +255,8 @@ def main(data: Path | None, output: Path) -> None:
         for label, part in kept.items()
     }
     for label, row in sectors.items():
-        print(f"shadow in {label}: {shadow(row)}")
+        for between in photo.shadows:
+            print(f"shadow in {label}: {shadow(row, between)}")
         print("    " + " ".join(f"{100 * part:.0f}" if np.isfinite(part) else "–" for part in row))
 
     albedo = ws.render(dataclasses.replace(plain, light=PLAIN))[squares.seen, :3].mean()

@@ -145,4 +145,5 @@ def test_a_shadow_is_measured_around_its_darkest_sector():
     kept[12] = np.nan
     found = bottle_light.shadow(kept)
     assert found == bottle_light.Shadow(pytest.approx(172.5), pytest.approx(0.4), 30)
+    assert bottle_light.shadow(kept, (-180, 0)).direction == pytest.approx(-157.5)
     assert str(found) == "darkest at 172°, 40% less light, 30° wide"
