@@ -608,6 +608,7 @@ def spheres(
         kept = ", read from the cache" if report.cached else ""
         typer.echo(f"{report.sphere_count} spheres, fitted in {report.seconds:.1f} s{kept}")
         typer.echo(f"irradiance error on the ground   {report.ground_error:6.1%}")
+        typer.echo(f"error of the shadow there        {report.shadow_error:6.1%}")
         typer.echo(f"irradiance error on the surface  {report.surface_error:6.1%}")
         typer.echo(f"surface covered                  {report.coverage:6.1%}")
         typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")

@@ -1,9 +1,11 @@
 """Sphere fits: the formulas they rest on, what they promise, and how good they are."""
 
+import dataclasses
 import os
 import stat
 import subprocess
 import sys
+import warnings
 from functools import partial
 
 import numpy as np
@@ -17,6 +19,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.spheres import Spheres, exact_occlusion, fit_spheres, plot_spheres
 from warpshadow.spheres import cover as stage_1
 from warpshadow.spheres import fit as fit_module
+from warpshadow.spheres import measure as stage_3
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.stages.visibility.cones import BLEND, FADE
@@ -359,6 +362,32 @@ def test_open_and_multi_part_meshes_are_fitted(short_cover):
 def test_no_spheres_are_an_empty_fit():
     fit = fit_spheres(bumpy(), 0, **QUICK)
     assert len(fit.spheres) == 0 and fit.report.coverage == 0 and fit.report.ground_error > 0.05
+
+
+def test_the_error_of_a_shadow_is_relative_to_it():
+    """None of it is the mesh's without spheres, and nearly all with the ball that the mesh is."""
+    mesh = normalized(icosphere(1.0, 4), "cpu")
+    none, ball = np.zeros((0, 4)), np.array([[0, 0, 0, 1 / np.sqrt(12)]])
+    assert stage_3.measure(mesh, none, 0.0).shadow_error == pytest.approx(1)
+    assert stage_3.measure(mesh, ball, 0.0).shadow_error < 0.03
+    assert stage_3.measure(mesh, ball * [1, 1, 1, 0.9], 0.0).shadow_error > 0.1
+
+
+def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatch):
+    report = stage_3.FitReport(64, 0.9, 0.1, 0.01, 0.02, shadow_error=0.21, seconds=1.0)
+    monkeypatch.setattr(fit_module, "_fit", lambda *_: (np.ones((1, 4), np.float32), report))
+    thin, others = bumpy(), {"count": 64, "cache": False}
+    with pytest.warns(UserWarning, match="'mesh' is thin for 64 spheres: .*21%.*blockers = 256.*ray-traced") as told:
+        fit_spheres(thin, **others)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_spheres(thin, **others)
+        fit_spheres(bumpy(), 16, cache=False)  # whoever asks for few knows
+        fit_spheres(bumpy(), 64, refine=False, cache=False)
+        fit_spheres(Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]]), **others)
+        report = dataclasses.replace(report, shadow_error=0.08)
+        fit_spheres(bumpy(), **others)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,8 @@ class FitReport:
     """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
     surface_error: float
     """On the mesh's own vertices, weighted by area."""
+    shadow_error: float
+    """The error on the ground relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
     seconds: float
     """Time that the fit took when it was made."""
     cached: bool = False
@@ -52,8 +54,8 @@ def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
     return 0.3 + 0.7 * np.maximum(directions[:, 1], 0) + 6 * np.exp((directions @ sun - 1) / 0.03)
 
 
-def _relative_error(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> float:
-    """Relative L2 error of the irradiance at receivers, over four azimuths of the sun."""
+def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
+    """L2 error of the irradiance at receivers, over four azimuths of the sun, relative to it and to what is missing."""
     directions = fibonacci(1024)
     array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
     receivers, rays = array(points[None].astype(np.float32)), array(directions.astype(np.float32))
@@ -65,8 +67,9 @@ def _relative_error(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarra
     light = np.stack([_sky(directions, azimuth) for azimuth in np.pi / 2 * np.arange(4)], axis=1)
     seen = 2 * visible.mean(axis=1) >= 0.05
     expected = (cosine * visible)[seen] @ light
-    difference = (cosine * passing)[seen] @ light - expected
-    return float(np.sqrt((difference**2).sum() / max((expected**2).sum(), 1e-30)))
+    missing, wrong = 1.0 - visible, 1.0 * passing - visible
+    error, shadow = (float(np.linalg.norm((cosine * part)[seen] @ light)) for part in (wrong, missing))
+    return error / max(float(np.linalg.norm(expected)), 1e-15), error / max(shadow, 1e-15)
 
 
 def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitReport:
@@ -86,12 +89,14 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
         outside_volume = float(shares[outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
+    ground_error, shadow_error = _errors(mesh, spheres, ground, up)
     return FitReport(
         sphere_count=len(spheres),
         coverage=float((_containing(grown, surface) > 0).mean()),
         outside_volume=outside_volume,
-        ground_error=_relative_error(mesh, spheres, ground, up),
-        surface_error=_relative_error(mesh, spheres, *mesh.sample_vertices(600, rng)),
+        ground_error=ground_error,
+        surface_error=_errors(mesh, spheres, *mesh.sample_vertices(600, rng))[0],
+        shadow_error=shadow_error,
         seconds=seconds,
     )
 
