@@ -10,7 +10,7 @@ import torch
 def torch_on_one_thread() -> Iterator[None]:
     """Let torch compute on the calling thread alone: its sums depend on how many threads share them.
 
-    That takes no longer: kernels have their own threads, and what torch does beside them is little.
+    Kernels keep their threads, on which results do not depend.
     """
     count = torch.get_num_threads()
     torch.set_num_threads(1)
