@@ -77,7 +77,7 @@ class Fit:
 
     @property
     def run(self) -> Callable[..., Result]:
-        """:func:`warpshadow.inverse.fit` of it; what is left to say is device, checkpoint, preview and progress."""
+        """:func:`warpshadow.inverse.fit` of it; device, checkpoint, preview, progress and view are left to say."""
         run = functools.partial(fit, self.problem, self.stages, optimizer=self.optimizer)
         return functools.partial(run, tolerance=self.tolerance, seed=self.seed)
 

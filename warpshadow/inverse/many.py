@@ -1,7 +1,7 @@
 """Many fits: each in a folder of its own, on workers of this machine or of a Ray cluster.
 
-A fit that is interrupted goes on from its checkpoint. One that has ended leaves a record, the last file that it writes,
-by which it is known and not done again; the table is made of these records.
+A fit that is interrupted goes on from its checkpoint. One that has ended with a result leaves a record, the last file
+that it writes, by which it is known and not done again. One that failed leaves none, and is tried again.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class _Job:
     name: str
     results: Path  # the folder of all
     fit: Fit | Path
-    digest: str  # of all that decides it
+    digest: str  # of the text of its file, or of all that decides it
     device: str
     checkpoint_seconds: float
 

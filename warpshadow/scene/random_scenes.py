@@ -1,7 +1,7 @@
 """Random scenes: a data set whose scenes come from a seed and a number, each by itself.
 
-One to three bodies stand or lie on a ground of neutral gray, in colors of their own, under a sky with a sun or under
-a few soft lights, or under maps that are given; a camera looks at them from above. :class:`Ranges` are those of what is
+Some bodies stand or lie on a ground of neutral gray, in colors of their own, under a sky with a sun or under a few soft
+lights, or under maps that are given; a camera looks at them from above. :class:`Ranges` are those of what is
 drawn. Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and
 ranges give the same scene.
 """
@@ -271,7 +271,7 @@ def _random_direction(rng: np.random.Generator) -> np.ndarray:
 
 
 def random_light(rng: np.random.Generator, scale: Range = Ranges.scale) -> EnvironmentMap:
-    """Draw light: half of the time a sky with a sun, else a few soft lights; up to four times brighter or darker."""
+    """Draw light: half of the time a sky with a sun, else a few soft lights; scaled by a factor of the range."""
     draw = _random_sky if rng.random() < 0.5 else _random_lamps
     return draw(rng).scaled(_random_scale(rng, scale))
 

@@ -2,7 +2,7 @@
 
 Receivers are on the mesh, on grounds below it and in a shell around it. Rays tell which directions they see past the
 mesh. Adam moves and scales the spheres until their transmittance, with the falloff of
-warpshadow.stages.visibility.directional, agrees with that under lights of several sharpnesses. Spheres that matter
+warpshadow.stages.visibility.falloff, agrees with that under lights of several sharpnesses. Spheres that matter
 little are relocated on the way.
 """
 
@@ -108,7 +108,7 @@ def _make_project(lanes: int) -> wp.Kernel:
         low = cos_width * cone.cosine - sin_width * sine
         outer = cos_width * sine + sin_width * cone.cosine
         slope, opacity = falloff(cone, sine, low, cos_width, sin_width)
-        bits = Lane(0.0)
+        bits = Lane(0.0)  # bit b: the sphere reaches bundle b; a float is exact for up to 24
         bit = float(1.0)
         for bundle in range(caps.shape[0]):
             along = caps[bundle, 0] * cone.axis.x + caps[bundle, 1] * cone.axis.y + caps[bundle, 2] * cone.axis.z
@@ -512,7 +512,7 @@ class Refinement:
         rng = self.rng
         chosen = rng.choice(self.RECEIVERS, 384, replace=False)
         near = spheres[rng.choice(len(spheres), 75)]
-        near = near * [1, 1, 1, 0] + 0.8 * near[:, 3:] * rng.normal(size=(75, 4)) * [1, 1, 1, 0] + near * [0, 0, 0, 1]
+        near[:, :3] += 0.8 * near[:, 3:] * rng.normal(size=(75, 4))[:, :3]
         near[:, 3] *= rng.uniform(0.4, 1.0, size=75)
         fresh = balls[rng.choice(len(balls), 75)]
         fresh[:, 3] = np.minimum(fresh[:, 3], 2 * np.median(spheres[:, 3])) * rng.uniform(0.5, 1.1, size=75)
