@@ -1,13 +1,12 @@
 """How long many pose fits take on one worker and on two, and that they end alike where processes are killed.
 
-    python demos/benchmarks/many_fits.py [--count 24] [--size 64] [--mesh FILE ...] [--repeats 1] [--kills 10] [--ray]
+    python demos/benchmarks/many_fits.py [--count 24] [--size 64] [--mesh FILE ...] [--repeats 1] [--kills 10]
 
 Fits are poses of meshes in turn, by default the bunny's, the bear's and the rocks' that ship with Warp, 10° to 40° and
 5% to 25% of the diagonal off, on a ground. `warpshadow fit FOLDER` does them with one worker of one thread, then with
-two of one thread each. With --kills, another folder gets them while processes are killed at random moments with
-SIGKILL: workers and the command by turns, and with --ray the node of a Ray cluster of this machine, too. The command
-is given again whenever it has ended. In the end the tables are compared, but for seconds; and it is checked that no
-fit was done again whose end was on record.
+two of one thread each. With --kills, another folder gets them while workers and the command are killed by turns, at
+random moments, with SIGKILL; the command is given again whenever it has ended. In the end the tables are compared, but
+for seconds; and it is checked that no fit was done again whose end was on record.
 """
 
 import argparse
@@ -36,7 +35,6 @@ from warpshadow.spheres import fit_spheres
 ROOT = Path(__file__).parents[2]
 FIT = 'scene = "scene.toml"\nstages = "pose"\n[[target]]\nimage = "photo.exr"\n[[free.pose]]\nbody = 0\n'
 LONGEST = 20.0  # until a kill [s]
-PORT = 6391  # of the Ray cluster
 
 
 def write_fits(folder: Path, meshes: list[ws.Mesh], count: int, size: int) -> None:
@@ -52,10 +50,9 @@ def write_fits(folder: Path, meshes: list[ws.Mesh], count: int, size: int) -> No
         (own / "fit.toml").write_text(FIT)
 
 
-def command(fits: Path, results: Path, workers: int, ray: str | None) -> subprocess.Popen:
+def command(fits: Path, results: Path, workers: int) -> subprocess.Popen:
     """Begin to do the fits."""
-    place = ["--ray", ray] if ray else []
-    line = [sys.executable, "-m", "warpshadow", "fit", fits, "-o", results, "--workers", str(workers), *place]
+    line = [sys.executable, "-m", "warpshadow", "fit", fits, "-o", results, "--workers", str(workers)]
     environment = os.environ | {"WARPSHADOW_NUM_THREADS": str(workers), "PYTHONPATH": str(ROOT)}
     return subprocess.Popen([*line, "--checkpoint-seconds", "1", "--quiet"], env=environment)
 
@@ -84,74 +81,27 @@ def descendants(process: int) -> Iterator[tuple[int, str]]:
         yield from descendants(int(child))
 
 
-def kill_one(head: int, victim: str, node: "Node | None") -> bool:
+def kill_one(head: int, victim: str) -> bool:
     """Kill a process by what it is; whether there was one."""
-    root, mark = (head, "spawn_main") if node is None else (node.process.pid, "ray::")
-    if victim == "command":
-        found = [head]
-    elif victim == "node":
-        found = [child for child, line in descendants(root) if "raylet/raylet" in line.split(" ")[0]]
-    else:
-        found = [child for child, line in descendants(root) if mark in line]
+    workers = [child for child, line in descendants(head) if "spawn_main" in line]
+    found = [head] if victim == "command" else workers
     if found:
         with contextlib.suppress(ProcessLookupError):
             os.kill(random.choice(found), signal.SIGKILL)
     return bool(found)
 
 
-class Node:
-    """A node of a Ray cluster, which is started again once it has died."""
-
-    def __init__(self) -> None:
-        self.start()
-
-    def start(self) -> None:
-        """Start it."""
-        line = [
-            "ray",
-            "start",
-            "--head",
-            "--block",
-            "--num-cpus",
-            "2",
-            "--port",
-            str(PORT),
-            "--include-dashboard=false",
-        ]
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0"}
-        ray = str(Path(sys.executable).with_name("ray"))
-        options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-        self.process = subprocess.Popen([ray, *line[1:]], start_new_session=True, **options)
-        time.sleep(15)
-
-    def end(self) -> None:
-        """End it, with all that it started."""
-        others = [child for child, _ in descendants(self.process.pid)]
-        for process in (self.process.pid, *others):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-        self.process.wait()
-
-    def revive(self) -> None:
-        """Start it again if it has died."""
-        if not any("raylet/raylet" in line for _, line in descendants(self.process.pid)):
-            self.end()
-            self.start()
-
-
-def do_with_kills(fits: Path, results: Path, kills: int, with_ray: bool) -> list[str]:
+def do_with_kills(fits: Path, results: Path, kills: int) -> list[str]:
     """Do the fits while processes are killed; the victims."""
-    victims, node, again = [], Node() if with_ray else None, False
-    address = f"127.0.0.1:{PORT}" if with_ray else None
-    kinds = ["worker", "command", "node"] if with_ray else ["worker", "command"]
-    head = command(fits, results, 2, address)
+    victims, kinds, again = [], ["worker", "command"], False
+    head = command(fits, results, 2)
     records: dict[Path, int] = {}
     try:
         while True:
             wait = random.uniform(0, LONGEST) if len(victims) < kills else None
             with contextlib.suppress(subprocess.TimeoutExpired):
                 head.wait(wait)
-            if head.poll() is None and kill_one(head.pid, kinds[len(victims) % len(kinds)], node):
+            if head.poll() is None and kill_one(head.pid, kinds[len(victims) % len(kinds)]):
                 victims.append(kinds[len(victims) % len(kinds)])
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     head.wait(0.1 if victims[-1] == "worker" else 120)
@@ -160,14 +110,10 @@ def do_with_kills(fits: Path, results: Path, kills: int, with_ray: bool) -> list
             if head.poll() is not None:
                 if head.returncode == 0:
                     break
-                if node is not None:
-                    node.revive()
-                head = command(fits, results, 2, address)
+                head = command(fits, results, 2)
     finally:
         head.kill()
         head.wait()
-        if node is not None:
-            node.end()
     if again:
         raise AssertionError("a fit was done again whose end was on record")
     return victims
@@ -186,7 +132,7 @@ def main(arguments: argparse.Namespace) -> None:
         for repeat in range(arguments.repeats):
             for workers in (1, 2):
                 start, before = time.perf_counter(), processor_seconds()
-                assert command(fits, Path(folder, f"{workers}.{repeat}"), workers, None).wait() == 0
+                assert command(fits, Path(folder, f"{workers}.{repeat}"), workers).wait() == 0
                 times.setdefault(workers, []).append(time.perf_counter() - start)
                 used, load = processor_seconds() - before, os.getloadavg()[0]
                 times_of = f"{times[workers][-1]:6.1f} s, {used:6.1f} s of processors, load {load:.1f}"
@@ -195,7 +141,7 @@ def main(arguments: argparse.Namespace) -> None:
         expected = table(Path(folder, "1.0"))
         print("tables are equal:", table(Path(folder, "2.0")) == expected)
         if arguments.kills:
-            victims = do_with_kills(fits, Path(folder, "killed"), arguments.kills, arguments.ray)
+            victims = do_with_kills(fits, Path(folder, "killed"), arguments.kills)
             equal = table(Path(folder, "killed")) == expected
             print(f"tables are equal after kills of {', '.join(victims)}: {equal}")
 
@@ -207,6 +153,5 @@ if __name__ == "__main__":
     parser.add_argument("--mesh", type=Path, nargs="*", default=[], help="meshes; by default those that ship with Warp")
     parser.add_argument("--repeats", type=int, default=1, help="times that are measured, of which the least counts")
     parser.add_argument("--kills", type=int, default=0, help="processes that are killed")
-    parser.add_argument("--ray", action="store_true", help="on a Ray cluster, where processes are killed")
     parser.add_argument("--seed", type=int, default=0, help="of the moments of kills")
     main(parser.parse_args())
