@@ -6,14 +6,16 @@ beside the spheres that are fitted to the mesh. Other bodies' spheres block thei
 
 import hashlib
 import json
-from collections.abc import Mapping
-from typing import NamedTuple
+import weakref
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.cache import cache_path, remembered
+from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.assembly import Assembly, Geometry
@@ -30,6 +32,12 @@ from warpshadow.stages.receivers import Receivers, Span
 
 VERSION = 3
 """Part of the key of cached rows: raise it whenever they would come out differently."""
+
+
+Found = TypeVar("Found")
+
+_OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, int, str], object]] = weakref.WeakKeyDictionary()
+"""What was found of each mesh that is in memory, for all renderers: what, cuts, device."""
 
 
 class Blocking(NamedTuple):
@@ -113,13 +121,25 @@ class OwnShadows:
         if body not in self._sites:
             mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
             faces = mesh.surface.faces
-            used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
-            positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
-            points = wp.array(positions[None], dtype=wp.vec3, device=device)
-            normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
             cuts = cuts_of(len(faces)) if self._samples_receive[body] else 1
-            self._sites[body] = find_sites(positions, normals, faces, cuts)
+
+            def find() -> Sites:
+                used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
+                positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
+                points = wp.array(positions[None], dtype=wp.vec3, device=device)
+                normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
+                return find_sites(positions, normals, faces, cuts)
+
+            self._sites[body] = self._of_mesh(body, "sites", cuts, find)
         return self._sites[body]
+
+    def _of_mesh(self, body: int, what: str, cuts: int, find: Callable[[], Found]) -> Found:
+        """What is found of the mesh of a body once, by whichever renderer asks for it first."""
+        kept: dict = _OF_MESHES.setdefault(self._assembly.scene.bodies[body].mesh, {})
+        key = what, cuts, self._assembly.device.alias
+        if key not in kept:
+            kept[key] = find()
+        return kept[key]
 
     def places(self, receivers: Receivers, span: Span) -> Places:
         """Where receivers of a body lie among its sites. Differentiable: barycentrics of samples."""
@@ -192,42 +212,45 @@ class OwnShadows:
     def rows(self, body: int) -> OwnRows:
         """What the sites of a body see past it: in memory, on disk, or traced."""
         if body not in self._rows:
-            mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
-            sites, faces = self.sites(body), mesh.surface.faces
-            count = ray_count(self._row_count(body))
-            if count < RAYS:
-                called = self._assembly.scene.bodies[body].called
-                check.warn(
-                    f"body {body} ({called!r}): {len(sites.positions):,} points have {count} rays each for the body's "
-                    f"shadow on itself, in place of {RAYS}, which would take too much memory",
-                )
-            numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
-            key = hashlib.sha256(json.dumps(numbers).encode())
-            key.update(sites.positions[: len(mesh.positions)].tobytes())
-            key.update(np.asarray(faces, np.int32).tobytes())
-
-            def read(stored: Mapping[str, np.ndarray]) -> OwnRows:
-                for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RUN)):
-                    check.shape(name, stored[name].shape, (self._row_count(body), width))
-                    if stored[name].dtype != dtype:
-                        raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
-                return OwnRows(*(wp.array(stored[name], device=device) for name in OwnRows._fields))
-
-            def trace() -> OwnRows:
-                points = wp.array(sites.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
-                whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
-                normals = self._normals(body)
-                places = np.tile(sites.positions, (len(normals) // len(sites.normals), 1))
-                with unrecorded():
-                    rows = trace_rows(whole, places, normals, count, progress=self._progress)
-                    is_buried = find_buried(whole, places, normals, len(sites.positions), rows)
-                    return rows.lent(find_lenders(sites, is_buried))
-
-            self._rows[body] = remembered(
-                cache_path("own_shadows", key.hexdigest()),
-                read,
-                trace,
-                lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
-                what="own shadow",
-            )
+            self._rows[body] = self._of_mesh(body, "rows", self.sites(body).cuts, lambda: self._find_rows(body))
         return self._rows[body]
+
+    def _find_rows(self, body: int) -> OwnRows:
+        mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
+        sites, faces = self.sites(body), mesh.surface.faces
+        count = ray_count(self._row_count(body))
+        if count < RAYS:
+            called = self._assembly.scene.bodies[body].called
+            check.warn(
+                f"body {body} ({called!r}): {len(sites.positions):,} points have {count} rays each for the body's "
+                f"shadow on itself, in place of {RAYS}, which would take too much memory",
+            )
+        numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
+        key = hashlib.sha256(json.dumps(numbers).encode())
+        key.update(sites.positions[: len(mesh.positions)].tobytes())
+        key.update(np.asarray(faces, np.int32).tobytes())
+
+        def read(stored: Mapping[str, np.ndarray]) -> OwnRows:
+            for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RUN)):
+                check.shape(name, stored[name].shape, (self._row_count(body), width))
+                if stored[name].dtype != dtype:
+                    raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
+            return OwnRows(*(wp.array(stored[name], device=device) for name in OwnRows._fields))
+
+        def trace() -> OwnRows:
+            points = wp.array(sites.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
+            whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
+            normals = self._normals(body)
+            places = np.tile(sites.positions, (len(normals) // len(sites.normals), 1))
+            with unrecorded():
+                rows = trace_rows(whole, places, normals, count, progress=self._progress)
+                is_buried = find_buried(whole, places, normals, len(sites.positions), rows)
+                return rows.lent(find_lenders(sites, is_buried))
+
+        return remembered(
+            cache_path("own_shadows", key.hexdigest()),
+            read,
+            trace,
+            lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
+            what="own shadow",
+        )

@@ -205,7 +205,7 @@ class RandomScenes:
         ranges = self.ranges
         bodies, prototypes = _random_bodies(rng, self.bodies, ranges)
         gray = np.full(3, _drawn(rng, ranges.ground_albedo))
-        ground = Body(plane(GROUND_SIZE, 1), albedo=gray, blockers=1, receivers="pixel")
+        ground = Body(_ground_mesh(), albedo=gray, blockers=1, receivers="pixel")
         if self.maps is None:
             light, drawn = random_light(rng, ranges.scale), None
         else:
@@ -213,6 +213,12 @@ class RandomScenes:
         camera = _random_camera(rng, bodies, self.size, ranges)
         scene = Scene((*bodies, ground), light, camera, self.visibility, self.supersampling, self.bounces)
         return Drawn(scene, prototypes, drawn)
+
+
+@functools.cache
+def _ground_mesh() -> Mesh:
+    """The same for all scenes, since renderers keep what they find of a mesh."""
+    return plane(GROUND_SIZE, 1)
 
 
 def _drawn(rng: np.random.Generator, between: Range) -> float:
