@@ -1,6 +1,7 @@
 """A small network that tells the light from one image, taught by the renderer alone, with shadows and without.
 
     python demos/examples/train_light_estimator.py [--scenes 1024] [--epochs 40] [--resume]
+    python demos/examples/train_light_estimator.py --recipe RECIPE.toml [--shards FOLDER]
     torchrun --nproc_per_node=2 demos/examples/train_light_estimator.py
 
 The network sees a ray-traced image of a random scene, its known reflectance divided out, and predicts the light in
@@ -10,11 +11,13 @@ twin through direct illumination. Then both look at scenes that they have not se
 
 Several processes share the scenes (DistributedDataParallel: gloo on a CPU, nccl on GPUs), and the first of them writes
 the files. A run that was interrupted goes on with --resume, to the same numbers as if it had not been.
+
+The scenes may be those of the first split of a recipe (warpshadow/dataset/README.md). Their images may come from shards
+that ``warpshadow dataset`` wrote; if it ray traced them as this does, the losses are the same to the last bit.
 """
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import math
 import os
@@ -34,6 +37,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.examples.bunny import contact_sheet
 from demos.scenes import image_error, on_ground, shipped_mesh
+from warpshadow.dataset import DataSet, load_recipe, read_shard
 from warpshadow.inverse import checkpoint
 from warpshadow.maths import sh
 from warpshadow.scene.random_scenes import RandomScenes, primitives
@@ -101,9 +105,10 @@ class Lesson(NamedTuple):
     to_world: torch.Tensor
 
 
-def prepare(number: int, scene: ws.Scene, device: torch.device) -> Lesson:
-    """Ray trace the image of a scene, and divide out its reflectance: what shows in even light without shadows."""
-    image = ws.render(dataclasses.replace(scene, visibility=RAY_TRACED), device=str(device))
+def prepare(number: int, scene: ws.Scene, device: torch.device, image: np.ndarray | None = None) -> Lesson:
+    """Divide the reflectance out of an image, by default ray traced here: it shows in even light without shadows."""
+    if image is None:
+        image = ws.render(dataclasses.replace(scene, visibility=RAY_TRACED), device=str(device))
     even = dataclasses.replace(scene, visibility=RENDERERS["none"], light=EVEN_LIGHT)
     reflectance = ws.render(even, device=str(device))[..., :3]
     shading = np.where(reflectance > 0, image[..., :3] / np.maximum(reflectance, 1e-3), 0)
@@ -154,11 +159,23 @@ def part(team: Team) -> None:
         distributed.destroy_process_group()
 
 
-def own_share(scenes: RandomScenes, team: Team) -> list[Lesson]:
-    """Prepare the scenes that fall to this process: every team.count-th."""
-    numbers = DistributedSampler(scenes, team.count, team.rank, shuffle=False)
-    bar = tqdm(numbers, desc="ray tracing images", unit="scene", disable=not team.is_first or None)
-    return [prepare(number, scenes[number], team.device) for number in bar]
+def own_share(scenes: RandomScenes, team: Team, shards: Sequence[Path] = ()) -> list[Lesson]:
+    """Prepare the scenes that fall to this process: every team.count-th; their images may be in shards."""
+    numbers = list(DistributedSampler(scenes, team.count, team.rank, shuffle=False))
+    samples = (sample for path in shards for sample in read_shard(path))
+    images = {int(sample.key): sample.color for sample in samples if int(sample.key) in numbers}
+    if shards and (missing := [number for number in numbers if number not in images]):
+        raise ValueError(f"shards: got none with image {missing[0]}, expected all of the split")
+    bar = tqdm(numbers, desc="preparing images", unit="scene", disable=not team.is_first or None)
+    return [prepare(number, scenes[number], team.device, images.get(number)) for number in bar]
+
+
+def of_recipe(path: Path) -> tuple[RandomScenes, str]:
+    """The scenes of the first split of a recipe, and what that is called."""
+    recipe = load_recipe(path)
+    split = next(iter(recipe.splits))
+    data_set = DataSet(recipe)
+    return dataclasses.replace(data_set.scenes(split), count=len(data_set.numbers(split))), split
 
 
 # ------------------------------------------------------------------------------------------------- training
@@ -376,22 +393,28 @@ def main(
     resume: bool = False,
     bodies: Sequence[ws.Body] | None = None,
     picture_size: int = 192,
+    recipe: Path | None = None,
+    shards: Path | None = None,
 ) -> None:
     ws.quiet()
     start = time.perf_counter()
     team = assemble(device)
     output.mkdir(parents=True, exist_ok=True)
-    bodies = primitives() if bodies is None else bodies
+    if recipe is None:
+        bodies = primitives() if bodies is None else bodies
+        split, random = "", RandomScenes(2 * seed, scenes, (size, size), bodies, supersampling=1)
+    else:
+        random, split = of_recipe(recipe)
     if "directional" in through:
-        fit_blockers(bodies, team)
-    random = functools.partial(RandomScenes, size=(size, size), bodies=bodies, supersampling=1)
-    lessons = own_share(random(2 * seed, scenes), team)
+        fit_blockers(random.bodies, team)
+    lessons = own_share(random, team, sorted(shards.glob(f"{split}-*.tar")) if shards else ())
     networks = {}
     for name in through:
         course = Course(name, epochs, seed=seed)
         networks[name] = train(lessons, course, team, output / f"light_estimator_{name}.checkpoint", resume=resume)
     if team.is_first:
-        exam = [prepare(number, scene, team.device) for number, scene in enumerate(random(2 * seed + 1, held_out))]
+        others = dataclasses.replace(random, seed=random.seed + 1, count=held_out)
+        exam = [prepare(number, scene, team.device) for number, scene in enumerate(others)]
         estimates = {name: estimate(network, exam) for name, network in networks.items()}
         judge(estimates, exam, Relighting(96, team.device))
         draw_picture(estimates, exam[:PICTURED], output / "light_estimator.png", picture_size)
@@ -418,7 +441,11 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0, help="of the scenes and of the training")
     parser.add_argument("--through", choices=[*RENDERERS, "both"], default="both", help="renderer to learn through")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda: each process takes a GPU of its own")
+    parser.add_argument("--recipe", type=Path, help="whose scenes are taken, in place of --scenes and --size")
+    parser.add_argument("--shards", type=Path, help="folder of the recipe's shards, for their images")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoints in the output folder")
     options = vars(parser.parse_args())
+    if options["shards"] and not options["recipe"]:
+        parser.error("--shards: got it without --recipe, expected the recipe of the shards, which has their scenes")
     name = options.pop("through")
     main(options.pop("output"), through=list(RENDERERS) if name == "both" else [name], **options)

@@ -11,6 +11,7 @@ import torch
 
 import warpshadow as ws
 from demos.examples import train_light_estimator as demo
+from warpshadow.dataset import DataSet, load_recipe, write_shards
 from warpshadow.inverse import checkpoint
 from warpshadow.maths import sh
 from warpshadow.scene.random_scenes import RandomScenes
@@ -144,6 +145,38 @@ def test_a_checkpoint_of_another_course_is_refused(lessons, tmp_path):
 def test_without_resume_training_begins_anew(lessons, tmp_path):
     first, second = (demo.train(lessons, COURSE, ALONE, tmp_path / "state") for _ in range(2))
     assert torch.equal(parameters(first), parameters(second))
+
+
+RECIPE = """
+images = 3
+layers = ["color"]
+[camera]
+size = [16, 16]
+supersampling = 1
+[visibility]
+method = "ray-traced"
+samples = 256
+[splits]
+train = 0.67
+test = 0.33
+"""
+
+
+def test_the_loss_is_the_same_from_shards_as_from_scenes_that_are_drawn(tmp_path):
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(RECIPE)
+    write_shards(DataSet(load_recipe(recipe)), tmp_path / "shards", workers=1)
+    scenes, split = demo.of_recipe(recipe)
+    paths = sorted((tmp_path / "shards").glob(f"{split}-*.tar"))
+    random = RandomScenes(0, 2, (16, 16), scenes.bodies, supersampling=1)
+    shares = demo.own_share(random, ALONE), demo.own_share(scenes, ALONE, paths)
+    losses = []
+    for number, lessons in enumerate(shares):
+        demo.train(lessons, COURSE, ALONE, tmp_path / f"{number}")
+        losses.append(checkpoint.load(tmp_path / f"{number}")["loss"])
+    assert len(shares[1]) == 2 and losses[0] == losses[1]
+    with pytest.raises(ValueError, match="shards: got none with image 0, expected all of the split"):
+        demo.own_share(scenes, ALONE, sorted((tmp_path / "shards").glob("test-*.tar")))
 
 
 TWO_PROCESSES = """
