@@ -54,7 +54,7 @@ def bumpy() -> Mesh:
 @pytest.fixture
 def short_cover(monkeypatch):
     """Fewer steps of stage 1 for tests that do not look at its result."""
-    monkeypatch.setattr(fit_module, "COVER_STEPS_FIRST", 5)
+    monkeypatch.setattr(fit_module, "COVER_STEPS_FIRST", (5, 5))
 
 
 # ------------------------------------------------------------------------------ float64 twins
