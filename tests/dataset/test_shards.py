@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import warpshadow as ws
 from warpshadow.cli import app
-from warpshadow.dataset import DataSet, load_recipe, read_shard, write_shards
+from warpshadow.dataset import DataSet, load_recipe, read_shard, shards, write_shards
 from warpshadow.dataset.samples import render_sample
 
 PAGE = Path(__file__).parents[2] / "warpshadow" / "dataset" / "README.md"
@@ -129,7 +129,7 @@ def test_what_is_killed_goes_on_to_the_same_bits_and_keeps_what_is_whole(recipe,
     assert {name: (folder / name).stat().st_mtime_ns for name in whole} == whole
 
 
-def test_a_folder_of_another_data_set_is_refused_and_stays_as_it_is(recipe, written, tmp_path):
+def test_a_folder_of_another_data_set_is_refused_and_stays_as_it_is(recipe, written, tmp_path, monkeypatch):
     before = bits(written)
     other = tmp_path / "other.toml"
     meshes = json.dumps(str(recipe.parent / "meshes"))
@@ -142,6 +142,9 @@ def test_a_folder_of_another_data_set_is_refused_and_stays_as_it_is(recipe, writ
         result = CliRunner().invoke(app, ["dataset", str(other), "-o", str(written)])
         assert result.exit_code == 1
         assert f"got shards of another data set ({difference}), expected those of this one" in result.output
+    monkeypatch.setattr(shards, "ALGORITHM_VERSION", -1)
+    with pytest.raises(FileExistsError, match=r"made_by: spheres: was \d+, is -1"):
+        write_shards(DataSet(load_recipe(recipe)), written)
     assert bits(written) == before
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "thesis.tex").touch()

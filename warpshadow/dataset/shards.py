@@ -8,6 +8,7 @@ import io
 import json
 import tarfile
 from collections.abc import Generator, Iterator, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from warpshadow.dataset.samples import render_sample
 from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.workers import run_tasks
+from warpshadow.spheres.fit import ALGORITHM_VERSION
 
 INDEX = "dataset.json"
 """The file beside the shards that says what they hold."""
@@ -136,7 +138,8 @@ def describe(data_set: DataSet) -> dict[str, Plain]:
             "meshes": list(meshes),
             "maps": None if maps is None else list(maps),
         }
-    about = {"recipe": data_set.recipe.plain(), "splits": splits, "hashes": data_set.hashes}
+    made_by = {"warpshadow": version("warpshadow"), "spheres": ALGORITHM_VERSION, "device": data_set.device[:4]}
+    about = {"recipe": data_set.recipe.plain(), "splits": splits, "hashes": data_set.hashes, "made_by": made_by}
     plain: dict[str, Plain] = json.loads(json.dumps(about))
     return plain
 
