@@ -136,6 +136,11 @@ def test_the_picture_has_a_background_and_a_tone(scene, tmp_path, background):
     assert (tmp_path / "python.png").read_bytes() == (tmp_path / "out.png").read_bytes()
 
 
+def test_a_pattern_that_the_shell_has_expanded_is_to_be_quoted(tmp_path):
+    result = run("fit", tmp_path / "a.toml", tmp_path / "b.toml", "-o", tmp_path / "out")
+    assert result.exit_code == 1 and "got 2, expected one, or a pattern in quotes" in result.output
+
+
 def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     from PIL import Image, ImageSequence
 

@@ -233,7 +233,7 @@ def render(
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
             frames = _frames(loaded, cameras, where, exposure, tone, background)
             write_video(output, frames, fps=rate)
-            _note(f"{output}: {len(cameras)} frames, {time.perf_counter() - start:.2f} s", is_quiet)
+            _note(f"{output}: {len(cameras)} frames, rendered in {time.perf_counter() - start:.2f} s", is_quiet)
             return
         renderer = Renderer(loaded, device=where, progress=True)
         image = renderer.render()
@@ -402,11 +402,12 @@ def _device(name: str) -> wp.Device:
 
 @app.command()
 def fit(
-    file: Annotated[
-        Path,
+    found: Annotated[
+        list[Path],
         typer.Argument(
+            metavar="FILE",
             help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern in quotes, a folder "
-            "with files called fit.toml, or a .txt file with a path on each line."
+            "with files called fit.toml, or a .txt file with a path on each line.",
         ),
     ],
     output: Annotated[
@@ -447,6 +448,10 @@ def fit(
     from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report
 
+    file, *others = found
+    if others:
+        with _clear_errors():
+            raise ValueError(f"FILE: got {len(found)}, expected one, or a pattern in quotes, such as 'fits/*/fit.toml'")
     if is_of_many(file):
         options = {"workers": workers, "ray": ray, "device": device, "checkpoint_seconds": checkpoint_seconds}
         _fit_many(file, output, view, is_quiet, **options)

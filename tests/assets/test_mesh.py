@@ -10,6 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import warpshadow as ws
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -338,6 +339,9 @@ def test_colors_of_vertices_are_dropped_with_a_warning(tmp_path, name):
     colors[0] = 0
     with pytest.warns(UserWarning, match=r"a\..*: colors of vertices dropped, which Body\(albedo=…\) takes"):
         load_mesh(export(tmp_path, name, vertices=vertices, faces=faces, colors=colors))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ws.Body(tmp_path / name, albedo=ws.srgb_to_linear(colors[:, :3] / 255), blockers=0)
 
 
 def test_colors_of_vertices_in_an_obj_are_dropped_with_a_warning_and_weights_are_not_colors(tmp_path):

@@ -38,6 +38,12 @@ def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
     return trimesh is not None and isinstance(value, (trimesh.Trimesh, trimesh.Scene))
 
 
+COLORS_DROPPED = (
+    "colors of vertices dropped, which Body(albedo=…) takes, linear, [vertex, 3]: srgb_to_linear(colors / 255)"
+)
+"""A remark on files whose colors are not read."""
+
+
 def load_mesh(path: MeshSource) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file, or take what trimesh has, as one mesh.
 
@@ -80,7 +86,7 @@ def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, 
 
     Args:
         path: As there.
-        wanted: Whether the texture is to be read.
+        wanted: Whether the texture is to be read, and colors of vertices are to be warned of.
 
     Returns:
         The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
@@ -90,6 +96,8 @@ def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, 
     """
     mesh, picture, remarks = _read(path)
     texture = None
+    if not wanted:
+        remarks = [remark for remark in remarks if remark != COLORS_DROPPED]
     if wanted and picture is not None:
         try:
             texture = _texels(picture)
@@ -152,7 +160,7 @@ def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, BaseColor | No
     if 0 < len(textured) < len(parts):
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
     if any(part.has_colors for part in parts):
-        remarks.append("colors of vertices dropped, which Body(albedo=…) takes, linear, [vertex, 3]")
+        remarks.append(COLORS_DROPPED)
     pictures = [picture for part in parts for picture in part.pictures]
     is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
     if any(pictures) and not is_one:

@@ -337,6 +337,10 @@ class Body:
             foot: Where its bottom goes, below the middle of the mesh's bounds [scene units], shape [3].
             size: Longest edge of the mesh's bounds, turned with it [scene units]; by default its scale stays.
         """
+        if np.ndim(foot) == 0:
+            raise ValueError(
+                f"foot: got {foot!r}, expected where its bottom goes, [3]; on_ground(size={foot!r}) scales it"
+            )
         foot = check.array("foot", foot, (3,))
         low, high = (corner.astype(np.float64) for corner in self.mesh.bounds)
         scale = self.scale if size is None else check.positive("size", size) / (high - low).max()
