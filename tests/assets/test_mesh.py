@@ -388,6 +388,13 @@ def test_ply_uvs_of_face_corners_stay_with_the_corners(tmp_path, binary):
         mesh = load_mesh(path)
     np.testing.assert_array_equal(mesh.faces, faces)
     np.testing.assert_array_equal(mesh.uvs[mesh.uv_faces].reshape(2, 6), uvs)
+    import trimesh
+
+    shape = trimesh.load(path, process=False)
+    np.testing.assert_array_equal(load_mesh(shape).uvs[mesh.uv_faces].reshape(2, 6), uvs)
+    shape.update_faces([1, 0])  # to which the file's uvs of corners no longer belong
+    turned = load_mesh(shape)
+    np.testing.assert_array_equal(turned.uvs[turned.uv_faces], uvs[::-1].reshape(2, 3, 2))
 
 
 @pytest.mark.parametrize("name", ["scene.glb", "scene.gltf"])

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import warpshadow as ws
 from warpshadow.assets.image import exr_channels
@@ -51,6 +52,17 @@ def test_no_mesh_and_no_map_is_in_two_splits_and_each_is_in_one(recipe):
         assert len(names) == len(set(names)) == 10
         assert all(named)
     assert "more/1.obj" in [name for stock in stocks.values() for name in stock.meshes]
+
+
+def test_a_mesh_with_another_texture_is_another(recipe, tmp_path):
+    square = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n"
+    (tmp_path / "square.obj").write_text("mtllib square.mtl\nusemtl paint\n" + square)
+    (tmp_path / "square.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    hashes = []
+    for color in ("red", "blue"):
+        Image.new("RGB", (4, 4), color).save(tmp_path / "paint.png")
+        hashes.append(DataSet(replace(recipe, meshes=tmp_path, splits={"train": 1.0})).hashes["meshes"]["square.obj"])
+    assert hashes[0] != hashes[1]
 
 
 def test_scenes_have_the_meshes_and_maps_of_their_split(recipe):

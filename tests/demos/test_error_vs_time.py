@@ -114,7 +114,7 @@ def test_a_path_tracer_is_compared_at_the_error_of_the_default(ball, monkeypatch
     paths = [each for each in found if each.family == "Mitsuba"]
     assert [each.size for each in paths] == list(counts)
     np.testing.assert_allclose([each.error for each in paths], 1 / np.sqrt(counts), rtol=1e-4)
-    error = image_error(ws.render(ball), truth)
+    error = image_error(ws.Renderer(ball).render(), truth)
     assert list(equal) == ["directional 128"]
     assert equal["directional 128"]["error"] == pytest.approx(error, rel=1e-6)
     assert equal["directional 128"]["times_as_long"] == pytest.approx(2 / error**2 / 4, rel=1e-3)

@@ -165,12 +165,32 @@ def test_what_has_ended_is_not_done_again(results, photos, monkeypatch):
     assert inverse.fit_many(good, folder, progress=False) == [each for each in endings if each.is_good]
 
 
+def test_a_fit_is_another_once_a_file_that_it_or_its_scene_names_has_changed(tmp_path):
+    (tmp_path / "fit.toml").write_text("scene = \"scene.toml\"\nphoto = 'photo.exr'\n")
+    (tmp_path / "scene.toml").write_text('mesh = "ball.obj"\n')
+    digests = {many._digest(tmp_path / "fit.toml")}
+    for count, name in enumerate(("photo.exr", "ball.obj", "scene.toml", "fit.toml"), start=2):
+        with (tmp_path / name).open("a") as file:
+            file.write("# more\n")
+        digests.add(many._digest(tmp_path / "fit.toml"))
+        assert len(digests) == count
+    assert many._digest(tmp_path / "fit.toml") in digests
+
+
+def test_a_damaged_record_is_none(tmp_path):
+    job = many._Job("a", tmp_path, tmp_path / "fit.toml", "digest", "cpu", 10.0)
+    job.folder.mkdir()
+    for text in ("{", "[]", "{}"):
+        (job.folder / "ending.json").write_text(text)
+        assert job.recorded() is None
+
+
 @pytest.mark.slow
 def test_on_a_ray_cluster_fits_end_as_they_would_alone(photos, alone, tmp_path, monkeypatch):
     """A real one, of this machine, with two workers, one of which is killed."""
     ray = pytest.importorskip("ray", reason="Ray is not installed (the extra 'ray')")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # where workers find this file
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
     try:
         files = [photos / name / "fit.toml" for name in ("a", "b", "NaN")]
         fits = (each for each in [*files, killed(photos, tmp_path / "mark")])

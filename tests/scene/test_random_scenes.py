@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.random_scenes import RandomScenes, primitives, random_light
+from warpshadow.scene.random_scenes import RandomScenes, Ranges, primitives, random_light
 from warpshadow.spheres import Spheres
 
 UNSHADOWED = ws.Visibility(method="none")  # needs no spheres, which would have to be fitted
@@ -154,3 +154,14 @@ def test_importing_the_module_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_many_large_bodies_have_a_ground_that_reaches_beyond_them():
+    ranges = Ranges(count=(6, 6), size=(1.5, 1.5), gap=(1.5, 1.5))
+    for scene in list(RandomScenes(0, 4, ranges=ranges, visibility=UNSHADOWED)):
+        *bodies, ground = scene.bodies
+        widest = ground.world_mesh().bounds
+        for body in bodies:
+            low, high = body.world_mesh().bounds
+            assert (low >= widest[0])[[0, 2]].all() and (high <= widest[1])[[0, 2]].all()
+    assert RandomScenes(0, 1, visibility=UNSHADOWED)[0].bodies[-1].mesh.bounds[1][0] == 5

@@ -374,7 +374,7 @@ def test_the_error_of_a_shadow_is_relative_to_it():
 
 
 def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatch):
-    report = stage_3.FitReport(64, 0.9, 0.1, 0.01, 0.02, shadow_error=0.21, seconds=1.0)
+    report = stage_3.FitReport(64, 0.9, 0.1, 0.02, 0.02, shadow_error=0.21, seconds=1.0)
     monkeypatch.setattr(fit_module, "_fit", lambda *_: (np.ones((1, 4), np.float32), report))
     thin, others = bumpy(), {"count": 64, "cache": False}
     with pytest.warns(UserWarning, match="'mesh' is thin for 64 spheres: .*21%.*blockers = 256.*ray-traced") as told:
@@ -386,7 +386,9 @@ def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatc
         fit_spheres(bumpy(), 16, cache=False)  # whoever asks for few knows
         fit_spheres(bumpy(), 64, refine=False, cache=False)
         fit_spheres(Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]]), **others)
-        report = dataclasses.replace(report, shadow_error=0.08)
+        slab = report = dataclasses.replace(report, ground_error=0.004)  # on the ground, with next to no shadow
+        fit_spheres(bumpy(), **others)
+        report = dataclasses.replace(slab, ground_error=0.02, shadow_error=0.08)
         fit_spheres(bumpy(), **others)
 
 

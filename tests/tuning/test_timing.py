@@ -43,7 +43,7 @@ def test_each_image_is_of_bodies_that_have_moved_by_nothing_to_speak_of(monkeypa
     first, second, third = (geometry.positions.numpy() for geometry in geometries)
     assert 0 < np.abs(second - first).max() < 1e-3
     np.testing.assert_array_equal(third, first)
-    truth = ws.render(scene)
+    truth = ws.Renderer(scene).render()
     for image in images:
         assert np.linalg.norm(image - truth) < 1e-2 * np.linalg.norm(truth)
 

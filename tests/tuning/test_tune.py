@@ -291,7 +291,7 @@ def test_a_renderer_shows_what_was_chosen():
     scene = auto(make_scene(), 0.5)
     renderer = ws.Renderer(scene)
     assert renderer.scene.visibility is resolved(scene).visibility
-    np.testing.assert_array_equal(renderer.render(), ws.render(resolved(scene)))
+    np.testing.assert_array_equal(renderer.render(), ws.Renderer(resolved(scene)).render())
 
 
 def test_a_problem_makes_the_choice_once_and_its_still_method_is_not_left_open():

@@ -156,5 +156,5 @@ def test_dragging_moves_the_body(site, page):
     page.mouse.up()
     site._panel._drag(None)
     after = settled(page)
-    assert site.loop.look.places[0].translation[0] < -0.2
+    assert site.loop.look.poses[0].translation[0] < -0.2
     assert center(red(after))[1] < center(red(before))[1] - 40

@@ -105,7 +105,7 @@ def test_a_body_is_dragged_by_handles_and_put_back(site, page):
     page.until(lambda message: is_image(message) and message["depth_data"])  # which hides handles
     since = len(page.heard)
     page.say("TransformControlsUpdateMessage", name="/handles", wxyz=(1, 0, 0, 0), position=(1.5, 0, 0), owner="")
-    eventually(lambda: site.loop.look.places[0].translation[0] > 0.1)
+    eventually(lambda: site.loop.look.poses[0].translation[0] > 0.1)
     after = shown(site, page, since)
     columns = np.arange(160)
 
@@ -117,7 +117,7 @@ def test_a_body_is_dragged_by_handles_and_put_back(site, page):
     page.say("TransformControlsUpdateMessage", name="/handles", wxyz=(0, 0, 0, 0), position=(9, 9, 9), owner="")
     page.enter("Drag", "nothing")
     page.say("GuiUpdateMessage", uuid=page.input("Put back"), updates={"value": True})
-    eventually(lambda: site.loop.look.places[0].translation == (0.0, 0.0, 0.0))
+    eventually(lambda: site.loop.look.poses[0].translation == (0.0, 0.0, 0.0))
 
 
 def test_spheres_are_shown_and_hidden(site, page):

@@ -309,12 +309,22 @@ def _trimesh_picture(material) -> BaseColor | None:
 
 def _ply_corner_uvs(shape) -> np.ndarray | None:
     """The uvs [corner, 2] of a PLY file that stores them with faces; trimesh gives each vertex only one."""
-    data = shape.metadata.get("_ply_raw", {}).get("face", {}).get("data", {})
+    raw = shape.metadata.get("_ply_raw", {})
+    data = raw.get("face", {}).get("data", {})
     names = data.dtype.names or () if isinstance(data, np.ndarray) else data
     if "texcoord" not in names:
         return None
-    uvs = data["texcoord"]  # binary files hold [count, values], ASCII files the values alone
-    return np.asarray(uvs["f1"] if getattr(uvs.dtype, "names", None) else uvs).reshape(-1, 2)
+    corners = next((data[name] for name in ("vertex_indices", "vertex_index") if name in names), None)
+    axes = [np.ravel(raw["vertex"]["data"][axis]) for axis in "xyz"]
+    points = np.stack(axes, axis=-1).astype(np.float32)
+    if corners is None or not np.array_equal(points[_ply_values(corners)], shape.triangles.astype(np.float32)):
+        return None  # the faces are no longer those of the file
+    return _ply_values(data["texcoord"]).reshape(-1, 2)
+
+
+def _ply_values(lists) -> np.ndarray:
+    """The values of lists: binary files hold [count, values], ASCII files the values alone."""
+    return np.asarray(lists["f1"] if getattr(lists.dtype, "names", None) else lists)
 
 
 def _read_usd(path: Path) -> list[MeshPart]:

@@ -79,7 +79,7 @@ class DataSet:
             self._primitives = [_fitted(body, self.device) if fits else body for body in primitives()]
         else:
             self.hashes["meshes"] = _hashes(
-                recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: self._read_mesh(path).mesh.content_hash, progress
+                recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: _content_hash(self._read_mesh(path)), progress
             )
         if recipe.maps is not None:
             self.hashes["maps"] = _hashes(
@@ -167,6 +167,13 @@ class _ReadWhenAsked(Sequence[Item], Generic[Item]):
 def _read_body(path: Path, blockers: int, fits: bool, device: str) -> Body:
     body = Body(path, blockers=blockers)
     return _fitted(body, device) if fits else body
+
+
+def _content_hash(body: Body) -> str:
+    """A hash of a mesh, and of its texture where it has one."""
+    if body.texture is None:
+        return body.mesh.content_hash
+    return hashlib.sha256(body.mesh.content_hash.encode() + body.texture.tobytes()).hexdigest()
 
 
 def _fitted(body: Body, device: str) -> Body:

@@ -16,6 +16,7 @@ import json
 import math
 import os
 import pickle
+import re
 import time
 import traceback
 import warnings
@@ -46,6 +47,7 @@ TABLE = "table.csv"
 _FIT_FILE = "fit.toml"  # what a folder is searched for
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
+_QUOTED = re.compile(r"""["']([^"'\n]+)["']""")
 _PATIENCE = 60.0
 """How long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]."""
 
@@ -186,7 +188,7 @@ class _Job:
     name: str
     results: Path  # the folder of all
     fit: Fit | Path
-    digest: str  # of the text of its file, or of all that decides it
+    digest: str  # of what decides it
     device: str
     checkpoint_seconds: float
 
@@ -199,8 +201,11 @@ class _Job:
         path = self.folder / _RECORD
         if not path.exists():
             return None
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return Ending(**record["ending"]) if record["of"] == self.digest else None
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            return Ending(**record["ending"]) if record["of"] == self.digest else None
+        except (ValueError, KeyError, TypeError):  # damaged: the checkpoint knows how it ended
+            return None
 
     def record(self, ending: Ending) -> None:
         """Note how it ended."""
@@ -210,11 +215,25 @@ class _Job:
 
 
 def _digest(fit: Fit | Path) -> str:
-    """A digest of a fit file's text, empty where there is none; or of a fit."""
+    """A digest of a fit file's text and of when what it names changed, empty where there is none; or of a fit."""
     if isinstance(fit, Path):
-        return hashlib.sha256(fit.read_bytes()).hexdigest() if fit.is_file() else ""
+        return hashlib.sha256("\n".join(_marks(fit)).encode()).hexdigest() if fit.is_file() else ""
     decides = f"{fit.problem.fingerprint()} {fit.stages!r} {fit.tolerance!r} {fit.seed}".encode()
     return hashlib.sha256(decides + pickle.dumps(fit.optimizer)).hexdigest()
+
+
+def _marks(file: Path) -> Iterator[str]:
+    """The text of a TOML file, and size and time of all files that it names; of TOML files among them the same."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    yield text
+    for name in sorted(set(_QUOTED.findall(text))):
+        named = file.parent / name
+        with contextlib.suppress(OSError, ValueError):  # a text that is no name of a file
+            if named.is_file():
+                status = named.stat()
+                yield f"{name} {status.st_size} {status.st_mtime_ns}"
+                if named.suffix == ".toml" and named != file:
+                    yield from _marks(named)
 
 
 def _do(job: _Job) -> Ending:

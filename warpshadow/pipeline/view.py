@@ -3,10 +3,12 @@
 import copy
 import functools
 import operator
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
@@ -14,6 +16,7 @@ from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import Blocking
 from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
+from warpshadow.scene.scene import Body
 from warpshadow.stages import film
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.photograph import Division, compose, divide_samples, over_nothing
@@ -195,6 +198,7 @@ class View(LitPoints):
         """Node of the samples."""
         samples_of = functools.partial(Node, "radiance", items=self._samples, keeps=False)
         if self.clip_positions.requires_grad:
+            _warn_of_creases(self.assembly.scene.bodies)
             moving = self.silhouettes, self.clip_positions
             return samples_of(_moving_radiance, self.receivers_node, lit, reflected, *moving)
         return samples_of(_radiance, self.receivers_node, lit, reflected)
@@ -269,6 +273,16 @@ class View(LitPoints):
 
 def _same(value: object) -> object:
     return value
+
+
+def _warn_of_creases(bodies: Sequence[Body]) -> None:
+    """Say that color jumps at a crease, and that pixels that are receivers do not notice that this line moves."""
+    for body in bodies:
+        if body.mesh.origins is not None and body.receivers == "pixel":
+            check.warn(
+                f"{body.called!r} is creased and shaded by pixel, so gradients to geometry leave out that its sharp "
+                'edges move; receivers = "vertex" has them'
+            )
 
 
 def _radiance(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:

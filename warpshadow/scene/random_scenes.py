@@ -110,7 +110,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "elevation": (1.0, 89.0),
     "distance": (0.5, 100.0),
 }
-"""Between what the ends of each range may be; all bodies stand on the ground, which is ``GROUND_SIZE`` wide."""
+"""Between what the ends of each range may be; the ground is ``GROUND_SIZE`` wide, or wider where bodies need it."""
 
 
 def _checked_range(name: str, value: object) -> tuple[float, float]:
@@ -205,7 +205,7 @@ class RandomScenes:
         ranges = self.ranges
         bodies, prototypes = _random_bodies(rng, self.bodies, ranges)
         gray = np.full(3, _drawn(rng, ranges.ground_albedo))
-        ground = Body(_ground_mesh(), albedo=gray, blockers=1, receivers="pixel")
+        ground = Body(_ground_mesh(_ground_size(bodies)), albedo=gray, blockers=1, receivers="pixel")
         if self.maps is None:
             light, drawn = random_light(rng, ranges.scale), None
         else:
@@ -215,10 +215,16 @@ class RandomScenes:
         return Drawn(scene, prototypes, drawn)
 
 
-@functools.cache
-def _ground_mesh() -> Mesh:
-    """The same for all scenes, since renderers keep what they find of a mesh."""
-    return plane(GROUND_SIZE, 1)
+def _ground_size(bodies: Sequence[Body]) -> float:
+    """Width of a ground under all bodies."""
+    reach = max(float(np.hypot(*body.translation[[0, 2]])) + _footprint(body) for body in bodies)
+    return GROUND_SIZE if 2 * reach <= GROUND_SIZE else 2.5 * reach
+
+
+@functools.lru_cache(8)
+def _ground_mesh(size: float) -> Mesh:
+    """The same for all scenes, but for wide ones, since renderers keep what they find of a mesh."""
+    return plane(size, 1)
 
 
 def _drawn(rng: np.random.Generator, between: Range) -> float:

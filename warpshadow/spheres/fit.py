@@ -53,6 +53,10 @@ BAD_SHADOW = 0.18
 """Error of a shadow above which it is ragged. With 64 spheres a chair, a fence and a table with thin legs have 0.21 to
 0.27; a ring and rocks, whose shadows are small but whole, 0.16; man, monkey, cow, teapot and bunny 0.02 to 0.07."""
 
+LEAST_GROUND_ERROR = 0.01
+"""Error of a ground below which nobody sees how ragged a shadow is: of a slab that lies on it, 0.004. Chair, fence and
+table have 0.02 to 0.05."""
+
 _warned: weakref.WeakSet[Mesh] = weakref.WeakSet()
 
 
@@ -120,7 +124,8 @@ def fit_spheres(
 
 def _warn_of_holes(mesh: Mesh, count: int, report: FitReport) -> None:
     """Warn once of a mesh too thin for spheres that are many; whoever asks for few knows; flats need none."""
-    if report.shadow_error <= BAD_SHADOW or count < MANY or mesh in _warned or mesh.is_flat:
+    is_ragged = report.shadow_error > BAD_SHADOW and report.ground_error > LEAST_GROUND_ERROR
+    if not is_ragged or count < MANY or mesh in _warned or mesh.is_flat:
         return
     _warned.add(mesh)
     more = f"blockers = {4 * count} has smaller holes, and " if 4 * count <= MOST_SPHERES else ""
