@@ -402,10 +402,9 @@ def _device(name: str) -> wp.Device:
 
 @app.command()
 def fit(
-    found: Annotated[
+    file: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE",
             help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern in quotes, a folder "
             "with files called fit.toml, or a .txt file with a path on each line.",
         ),
@@ -448,20 +447,20 @@ def fit(
     from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report
 
-    file, *others = found
-    if others:
+    if len(file) > 1:
         with _clear_errors():
-            raise ValueError(f"FILE: got {len(found)}, expected one, or a pattern in quotes, such as 'fits/*/fit.toml'")
-    if is_of_many(file):
+            raise ValueError(f"FILE: got {len(file)}, expected one, or a pattern in quotes, such as 'fits/*/fit.toml'")
+    (where,) = file
+    if is_of_many(where):
         options = {"workers": workers, "ray": ray, "device": device, "checkpoint_seconds": checkpoint_seconds}
-        _fit_many(file, output, view, is_quiet, **options)
+        _fit_many(where, output, view, is_quiet, **options)
         return
     with _clear_errors(), _resumable(output):
         if workers is not None or ray is not None:
-            raise ValueError(f"--workers, --ray: got the fit file {file}, expected a pattern, a folder or a .txt file")
-        where = _device(device)
+            raise ValueError(f"--workers, --ray: got the fit file {where}, expected a pattern, a folder or a .txt file")
+        on = _device(device)
         check_folder(output)
-        loaded = load_fit(file)
+        loaded = load_fit(where)
         output.mkdir(exist_ok=True)
         state = checkpoints.load(output / CHECKPOINT)
         was_over = state is not None and state["reason"] is not None
@@ -474,7 +473,7 @@ def fit(
             typer.echo(viewer.url)
             viewer.open(browser)
         result = loaded.run(
-            device=str(where),
+            device=str(on),
             checkpoint=output / CHECKPOINT,
             checkpoint_seconds=checkpoint_seconds,
             preview=output / PREVIEW if preview else None,
