@@ -91,14 +91,19 @@ def main(
     warnings.showwarning = lambda message, *_: typer.secho(f"warning: {message}", fg="yellow", err=True)
 
 
+def _interrupted(how: str = "") -> typer.Exit:
+    """Say in one line that the user interrupted the command, and how it goes on; returns the exit."""
+    typer.secho(f"interrupted{how}", fg="yellow", err=True)
+    return typer.Exit(INTERRUPTED)
+
+
 @contextlib.contextmanager
 def _clear_errors() -> Iterator[None]:
     """Turn errors in what the user gave into one line and exit status 1, and an interrupt into one and 130."""
     try:
         yield
     except KeyboardInterrupt as error:
-        typer.secho("interrupted", fg="yellow", err=True)  # at once: threads and kernels take a second to end
-        raise typer.Exit(INTERRUPTED) from error
+        raise _interrupted() from error  # at once: threads and kernels take a second to end
     except (ValueError, OSError, ImportError) as error:
         message = error if error.args else type(error).__name__
         typer.secho(f"error: {message}", fg="red", err=True)
@@ -442,6 +447,7 @@ def fit(
     again. One that fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
     """
     from warpshadow.inverse import checkpoint as checkpoints
+    from warpshadow.inverse.descent import GOOD_ENDINGS
     from warpshadow.inverse.fit_file import load_fit
     from warpshadow.inverse.folder import CHECKPOINT, PREVIEW, check_folder
     from warpshadow.inverse.many import is_of_many
@@ -482,7 +488,7 @@ def fit(
         )
         if result.reason == "stopped":
             raise KeyboardInterrupt  # which the page's button stands for
-        has_diverged = result.reason not in ("converged", "finished")
+        has_diverged = result.reason not in GOOD_ENDINGS
         ending = "diverged" if has_diverged else result.reason
         ending += f" after {sum(map(len, result.losses))} iterations"
         if was_over and (output / SUMMARY).exists():
@@ -515,8 +521,7 @@ def _fit_many(where: Path, output: Path, view: bool, is_quiet: bool, **options: 
         try:
             endings = fit_many(find_fits(where), output, **options)
         except KeyboardInterrupt as error:
-            typer.secho("interrupted; the same command goes on from the checkpoints", fg="yellow", err=True)
-            raise typer.Exit(INTERRUPTED) from error
+            raise _interrupted("; the same command goes on from the checkpoints") from error
     for ending in endings:
         for warning in ending.warnings:
             typer.secho(f"warning: {ending.name}: {warning}", fg="yellow", err=True)
@@ -542,8 +547,7 @@ def _resumable(folder: Path) -> Iterator[None]:
     except KeyboardInterrupt as error:
         is_kept = has_checkpoint(folder)
         kept = f"; the same command goes on from {folder / CHECKPOINT}" if is_kept else " before a checkpoint"
-        typer.secho(f"interrupted{kept}", fg="yellow", err=True)
-        raise typer.Exit(INTERRUPTED) from error
+        raise _interrupted(kept) from error
 
 
 @app.command()
@@ -571,8 +575,7 @@ def dataset(
         try:
             shards = write_shards(data_set, output, workers=workers)
         except KeyboardInterrupt as error:
-            typer.secho(f"interrupted; the same command goes on in {output}", fg="yellow", err=True)
-            raise typer.Exit(INTERRUPTED) from error
+            raise _interrupted(f"; the same command goes on in {output}") from error
         size = sum(shard.stat().st_size for shard in shards)
         seconds = time.perf_counter() - start
         _note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {seconds:.0f} s", is_quiet)

@@ -126,37 +126,36 @@ def load_recipe(path: AnyPath) -> Recipe:
 def _recipe(given: Table, folder: Path) -> Recipe:
     plain = ("images", "seed", "shard", "layers")
     check.known_keys("the recipe", given, (*plain, *_KEYS))
-    tables = {name: _table(given, name) for name in _KEYS}
-    found: Table = {key: given[key] for key in plain if key in given}
-    bodies, light, camera = (dict(tables[name]) for name in ("bodies", "light", "camera"))
+    bodies, light, camera, visibility, splits = (dict(_table(given, name)) for name in _KEYS)
+    recipe = toml_tables.make(Recipe, _taken(dict(given), *plain))
     with check.located("[bodies]"):
+        found = _taken(bodies, "blockers")
         if "meshes" in bodies:
             found["meshes"] = _folder(bodies, "meshes", folder)
-        elif "blockers" in bodies:
+        elif found:
             raise ValueError("blockers: got it without meshes, to which they are fitted")
-        found |= {key: bodies.pop(key) for key in ("blockers",) if key in bodies}
-        if "blockers" in found:
-            check.whole("blockers", found["blockers"], least=0)
-        ranges = replace(Ranges(), **bodies)
+        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **bodies))
     with check.located("[light]"):
+        found = _taken(light, "bounces")
         if "maps" in light:
             found["maps"] = _folder(light, "maps", folder)
         elif "rotation" in light:
             raise ValueError("rotation: got it without maps, which it turns")
-        found |= {key: light.pop(key) for key in ("bounces",) if key in light}
-        check_bounces(found.get("bounces", 0))
-        ranges = replace(ranges, **light)
+        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **light))
     with check.located("[camera]"):
-        found |= {key: camera.pop(key) for key in ("size", "supersampling") if key in camera}
-        check.image_size(found.get("size", Recipe.size))
-        check_supersampling(found.get("supersampling", Recipe.supersampling))
-        found["ranges"] = replace(ranges, **camera)
+        found = _taken(camera, "size", "supersampling")
+        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **camera))
     with check.located("[visibility]"):
-        found["visibility"] = Visibility.of(tables["visibility"])
+        recipe = replace(recipe, visibility=Visibility.of(visibility))
     if "splits" in given:
         with check.located("[splits]"):
-            found["splits"] = _checked_splits(tables["splits"])
-    return toml_tables.make(Recipe, found)
+            recipe = replace(recipe, splits=splits)
+    return recipe
+
+
+def _taken(table: Table, *keys: str) -> Table:
+    """Take what a table has of some keys out of it."""
+    return {key: table.pop(key) for key in keys if key in table}
 
 
 def _table(given: Table, name: str) -> Table:

@@ -39,6 +39,9 @@ LIGHT_ORDER = 4
 
 _WHITE = (1.0, 1.0, 1.0)
 
+_LAYER_OF = {"Z": "depth", "N": "normals", "body": "bodies", "mask": "masks"}
+"""Layers by what the names of their channels begin with, as renderers call these."""
+
 
 class Sample(NamedTuple):
     """An image and what it shows, as read from a shard."""
@@ -73,7 +76,7 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     if "shadow" in layers:
         shadow = _shadow(renderer, data_set.device)
         channels |= {f"shadow.{color}": shadow[..., k] for k, color in enumerate("RGB")}
-    if {"depth", "normals", "bodies", "masks"} & set(layers):
+    if set(_LAYER_OF.values()) & set(layers):
         channels |= _chosen(renderer.layers().channels(), layers, data_set.recipe.ranges.count[1] + 1)
     files = {"json": json.dumps(_about(data_set, number, drawn), ensure_ascii=False).encode()}
     if channels:
@@ -87,9 +90,8 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
 
 def _chosen(channels: dict[str, np.ndarray], layers: tuple[str, ...], most_bodies: int) -> dict[str, np.ndarray]:
     """The channels of layers; masks for as many bodies as any scene has, so that images can be stacked."""
-    layer_of = {"Z": "depth", "N": "normals", "body": "bodies", "mask": "masks"}
     empty = {f"mask.{number}": np.zeros_like(channels["Z"]) for number in range(most_bodies)}
-    return {name: values for name, values in (empty | channels).items() if layer_of[name.split(".")[0]] in layers}
+    return {name: values for name, values in (empty | channels).items() if _LAYER_OF[name.split(".")[0]] in layers}
 
 
 def _shadow(renderer: Renderer, device: str) -> np.ndarray:

@@ -48,6 +48,10 @@ class FitWarning(UserWarning):
     """A fit that ended before its time."""
 
 
+GOOD_ENDINGS = ("converged", "finished")
+"""Why a fit ends whose values can be used as they are."""
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """What a fit ended with.

@@ -34,7 +34,7 @@ from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.workers import run_tasks
 from warpshadow.inverse import checkpoint as checkpoints
-from warpshadow.inverse.descent import FitWarning, default_optimizer
+from warpshadow.inverse.descent import GOOD_ENDINGS, FitWarning, default_optimizer
 from warpshadow.inverse.fit_file import Fit, load_fit
 from warpshadow.inverse.folder import CHECKPOINT, check_folder
 from warpshadow.inverse.problem import Problem
@@ -81,7 +81,7 @@ class Ending:
     @property
     def is_good(self) -> bool:
         """Whether it converged or finished."""
-        return self.reason in ("converged", "finished")
+        return self.reason in GOOD_ENDINGS
 
 
 def fit_many(
@@ -276,7 +276,7 @@ def _ended(job: _Job) -> Ending:
             report.write(job.folder)
     except Timeout as error:
         raise checkpoints.CheckpointError(f"{job.folder}: another process is writing it") from error
-    is_good = result.reason in ("converged", "finished")
+    is_good = result.reason in GOOD_ENDINGS
     return Ending(
         job.name,
         result.reason if is_good else "diverged",

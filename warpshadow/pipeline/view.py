@@ -3,7 +3,6 @@
 import copy
 import functools
 import operator
-from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -16,7 +15,7 @@ from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import Blocking
 from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
-from warpshadow.scene.scene import Body
+from warpshadow.scene.creases import unmoved_edges
 from warpshadow.stages import film
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.photograph import Division, compose, divide_samples, over_nothing
@@ -198,7 +197,8 @@ class View(LitPoints):
         """Node of the samples."""
         samples_of = functools.partial(Node, "radiance", items=self._samples, keeps=False)
         if self.clip_positions.requires_grad:
-            _warn_of_creases(self.assembly.scene.bodies)
+            for remark in unmoved_edges(self.assembly.scene):
+                check.warn(remark)
             moving = self.silhouettes, self.clip_positions
             return samples_of(_moving_radiance, self.receivers_node, lit, reflected, *moving)
         return samples_of(_radiance, self.receivers_node, lit, reflected)
@@ -273,16 +273,6 @@ class View(LitPoints):
 
 def _same(value: object) -> object:
     return value
-
-
-def _warn_of_creases(bodies: Sequence[Body]) -> None:
-    """Say that color jumps at a crease, and that pixels that are receivers do not notice that this line moves."""
-    for body in bodies:
-        if body.mesh.origins is not None and body.receivers == "pixel":
-            check.warn(
-                f"{body.called!r} is creased and shaded by pixel, so gradients to geometry leave out that its sharp "
-                'edges move; receivers = "vertex" has them'
-            )
 
 
 def _radiance(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:

@@ -1,4 +1,4 @@
-"""Sharp edges: which bodies have normals that round them."""
+"""Sharp edges: which bodies have normals that round them, and of which gradients leave out that they move."""
 
 from warpshadow.assets.topology import CREASE
 from warpshadow.scene.scene import Scene
@@ -11,4 +11,14 @@ def rounded_edges(scene: Scene) -> list[str]:
         f"dark or bright; Body(…).creased(), in scene files creased = {CREASE:g}, parts them"
         for number, body in enumerate(scene.bodies)
         if body.mesh.rounds_edges
+    ]
+
+
+def unmoved_edges(scene: Scene) -> list[str]:
+    """Say which bodies are creased and shaded by pixel: pixels do not notice that creases move, where color jumps."""
+    return [
+        f"{body.called!r} is creased and shaded by pixel, so gradients to geometry leave out that its sharp "
+        'edges move; receivers = "vertex" has them'
+        for body in scene.bodies
+        if body.mesh.origins is not None and body.receivers == "pixel"
     ]

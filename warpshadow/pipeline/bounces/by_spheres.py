@@ -248,10 +248,10 @@ class SphereBounces:
     def _radiosity(self, sources: Sources, taken: Node, stand_ins: StandIns, materials: Materials) -> Radiosity:
         """What patches send in the light in which sources are."""
         senders, why_not = stand_ins.senders, "light bounces once" if self._count == 1 else ""
-        seen, _, frames, _ = sources
-        lit = LitParts(seen, taken, _words(senders), _OF_SOURCES)
+        lit = LitParts(sources.seen, taken, _words(senders), _OF_SOURCES)
         albedo = self._patches.albedo(materials, senders.bodies)
-        among = self._gathering(senders, (lit, albedo, frames), _words(senders), _OF_SOURCES, why_not, only_others=True)
+        given = lit, albedo, sources.frames
+        among = self._gathering(senders, given, _words(senders), _OF_SOURCES, why_not, only_others=True)
         return Radiosity(self._count, stand_ins, self._own_factors, among, lit, albedo, sources)
 
     def _gathering(self, senders: Senders, *given: Any, **options: Any) -> Gathering:
