@@ -344,7 +344,7 @@ def test_vertices_and_spheres_have_the_gradient_of_what_they_send(method, name):
 class Given:
     """The image as a function of light, of both albedos, of colors of vertices or of a texture.
 
-    Bodies that stand still are lit by what is kept; a geometry that is given, though it is the scene's, by spheres.
+    Bodies that do not move are lit by what is kept; a geometry that is given, though it is the scene's, by spheres.
     """
 
     def __init__(self, renderer: TorchRenderer, name: str, *, stands: bool = True):
@@ -431,7 +431,7 @@ def test_one_instance_of_anything_serves_all_with_bounces(name):
         torch.testing.assert_close(image_of_batch(renderer, one)[0], images[instance], rtol=1e-5, atol=1e-6)
 
 
-# ---------------------------------------------------------------------------------------------- what stands still
+# ---------------------------------------------------------------------------------------------- what does not move
 
 
 @pytest.mark.parametrize("name", ["light", "albedo"])

@@ -487,7 +487,7 @@ def test_what_a_fit_writes_can_be_rendered(fit_file, tmp_path):
 
 @pytest.mark.slow
 def test_fit_recovers_a_color_and_the_exposure_from_a_picture_of_8_bits_under_a_mask(fit_file, tmp_path):
-    """Only what stands still in known light has a known color: the ground is known."""
+    """Only what does not move in known light has a known color: the ground is known."""
     lines = 'image = "photo.png"\nmask = "mask.png"'
     text = FIT.replace('image = "photo.exr"', lines).replace("[[free", "[free]\nexposure = true\n[[free")
     fit_file.write_text(text.replace("iterations = 60", "iterations = 200"))

@@ -1,6 +1,6 @@
 """Rendering with torch tensors: images that are differentiable in light, reflectance, geometry and cameras.
 
-While geometry and camera stand still, visibility and rasterization are computed once, by any method, the ray-traced
+While geometry and camera do not move, visibility and rasterization are computed once, by any method, the ray-traced
 mesh included; an iteration is then a matrix product and a gather.
 """
 

@@ -17,7 +17,7 @@ pose       MDE, mean distance of vertices to where they belong [% of the boundin
            rotations [rad]; TE, squared distance between the translations
 geometry   MDE of a body that was bent, twisted and stretched
 
-Where geometry stands still, "ray traced" is what a fit does by default. With ``--bounces`` targets are path traced with
+Where nothing moves, "ray traced" is what a fit does by default. With ``--bounces`` targets are path traced with
 all bounces, and fits that know direct light alone stand beside those that know so many; results are kept in
 OUTPUT/full_light_tables.json. ``--ablation`` repeats the pose for 50 to 200
 spheres and 16 to 64 coefficients of log-SH. Mitsuba 3 takes part where it is installed (mitsuba_fits.py).

@@ -98,7 +98,7 @@ def timed(scene: ws.Scene) -> tuple[np.ndarray, float]:
 
 
 def recover_light(scene: ws.Scene, target: np.ndarray, iterations: int) -> tuple[ws.EnvironmentMap, float]:
-    """Fit a map of light to an image, from a gray sky: with rays past what stands still, if the scene has shadows."""
+    """Fit a map of light to an image, from a gray sky: with rays past what does not move, if the scene has shadows."""
     start = time.perf_counter()
     unknown = dataclasses.replace(scene, light=ws.EnvironmentMap.constant(0.5))
     still = ws.Visibility(method="none" if scene.visibility.method == "none" else "ray-traced")

@@ -249,7 +249,7 @@ def loss_of(
 
 
 def teacher(scene: ws.Scene, through: str, device: torch.device) -> TorchRenderer:
-    """The renderer that a network learns through: while geometry stands still, an image is a matrix product."""
+    """The renderer that a network learns through: while geometry does not move, an image is a matrix product."""
     scene = dataclasses.replace(scene, visibility=RENDERERS[through])
     return TorchRenderer(scene, device=device, basis=ws.HarmonicBasis(ORDER))
 

@@ -207,7 +207,7 @@ def test_fits_of_spheres_are_beside_the_tape():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_threads_that_share_a_renderer_each_see_what_they_ask_for(method, restless):
-    """One body moves, so the renderer keeps what stands still, for the last camera."""
+    """One body moves, so the renderer keeps what does not move, for the last camera."""
     scene = small_scene(method, size=8)
     eyes = [(0.4 * k, 2.5, 5) for k in range(4)]
     matrices = [

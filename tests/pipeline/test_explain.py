@@ -246,10 +246,10 @@ def mesh_of(body: ws.Body) -> wp.Mesh:
 def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.ndarray]:
     """Of the receivers on still bodies, where the moving one is too far away to matter: as rendered, and by rays."""
     view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
-    shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.still)]
+    shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.on_static)]
     vertices = renderer.geometry().positions.numpy()[0]
     normals = vertex_normals(renderer.geometry().positions, renderer.assembly.faces).numpy()[0]
-    points, normals = (wp.array(values[view.receivers.still], dtype=wp.vec3) for values in (vertices, normals))
+    points, normals = (wp.array(values[view.receivers.on_static], dtype=wp.vec3) for values in (vertices, normals))
     mesh = mesh_of(renderer.scene.bodies[1])
     if light is None:
         truth = trace_shading(mesh, points, normals, sample_map(renderer.scene.light.radiance, directions)).numpy()
@@ -271,7 +271,7 @@ def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
     assert np.linalg.norm(shading - truth) < RAY_NOISE * np.linalg.norm(truth)
     view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0))))  # any body may move
     rows = view.receivers.of_vertices.numpy()[renderer.view(None).receivers.of_vertices.numpy() >= -1]
-    still = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.still
+    still = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0])).receivers.on_static
     by_spheres = renderer.shade(light, view).numpy()[0, rows[still]]
     assert np.linalg.norm(by_spheres - truth) > 3 * np.linalg.norm(shading - truth)
 
@@ -289,7 +289,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
 
     def weights_of(view: View) -> np.ndarray:
         weights = np.zeros((1, (view.receivers.of_vertices.numpy() >= 0).sum(), 3), np.float32)
-        vertices = view.receivers.still
+        vertices = view.receivers.on_static
         weights[0, : len(vertices)] = weight_of_vertex[vertices] * np.isin(vertices, always_seen)[:, None]
         return weights
 
@@ -299,7 +299,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
 
     step = 4e-3  # at which float32 rounding and curvature are both below the tolerance
     shifts = step * np.concatenate([np.eye(3), -np.eye(3)])
-    seen = [view_of(poses_of(renderer, shift)).receivers.still for shift in shifts]
+    seen = [view_of(poses_of(renderer, shift)).receivers.on_static for shift in shifts]
     always_seen = functools.reduce(np.intersect1d, seen)
     differences = np.array([loss(shift) for shift in shifts])
     poses = poses_of(renderer, requires_grad=True)
@@ -348,7 +348,7 @@ def test_cameras_share_what_stands_still(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_samples_that_are_receivers_are_lit_by_everything_that_moves_or_not(method):
-    """Bodies that stand still and have no spheres: nothing may change."""
+    """Bodies that do not move and have no spheres: nothing may change."""
     scene = scene_of(method, still_blocks=False)
     ground = dataclasses.replace(scene.bodies[2], receivers="pixel")
     renderer = Renderer(dataclasses.replace(scene, bodies=(*scene.bodies[:2], ground)))
@@ -396,7 +396,7 @@ def test_other_bodies_that_move_are_noticed(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_bodies_that_stand_elsewhere_are_noticed(method):
-    """A geometry that was not placed, in which what is said to stand still stands somewhere else."""
+    """A geometry that was not placed, in which what is said not to move is somewhere else."""
     renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
     image = renderer.draw(view=renderer.view(renderer.placed(moving=[0]))).numpy().copy()
     poses = renderer.scene_poses()

@@ -135,7 +135,7 @@ def test_without_blockers_log_sh_is_no_visibility_at_all(device):
 @pytest.mark.parametrize("blockers", [0, ws.Spheres(np.empty((0, 3)), [])], ids=["0", "no spheres"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, blockers):
-    """Neither when all bodies may move nor when it stands still among moving ones, nor on what it is compared with."""
+    """Neither when all bodies may move nor when others do, nor on what it is compared with."""
     canopy = ws.Body(ws.plane(4.0, 8), blockers=blockers, translation=(0, 2.6, 0))  # beyond what the camera sees
     results = []
     for bodies in ((ball(), ground()), (ball(), ground(), canopy)):

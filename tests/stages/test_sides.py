@@ -208,7 +208,7 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     renderer = Renderer(scene)
     view = renderer.view(renderer.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
-    assert view.receivers.points.shape[1] + len(view.receivers.still) == 2 * vertex_counts[0] + vertex_counts[1]
+    assert view.receivers.points.shape[1] + len(view.receivers.on_static) == 2 * vertex_counts[0] + vertex_counts[1]
     assert_near(renderer.draw(view=view).numpy()[0], expected)
     front = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
     assert front.view().receivers.points.shape[1] == vertex_counts[0]

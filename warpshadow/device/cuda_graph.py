@@ -1,4 +1,4 @@
-"""Graphs: an iteration whose shapes stand still, captured once and replayed as a single launch.
+"""Graphs: an iteration whose shapes stay, captured once and replayed as a single launch.
 
 On a GPU an iteration is some hundred kernels of a few microseconds each, and Python takes longer to launch them than
 they take to run. A CUDA graph holds all of them, forward and backward, and is launched at once:

@@ -236,19 +236,17 @@ class Assembly:
             )
         bodies = {*numbers, *rest.moving}
         vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
-        still = self.scene_geometry
+        own = self.scene_geometry
         if turned is not None:
-            assert still.rotations is not None
+            assert own.rotations is not None
             every, given = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
-            turned = exchanged(still.rotations, every, lambda a, b: given[:, a:b])
+            turned = exchanged(own.rotations, every, lambda a, b: given[:, a:b])
         return Geometry(
             exchanged(
-                still.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
+                own.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
             ),
-            exchanged(
-                still.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])
-            ),
-            exchanged(still.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            exchanged(own.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
+            exchanged(own.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,

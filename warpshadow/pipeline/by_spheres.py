@@ -39,7 +39,7 @@ class Bouncing(Protocol):
         """The same in free light."""
 
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
-        """The same of points that stand still; what does not depend on light and materials is kept."""
+        """The same of points that do not move; what does not depend on light and materials is kept."""
 
     def kept_free_shading(self, direct: Node, points: LitPoints, light: Source, materials: Materials) -> Node:
         """The same in free light, given the direct shading."""
@@ -230,7 +230,7 @@ class InParts(Node):
         """Find it for one part after another."""
         receivers, spheres, taken, kept_rows, looked_up, frames = self.values(call)
         groups = self._grouping.groups(call, receivers, spheres, kept_rows, looked_up, frames)
-        total = len(receivers.still) + receivers.points.shape[1]
+        total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", wanted=self._progress) as bar:
             for group in groups:
                 for part in group.parts():
@@ -314,7 +314,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Source | Non
 
     def missing() -> int:
         receivers = points.receivers_node.known(points.call)
-        return rows.missing(None if receivers is None else receivers.still)
+        return rows.missing(None if receivers is None else receivers.on_static)
 
     return Node(
         "static shadows",

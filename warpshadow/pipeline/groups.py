@@ -117,9 +117,9 @@ class Grouping:
             frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · flat]; None without any.
         """
         groups = list(self._that_move(receivers, spheres, own_shadows, frames))
-        if self._static is None or not len(receivers.still):
+        if self._static is None or not len(receivers.on_static):
             return groups
-        on_static = self._static.receivers(receivers.still, self._static.normals.value(call))
+        on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
         moving = self._assembly.spheres_of(self._solid(self._static.moving), spheres)
         group = Group(*on_static, *moving, kept_rows, flats=self._flats_around(frames, self._static.moving))
         return [group, *groups] if receivers.points.shape[1] else [group]

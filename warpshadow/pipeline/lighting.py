@@ -88,7 +88,7 @@ class LitPoints:
     def counts(self) -> tuple[str, int, int]:
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
         receivers = self.receivers
-        return "", receivers.points.size, len(receivers.still)
+        return "", receivers.points.size, len(receivers.on_static)
 
     def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
         """What the receivers send back as white surfaces, vec3 of shape [batch, receiver]; None is the scene's light.

@@ -61,7 +61,7 @@ _OF_CAMERAS = ("_own_view", "_without_others")
 class Renderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
-    Geometry and cameras of the scene itself stand still, so that their image costs a dot product and a gather. All
+    Geometry and cameras of the scene itself do not move, so that an image costs a dot product and a gather. All
     methods are differentiable under Warp's tape in the arrays they are given, as far as those require gradients.
 
     Args:

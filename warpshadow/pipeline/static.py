@@ -1,4 +1,4 @@
-"""Static bodies: those that stand still among moving ones. What is found out about them once is kept.
+"""Static bodies: those that do not move while others do. What is found out about them once is kept.
 
 Where the spheres of moving bodies let the share T_q of the light of a cell through, a receiver on a static body gets
 
@@ -178,7 +178,7 @@ class Rows:
 
     def of_receivers(self, receivers: Receivers, normals: wp.array) -> KeptRows | None:
         """Rows of the static receivers, those of vertices that come for the first time found; None without any."""
-        vertices = receivers.still
+        vertices = receivers.on_static
         if not len(vertices):
             return None
         new = vertices[self._row_of_vertex[vertices] < 0]

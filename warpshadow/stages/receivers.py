@@ -37,12 +37,12 @@ class Receivers(NamedTuple):
     pixel with a receiver r of its own sees a face (r, r, r), which follows the mesh's faces.
     """
 
-    points: wp.array  # [batch, receiver − still] vec3
-    normals: wp.array  # [batch, receiver − still] vec3
+    points: wp.array  # [batch, receiver − on static] vec3
+    normals: wp.array  # [batch, receiver − on static] vec3
     faces: wp.array  # [face or side + own] vec3i, indices of receivers
     of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
-    still: np.ndarray = np.empty(0, int)  # [still], the vertices that the first receivers are
+    on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # [vertex receiver] int32, the vertices and backs that the first of them are, …
     seen: Fragments | None = None  # … and what the rest see: sides and barycentrics, [batch, own]; −1 for none
@@ -205,8 +205,10 @@ def _add_faces(
 class Numbering(NamedTuple):
     """Which vertices are receivers, and their numbers."""
 
-    vertices: wp.array | None  # [receiver − still] int32, those not on static bodies; None for all vertices as they are
-    still: np.ndarray  # [still], those on static bodies, which are the first receivers
+    vertices: (
+        wp.array | None
+    )  # [receiver − on static] int32, those not on static bodies; None for all vertices as they are
+    on_static: np.ndarray  # [on static], those on static bodies, which are the first receivers
     faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
     spans: tuple[Span, ...] = ()  # of those not on static bodies, where bodies are told apart
@@ -219,7 +221,7 @@ class Numbering(NamedTuple):
     @property
     def receiver_count(self) -> int:
         """Number of receivers at vertices."""
-        return len(self.still) + self.moving_count
+        return len(self.on_static) + self.moving_count
 
 
 def number_receivers(
@@ -252,13 +254,13 @@ def number_receivers(
         bodies = np.tile(bodies, side_count)
         sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
     stays, moves = (keeps_vertex & is_static).ravel(), (keeps_vertex & ~is_static).ravel()
-    still, vertices = sequence[stays[sequence]], sequence[moves[sequence]]
+    on_static, vertices = sequence[stays[sequence]], sequence[moves[sequence]]
     of_vertices = np.full(keeps_vertex.size, -1, np.int32)
-    of_vertices[np.concatenate([still, vertices])] = np.arange(len(still) + len(vertices))
+    of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
     corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
     return Numbering(
         wp.array(vertices, dtype=wp.int32, device=device),
-        still,
+        on_static,
         wp.array(corners, dtype=wp.vec3i, device=device),
         wp.array(of_vertices, dtype=wp.int32, device=device),
         () if bodies is None else _spans(bodies[vertices]),
@@ -303,7 +305,7 @@ def find_receivers(
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
-    vertices, still, receiver_faces, of_vertices, spans = numbering
+    vertices, on_static, receiver_faces, of_vertices, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
     own, own_count = _Own(receiver_fragments), 0
@@ -331,7 +333,7 @@ def find_receivers(
         inputs=[positions, normals, faces, rows(sides), own.means, vertices, own.samples],
         outputs=[points, point_normals],
     )
-    found = Receivers(points, point_normals, receiver_faces, of_vertices, own.fragments, still)
+    found = Receivers(points, point_normals, receiver_faces, of_vertices, own.fragments, on_static)
     if bodies is None:
         return found
     return found._replace(spans=spans, vertices=vertices, seen=_seen(sides, own) if own_count else None)

@@ -1,4 +1,4 @@
-"""Bounces over geometry that stands still, of free light and reflectance: against paths, a twin and differences."""
+"""Bounces over geometry that does not move, of free light and reflectance: against paths, a twin and differences."""
 
 import itertools
 from dataclasses import replace

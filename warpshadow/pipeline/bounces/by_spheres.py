@@ -258,7 +258,7 @@ class SphereBounces:
         return Gathering(self._method.visibility, senders, self._own_factors, *given, **options)
 
     def kept_shading(self, points: LitPoints, taken: Any, light: Source, materials: Materials) -> Node:
-        """The same of points that stand still: what they and the sources see is kept, and so are form factors by rays.
+        """The same of points that do not move: what they and the sources see is kept, and so are form factors by rays.
 
         Args:
             points: The receivers, among bodies that stand where the scene has them.
@@ -284,7 +284,7 @@ class SphereBounces:
         return self._still.in_free_light(direct, transfers, light, points, materials)
 
     def _kept_sources(self, points: LitPoints, materials: Materials) -> tuple[Node, LitPoints]:
-        """Node of the sources of bodies that stand still, and these as points that are lit."""
+        """Node of the sources of bodies that do not move, and these as points that are lit."""
         sources = self._still.sources(points, materials)
         return sources, points.kept("lit sources", sources, lambda: self._at(sources, points, materials))
 

@@ -1,4 +1,4 @@
-"""Bounces where geometry stands still: rays once, then small matrices in each iteration, by any method that lights.
+"""Bounces where geometry does not move: rays once, then small matrices in each iteration, by any method that lights.
 
 Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
 With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces,
@@ -64,7 +64,7 @@ class _Factors(NamedTuple):
 
 
 class KeptBounces:
-    """Light that bounces between the bodies of a scene that stand still.
+    """Light that bounces between the bodies of a scene that do not move.
 
     Args:
         patches: Of the scene.

@@ -178,7 +178,7 @@ def find_footprints(
 ) -> Footprints:
     """Find where each sample lies in its texture, and what it covers there.
 
-    Footprints depend on the sizes of the textures, not on what is in them: where geometry and camera stand still,
+    Footprints depend on the sizes of the textures, not on what is in them: where geometry and camera do not move,
     they are found once. A footprint is that of the sample's face, continued beyond its edges, so neither seams of
     the uvs nor occlusions disturb it.
 
