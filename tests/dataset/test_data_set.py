@@ -199,6 +199,7 @@ layers = ["color", "masks"]
 [bodies]
 meshes = "meshes"
 blockers = 16
+creased = 30
 count = [2, 2]
 size = [0.5, 1]
 upright = 1
@@ -226,6 +227,7 @@ def test_a_recipe_is_read(folder):
     recipe = load_recipe(folder / "recipe.toml")
     assert (recipe.images, recipe.seed, recipe.shard, recipe.layers) == (30, 3, 8, ("color", "masks"))
     assert (recipe.meshes, recipe.maps, recipe.blockers) == (folder / "meshes", folder / "maps", 16)
+    assert recipe.creased == 30
     drawn = {"count": (2, 2), "size": (0.5, 1), "upright": 1, "albedo": (0.5, 0.6)}
     ranges = Ranges(**drawn, rotation=(0, 90), scale=(1, 1), fov_y=(30, 50))
     assert recipe.ranges == ranges
@@ -243,8 +245,10 @@ def test_a_recipe_is_read(folder):
         ('"masks"', '"color"', "layers: got ['color', 'color'], expected one or more, each once"),
         ("shard = 8", "shard = 0", "shard: got 0, expected a whole number of images, at least 1"),
         ('meshes = "meshes"', 'meshes = "mesh"', "[bodies]: meshes: no such folder: "),
-        ('meshes = "meshes"', "", "[bodies]: blockers: got it without meshes, to which they are fitted"),
+        ('meshes = "meshes"', "", "[bodies]: blockers: got it without meshes, for which it is"),
         ("blockers = 16", "blockers = -1", "[bodies]: blockers: got -1, expected a whole number of at least 0"),
+        ("creased = 30", "creased = true", "[bodies]: creased: got True, expected degrees from 0 to 180"),
+        ("images = 30", 'images = 30\nformat = "jpg"', "format: got 'jpg', expected one of 'exr', 'png'"),
         (
             "count = [2, 2]",
             "count = [2, 9]",

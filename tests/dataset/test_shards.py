@@ -7,12 +7,14 @@ import subprocess
 import sys
 import tarfile
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from trimesh import creation
 from typer.testing import CliRunner
 
 import warpshadow as ws
@@ -98,6 +100,24 @@ def test_a_sample_has_the_same_bits_in_any_order_on_any_number_of_threads(recipe
     finally:
         ws.set_thread_count(None)
     assert forward == backward[::-1]
+
+
+def test_a_warning_is_said_once_with_the_number_of_the_first_image_and_creased_meshes_draw_none(recipe, tmp_path):
+    """Boxes, whose corners have one normal each."""
+    (tmp_path / "meshes").mkdir()
+    for name, width in (("box", 1.0), ("bar", 2.0)):
+        box = creation.box((width, 1, 1))
+        ws.Mesh(box.vertices, box.faces).write(tmp_path / "meshes" / f"{name}.obj")
+    plain = replace(load_recipe(recipe), images=4, splits={"train": 1.0}, meshes=tmp_path / "meshes")
+    with pytest.warns(UserWarning) as said:
+        write_shards(DataSet(plain), tmp_path / "rounded", workers=1)
+    (message,) = [str(each.message) for each in said]
+    assert re.match(r"image 0: body 0 \('b..'\) has sharp edges", message)
+    creased = DataSet(replace(plain, creased=30))
+    assert creased.hashes == DataSet(plain).hashes and len(creased.draw(0).scene.bodies[0].mesh.positions) == 24
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_shards(creased, tmp_path / "creased", workers=1)
 
 
 @pytest.mark.slow

@@ -132,6 +132,27 @@ def exr_channels(content: bytes) -> dict[str, np.ndarray]:
         raise ImageError(f"not an OpenEXR file, or a damaged one ({error})") from error
 
 
+def png_codes(content: bytes) -> np.ndarray:
+    """The codes of a PNG file in memory, as :func:`warpshadow.assets.picture.png_bytes` makes one.
+
+    Returns:
+        uint8 of shape [height, width, 1, 3 or 4], or uint16 of shape [height, width, 1].
+
+    Raises:
+        ImageError: for what is none, or is truncated.
+    """
+    from PIL import Image
+
+    try:
+        picture = Image.open(io.BytesIO(content), formats=["PNG"])
+    except Image.UnidentifiedImageError as error:
+        raise ImageError("not a PNG file, or its header is damaged") from error
+    _load(picture)
+    codes = np.asarray(picture)
+    codes = codes if codes.dtype == np.uint8 else codes.astype(np.uint16)  # of 16 bits; some releases give it 32
+    return codes.reshape(*codes.shape[:2], -1)
+
+
 def _no_layers(path: Path, layers: object) -> None:
     if layers is not None:
         raise ImageError(f"{path}: got layers, which only .exr files have")

@@ -85,9 +85,7 @@ class Picture:
 
     def _repr_png_(self) -> bytes:
         """What notebooks draw."""
-        file = io.BytesIO()
-        _pillow(self.pixels).save(file, format="PNG")
-        return file.getvalue()
+        return png_bytes(self.pixels)
 
     def opaque(self) -> np.ndarray:
         """uint8 of shape [height, width, 3], on white where the picture is transparent."""
@@ -111,6 +109,13 @@ class Picture:
             else:
                 shown = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
                 _pillow(shown).save(unfinished, quality=95, subsampling=0)
+
+
+def png_bytes(codes: np.ndarray) -> bytes:
+    """A PNG file in memory of uint8 [height, width, 1, 3 or 4] or uint16 [height, width, 1]."""
+    file = io.BytesIO()
+    _pillow(codes).save(file, format="PNG")
+    return file.getvalue()
 
 
 def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:

@@ -72,14 +72,15 @@ class DataSet:
         for kept in (_read_body, _read_map):
             kept.cache_clear()  # of files as they were
         fits = recipe.visibility.method in (*SPHERE_METHODS, AUTO) or "spheres" in recipe.layers
-        self._read_mesh = functools.partial(_read_body, blockers=recipe.blockers, fits=fits, device=self.device)
+        given = {"blockers": recipe.blockers, "creased": recipe.creased, "fits": fits, "device": self.device}
+        self._read_mesh = functools.partial(_read_body, **given)
         self.hashes: dict[str, dict[str, str]] = {}
         if recipe.meshes is None:
             self.hashes["meshes"] = {body.called: body.mesh.content_hash for body in primitives()}
             self._primitives = [_fitted(body, self.device) if fits else body for body in primitives()]
         else:
             self.hashes["meshes"] = _hashes(
-                recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: _content_hash(self._read_mesh(path)), progress
+                recipe.meshes, "meshes", MESH_SUFFIXES, lambda path: self._read_mesh(path).content_hash, progress
             )
         if recipe.maps is not None:
             self.hashes["maps"] = _hashes(
@@ -124,7 +125,7 @@ class DataSet:
         if recipe.meshes is None:
             bodies = [body for body in self._primitives if body.called in stock.meshes]
         else:
-            bodies = _ReadWhenAsked(recipe.meshes, stock.meshes, self._read_mesh)
+            bodies = _ReadWhenAsked(recipe.meshes, stock.meshes, lambda path: self._read_mesh(path).body)
         maps = None if recipe.maps is None else _ReadWhenAsked(recipe.maps, stock.maps or (), _read_map)
         given = recipe.visibility, recipe.supersampling, maps, recipe.ranges, recipe.bounces
         return RandomScenes(recipe.seed, recipe.images, recipe.size, bodies, *given)
@@ -163,17 +164,23 @@ class _ReadWhenAsked(Sequence[Item], Generic[Item]):
             return self._read(self._folder / self._names[place])
 
 
+class _Read(NamedTuple):
+    """A mesh as it was read."""
+
+    body: Body
+    """With its spheres, creased if that is wanted."""
+    content_hash: str
+    """Of what is in the file, and in that of its texture, however it is creased."""
+
+
 @functools.lru_cache(_KEPT_BODIES)
-def _read_body(path: Path, blockers: int, fits: bool, device: str) -> Body:
+def _read_body(path: Path, blockers: int, creased: float | None, fits: bool, device: str) -> _Read:
     body = Body(path, blockers=blockers)
-    return _fitted(body, device) if fits else body
-
-
-def _content_hash(body: Body) -> str:
-    """A hash of a mesh, and of its texture where it has one."""
-    if body.texture is None:
-        return body.mesh.content_hash
-    return hashlib.sha256(body.mesh.content_hash.encode() + body.texture.tobytes()).hexdigest()
+    content_hash = body.mesh.content_hash
+    if body.texture is not None:
+        content_hash = hashlib.sha256(content_hash.encode() + body.texture.tobytes()).hexdigest()
+    body = body if creased is None else body.creased(creased)
+    return _Read(_fitted(body, device) if fits else body, content_hash)
 
 
 def _fitted(body: Body, device: str) -> Body:

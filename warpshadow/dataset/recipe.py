@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 from warpshadow import check
 from warpshadow.check import AnyPath
+from warpshadow.dataset.layers import LAYERS
 from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
 from warpshadow.scene.scene import Scene, Visibility, check_bounces, check_supersampling
@@ -19,11 +20,14 @@ from warpshadow.scene.toml_tables import Table
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
 """What JSON has."""
 
-LAYERS = ("color", "shadow", "depth", "normals", "bodies", "masks", "spheres", "light")
+_LAYERS = (*LAYERS, "spheres", "light")
 """What may be written of each scene."""
 
+FORMATS = ("exr", "png")
+"""What layers of pixels may be kept as."""
+
 _KEYS = {
-    "bodies": ("meshes", "blockers", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
+    "bodies": ("meshes", "blockers", "creased", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
     "light": ("maps", "rotation", "scale", "bounces"),
     "camera": ("size", "supersampling", "fov_y", "elevation", "distance"),
     "visibility": None,
@@ -44,11 +48,14 @@ class Recipe:
         images: Number of images in all splits together.
         seed: Number of the data set, 0 or more.
         shard: Images in a shard; the last one of a split has fewer.
-        layers: What is written of each scene: some of ``LAYERS``.
+        layers: What is written of each scene: some of those of :mod:`warpshadow.dataset.layers`, "spheres", "light".
+        format: Of the layers of pixels: "exr", as they are, or "png", in 8 and 16 bits.
         splits: Part of the images, and about that part of the meshes and maps, by the name of the split; their sum
             is 1.
         meshes: Folder of meshes, those in its folders, too; None for simple shapes.
         blockers: Spheres that are fitted to each mesh of the folder.
+        creased: The meshes of the folder are parted where faces bend by more [degrees], 0 to 180; None for nowhere. See
+            :meth:`warpshadow.Mesh.creased`.
         maps: Folder of environment maps; None for skies and lamps that are drawn.
         size: Width and height of the images [pixels].
         ranges: What poses, colors, light and cameras are drawn from.
@@ -59,9 +66,11 @@ class Recipe:
     seed: int = 0
     shard: int = 200
     layers: tuple[str, ...] = ("color", "shadow", "depth", "normals")
+    format: str = "exr"
     splits: Mapping[str, float] = field(default_factory=lambda: {"train": 1.0})
     meshes: Path | None = None
     blockers: int = 64
+    creased: float | None = None
     maps: Path | None = None
     size: tuple[int, int] = (128, 128)
     ranges: Ranges = Ranges()
@@ -73,14 +82,17 @@ class Recipe:
         check.whole("images", self.images)
         check.whole("seed", self.seed, least=0)
         check.whole("shard", self.shard, what="images")
-        check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, LAYERS))}")
+        check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, _LAYERS))}")
         for layer in self.layers:
-            check.choice("layers", layer, LAYERS)
+            check.choice("layers", layer, _LAYERS)
         if not self.layers or len(set(self.layers)) < len(self.layers):
             raise ValueError(f"layers: got {check.described(self.layers)}, expected one or more, each once")
         object.__setattr__(self, "layers", tuple(self.layers))
+        check.choice("format", self.format, FORMATS)
         object.__setattr__(self, "splits", _checked_splits(self.splits))
         check.whole("blockers", self.blockers, least=0)
+        if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
+            raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
         object.__setattr__(self, "size", check.image_size(self.size))
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
@@ -124,16 +136,16 @@ def load_recipe(path: AnyPath) -> Recipe:
 
 
 def _recipe(given: Table, folder: Path) -> Recipe:
-    plain = ("images", "seed", "shard", "layers")
+    plain = ("images", "seed", "shard", "layers", "format")
     check.known_keys("the recipe", given, (*plain, *_KEYS))
     bodies, light, camera, visibility, splits = (dict(_table(given, name)) for name in _KEYS)
     recipe = toml_tables.make(Recipe, _taken(dict(given), *plain))
     with check.located("[bodies]"):
-        found = _taken(bodies, "blockers")
+        found = _taken(bodies, "blockers", "creased")
         if "meshes" in bodies:
             found["meshes"] = _folder(bodies, "meshes", folder)
         elif found:
-            raise ValueError("blockers: got it without meshes, to which they are fitted")
+            raise ValueError(f"{next(iter(found))}: got it without meshes, for which it is")
         recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **bodies))
     with check.located("[light]"):
         found = _taken(light, "bounces")

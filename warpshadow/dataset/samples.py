@@ -1,46 +1,38 @@
 """Samples: an image and what it shows, as the files that a shard has of it; written and read.
 
-A sample has a key, the number of its image in nine digits, and up to three files:
+A sample has a key, the number of its image in nine digits, and these files:
 
-    KEY.exr          layers that are images, as channels
+    KEY.exr          layers of pixels, as channels; or, where the recipe says so, KEY.color.png, KEY.depth.png, …
     KEY.spheres.npy  what stands in for the bodies, float32 of shape [sphere, 5]: center, radius, number of the body
     KEY.json         how the scene was drawn; README.md says what it has
 """
 
 from __future__ import annotations
 
-import functools
 import io
 import itertools
 import json
 import tarfile
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.image import exr_bytes, exr_channels
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
+from warpshadow.dataset.layers import LAYERS, Shown
+from warpshadow.dataset.png import Channels, as_png, from_png
 from warpshadow.dataset.recipe import Plain
-from warpshadow.device.tape import unrecorded
 from warpshadow.scene.files import camera_table
 from warpshadow.scene.random_scenes import Drawn
 from warpshadow.scene.scene import Body, Scene
 from warpshadow.spheres import Spheres
-from warpshadow.tuning.renderer import Renderer
 
 LIGHT_ORDER = 4
 """Bands of the coefficients that a sample has of its light."""
-
-_WHITE = (1.0, 1.0, 1.0)
-
-_LAYER_OF = {"Z": "depth", "N": "normals", "body": "bodies", "mask": "masks"}
-"""Layers by what the names of their channels begin with, as renderers call these."""
 
 
 class Sample(NamedTuple):
@@ -49,7 +41,7 @@ class Sample(NamedTuple):
     key: str
     """Number of the image, in nine digits."""
     channels: dict[str, np.ndarray]
-    """Layers that are images, float32 of shape [height, width], by their channels."""
+    """Layers of pixels, float32 of shape [height, width], by their channels; the same of EXR and PNG."""
     spheres: np.ndarray | None
     """float32 of shape [sphere, 5]: center, radius [scene units], number of the body; None where the layer is not."""
     scene: dict[str, Plain]
@@ -67,59 +59,30 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     The bits depend on the recipe, the number, and what is in the meshes and maps of the scene; neither on what was
     rendered before nor on the number of threads.
     """
-    layers, drawn = data_set.recipe.layers, data_set.draw(number)
-    scene = drawn.scene
-    renderer = Renderer(scene, device=data_set.device, progress=False)
-    channels: dict[str, np.ndarray] = {}
-    if "color" in layers:
-        channels |= dict(zip("RGBA", np.moveaxis(renderer.render(), -1, 0), strict=True))
-    if "shadow" in layers:
-        shadow = _shadow(renderer, data_set.device)
-        channels |= {f"shadow.{color}": shadow[..., k] for k, color in enumerate("RGB")}
-    if set(_LAYER_OF.values()) & set(layers):
-        channels |= _chosen(renderer.layers().channels(), layers, data_set.recipe.ranges.count[1] + 1)
-    files = {"json": json.dumps(_about(data_set, number, drawn), ensure_ascii=False).encode()}
-    if channels:
-        files["exr"] = exr_bytes(channels)
-    if "spheres" in layers:
+    recipe, drawn = data_set.recipe, data_set.draw(number)
+    shown = Shown(drawn.scene, data_set.device, recipe.ranges.count[1] + 1)
+    found = {name: layer.find(shown) for name, layer in LAYERS.items() if name in recipe.layers}
+    about, files = _about(data_set, number, drawn), {}
+    if found and recipe.format == "exr":
+        files["exr"] = exr_bytes({name: values for layer in found.values() for name, values in layer.items()})
+    elif found:
+        files, about["png"] = _pictures(found)
+    if "spheres" in recipe.layers:
         stream = io.BytesIO()
-        np.save(stream, _spheres(scene))
+        np.save(stream, _spheres(drawn.scene))
         files["spheres.npy"] = stream.getvalue()
+    files["json"] = json.dumps(about, ensure_ascii=False).encode()
     return files
 
 
-def _chosen(channels: dict[str, np.ndarray], layers: tuple[str, ...], most_bodies: int) -> dict[str, np.ndarray]:
-    """The channels of layers; masks for as many bodies as any scene has, so that images can be stacked."""
-    empty = {f"mask.{number}": np.zeros_like(channels["Z"]) for number in range(most_bodies)}
-    return {name: values for name, values in (empty | channels).items() if _LAYER_OF[name.split(".")[0]] in layers}
-
-
-def _shadow(renderer: Renderer, device: str) -> np.ndarray:
-    """Direct light on the bodies over that which they would get if nothing blocked any: [height, width, 3].
-
-    All surfaces count as white. Where no light would come from, and where there is no body, it is 1.
-    """
-    scene = renderer.scene
-    if scene.bounces:
-        scene = replace(scene, bounces=0)
-        renderer = Renderer(scene, device=device, progress=False)
-    bodies = tuple(replace(body, blockers=0) for body in scene.bodies)
-    others = Renderer(replace(scene, bodies=bodies), device=device, progress=False)
-    received, unblocked = (_white_image(each)[..., :3] for each in (renderer, others))
-    return np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
-
-
-def _white_image(renderer: Renderer) -> np.ndarray:
-    """The image if all bodies were white."""
-    white = functools.partial(wp.full, value=wp.vec3(_WHITE), dtype=wp.vec3, device=renderer.device)
-    albedo, textures = {}, {}
-    for number, body in enumerate(renderer.scene.bodies):
-        if body.texture is None:
-            albedo[number] = white((1, 1))
-        else:
-            textures[number] = white((1, 1, 1))
-    with unrecorded():
-        return renderer.draw(albedo=albedo, textures=textures).numpy()[0].copy()
+def _pictures(found: dict[str, Channels]) -> tuple[dict[str, bytes], dict[str, Plain]]:
+    """PNG files of layers, by the ends of their names; and what is said of each."""
+    files: dict[str, bytes] = {}
+    about: dict[str, Plain] = {}
+    for name, channels in found.items():
+        for ending, shown in LAYERS[name].pictures(name, channels).items():
+            files[ending], about[ending] = as_png(shown, LAYERS[name].coding)
+    return files, about
 
 
 def _spheres(scene: Scene) -> np.ndarray:
@@ -194,6 +157,11 @@ def read_shard(path: AnyPath) -> Iterator[Sample]:
 def _sample(key: str, files: dict[str, bytes]) -> Sample:
     if "json" not in files:
         raise ValueError(f"{key}: got {', '.join(files)}, expected a .json file")
+    scene = json.loads(files["json"])
     channels = exr_channels(files["exr"]) if "exr" in files else {}
+    for ending, about in scene.get("png", {}).items():
+        if ending not in files:
+            raise ValueError(f"{key}: got {', '.join(files)}, expected a .{ending} file, too")
+        channels |= from_png(files[ending], about)
     spheres = np.load(io.BytesIO(files["spheres.npy"])) if "spheres.npy" in files else None
-    return Sample(key, channels, spheres, json.loads(files["json"]))
+    return Sample(key, channels, spheres, scene)

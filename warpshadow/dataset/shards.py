@@ -6,7 +6,9 @@ import contextlib
 import functools
 import io
 import json
+import re
 import tarfile
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -51,7 +53,8 @@ def write_shards(
 ) -> list[Path]:
     """Render the images of a data set into shards, those that are not there yet; bits are the same for any workers.
 
-    A shard has a temporary name until it is whole. So what was interrupted goes on, at the shards that were begun.
+    A shard has a temporary name until it is whole. So what was interrupted goes on, at the shards that were begun. Each
+    kind of warning is said once, with the number of the first image that draws it.
 
     Args:
         data_set: What is drawn.
@@ -75,12 +78,14 @@ def write_shards(
         _begin(folder, describe(data_set))
         missing = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing for number in shard.numbers]
-        rendered = _rendered(data_set, numbers, _worker_count(data_set, workers))
+        rendered, said = _rendered(data_set, numbers, _worker_count(data_set, workers)), set[str]()
         with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", wanted=progress) as bar:
             for shard in missing:
                 with _new_archive(folder / shard.name) as archive:
                     for number in shard.numbers:
-                        _add(archive, number, next(rendered))
+                        sample, remarks = next(rendered)
+                        _say(remarks, number, said)
+                        _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
 
@@ -91,20 +96,45 @@ def _worker_count(data_set: DataSet, workers: int | None) -> int:
     return thread_count() if data_set.device == "cpu" else 1
 
 
-def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[dict[str, bytes], None, None]:
-    """Render images, and give the files of each in the order of the numbers."""
-    render = functools.partial(render_sample, data_set)
+class _Rendered(NamedTuple):
+    """An image, and what was said meanwhile."""
+
+    files: dict[str, bytes]
+    """By the ends of their names."""
+    warnings: list[str]
+
+
+def _render(data_set: DataSet, number: int) -> _Rendered:
+    """Render an image, and keep the warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        files = render_sample(data_set, number)
+    return _Rendered(files, [str(each.message) for each in caught])
+
+
+def _say(remarks: list[str], number: int, said: set[str]) -> None:
+    """Warn of what was not said of another image; names and numbers make no difference."""
+    for remark in remarks:
+        kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
+        if not kinds <= said:
+            check.warn(f"image {number}: {remark}")
+        said.update(kinds)
+
+
+def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:
+    """Render images, in the order of the numbers."""
+    render = functools.partial(_render, data_set)
     if workers == 1:
         yield from map(render, numbers)
         return
-    early: dict[int, dict[str, bytes]] = {}
+    early: dict[int, _Rendered] = {}
     with contextlib.closing(run_tasks(render, numbers, workers=workers)) as ended:
         for number in numbers:
             while number not in early:
-                done, sample, error = next(ended)
-                if sample is None:
+                done, rendered, error = next(ended)
+                if rendered is None:
                     raise ChildProcessError(f"image {done}: {error}") from error
-                early[done] = sample
+                early[done] = rendered
             yield early.pop(number)
 
 

@@ -1,0 +1,113 @@
+"""Layers of pixels: what an image of a data set may show. ``LAYERS`` says how each is found, and how PNG has it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.dataset.png import Channels, Coding, Even, Srgb
+from warpshadow.device.tape import unrecorded
+from warpshadow.scene.scene import Scene
+from warpshadow.tuning.renderer import Renderer
+
+_WHITE = (1.0, 1.0, 1.0)
+
+
+class Shown:
+    """What an image shows; each part is found when a layer asks for it, once.
+
+    Args:
+        scene: The scene.
+        device: Where it is rendered.
+        most_bodies: There are masks for so many, so that images can be stacked; those of no body are 0.
+    """
+
+    def __init__(self, scene: Scene, device: str, most_bodies: int):
+        self.most_bodies = most_bodies
+        self._make = functools.partial(Renderer, device=device, progress=False)
+        self.renderer = self._make(scene)
+
+    @functools.cached_property
+    def _channels(self) -> Channels:
+        """Those of the renderer's layers, as it calls them."""
+        return self.renderer.layers().channels()
+
+    def color(self) -> Channels:
+        """Linear RGB, premultiplied, and coverage."""
+        return _named("RGBA", self.renderer.render())
+
+    def shadow(self) -> Channels:
+        """Direct light on the bodies over that which they would get if nothing blocked any.
+
+        All surfaces count as white. Where no light would come from, and where there is no body, it is 1.
+        """
+        renderer = self.renderer
+        if renderer.scene.bounces:
+            renderer = self._make(replace(renderer.scene, bounces=0))
+        bodies = tuple(replace(body, blockers=0) for body in renderer.scene.bodies)
+        others = self._make(replace(renderer.scene, bodies=bodies))
+        received, unblocked = (_white_image(each)[..., :3] for each in (renderer, others))
+        ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
+        return _named([f"shadow.{color}" for color in "RGB"], ratio)
+
+    def some(self, *names: str) -> Channels:
+        """Some of the channels of the renderer's layers."""
+        return {name: self._channels[name] for name in names}
+
+    def masks(self) -> Channels:
+        """Part of each pixel that each body covers."""
+        names = [f"mask.{number}" for number in range(self.most_bodies)]
+        return {name: self._channels.get(name, np.zeros_like(self._channels["Z"])) for name in names}
+
+
+def _named(names: Sequence[str], values: np.ndarray) -> Channels:
+    return dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
+
+
+def _white_image(renderer: Renderer) -> np.ndarray:
+    """The image if all bodies were white."""
+    white = functools.partial(wp.full, value=wp.vec3(_WHITE), dtype=wp.vec3, device=renderer.device)
+    albedo, textures = {}, {}
+    for number, body in enumerate(renderer.scene.bodies):
+        if body.texture is None:
+            albedo[number] = white((1, 1))
+        else:
+            textures[number] = white((1, 1, 1))
+    with unrecorded():
+        return renderer.draw(albedo=albedo, textures=textures).numpy()[0].copy()
+
+
+# ---------------------------------------------------------------------------------------------- the table
+
+
+class Layer(NamedTuple):
+    """A layer of pixels."""
+
+    find: Callable[[Shown], Channels]
+    """Find its channels."""
+    coding: Coding
+    """How PNG has their numbers."""
+    is_apart: bool = False
+    """Whether each channel is a picture of its own."""
+
+    def pictures(self, name: str, channels: Channels) -> dict[str, Channels]:
+        """The channels of each PNG file, by the end of its name."""
+        if self.is_apart:
+            return {f"{channel}.png": {channel: values} for channel, values in channels.items()}
+        return {f"{name}.png": channels}
+
+
+LAYERS = {
+    "color": Layer(Shown.color, Srgb()),
+    "shadow": Layer(Shown.shadow, Even(8)),
+    "depth": Layer(lambda shown: shown.some("Z"), Even(16)),
+    "normals": Layer(lambda shown: shown.some("N.X", "N.Y", "N.Z"), Even(8, low=-128 / 127)),  # 128 is 0
+    "bodies": Layer(lambda shown: shown.some("body"), Even(8, low=-1, high=254)),
+    "masks": Layer(Shown.masks, Even(8), is_apart=True),
+}
+"""The layers, by the names that recipes have for them."""

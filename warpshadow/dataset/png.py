@@ -1,0 +1,98 @@
+"""Channels as pictures in PNG, and back.
+
+PNG has whole numbers, codes. What they stand for differs from image to image; it is said beside each picture, so that
+the channels can be had again, but for rounding:
+
+    values = (low (most − code) + high code) / most,   of most = 255 or 65535, range = [low, high]
+    color  = alpha sRGB⁻¹(code / 255) / 2^exposure,    alpha = code / 255
+
+Nothing is cut off: a range is as wide, and an exposure as low, as an image needs. Only color below 0, which sRGB has
+not, becomes 0: it is said of which part of the pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.image import png_codes
+from warpshadow.assets.picture import png_bytes
+
+Channels = dict[str, np.ndarray]
+"""float32 of shape [height, width], by names."""
+
+
+class Coding(Protocol):
+    """How the channels of a picture become codes."""
+
+    def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """The codes of values [height, width, channel], and what is said of them."""
+        ...
+
+
+@dataclass(frozen=True)
+class Even:
+    """Numbers at even steps.
+
+    Args:
+        bits: Of a code, 8 or 16.
+        low: What code 0 stands for; less, where an image has less.
+        high: What the largest code stands for; more, where an image has more.
+    """
+
+    bits: int = 8
+    low: float = 0.0
+    high: float = 1.0
+
+    def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """As :class:`Coding` says."""
+        most = 2**self.bits - 1
+        rounding = (self.high - self.low) / most / 2
+        least, largest = float(values.min()), float(values.max())
+        low = least if least < self.low - rounding else self.low
+        high = largest if largest > self.high + rounding else self.high
+        codes = np.rint((values.astype(np.float64) - low) / (high - low) * most).clip(0, most)
+        return codes.astype(np.uint8 if self.bits == 8 else np.uint16), {"range": [low, high]}
+
+
+class Srgb:
+    """Color and coverage in 8 bits: sRGB, not premultiplied, exposed so that the brightest value is just white."""
+
+    def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """As :class:`Coding` says."""
+        alpha = np.rint(values[..., 3:].astype(np.float64) * 255).clip(0, 255)
+        color = np.divide(values[..., :3], values[..., 3:], out=np.zeros_like(values[..., :3]), where=alpha > 0)
+        brightest = float(color.max())
+        exposure = -float(np.log2(brightest)) if brightest > 0 else 0.0
+        encoded = linear_to_srgb((color.astype(np.float64) * 2**exposure).clip(0, 1))
+        about = {"exposure": exposure, "below_zero": float((color < 0).any(axis=-1).mean())}
+        return np.concatenate([np.rint(encoded * 255), alpha], axis=-1).astype(np.uint8), about
+
+
+def as_png(channels: Channels, coding: Coding) -> tuple[bytes, dict[str, Any]]:
+    """A PNG file of channels, 1, 3 or 4 of them; and what is to be said beside it."""
+    codes, about = coding.codes(np.stack([*channels.values()], axis=-1))
+    return png_bytes(codes), {"channels": list(channels), **about}
+
+
+def from_png(content: bytes, about: Mapping[str, Any]) -> Channels:
+    """The channels of a PNG file, from what is said beside it.
+
+    Raises:
+        ImageError: for what is no PNG file, or is truncated.
+    """
+    codes = png_codes(content)
+    check.shape("a PNG file of a sample", codes.shape, ("height", "width", len(about["channels"])))
+    most, codes = np.iinfo(codes.dtype).max, codes.astype(np.float64)
+    if "range" in about:
+        low, high = about["range"]
+        values = (low * (most - codes) + high * codes) / most
+    else:
+        color, alpha = codes[..., :3] / most, codes[..., 3:] / most
+        values = np.concatenate([alpha * srgb_to_linear(color) / 2 ** about["exposure"], alpha], axis=-1)
+    return {name: values[..., k].astype(np.float32) for k, name in enumerate(about["channels"])}
