@@ -279,6 +279,16 @@ def pixels(name: str, values: object, *, expected: str, error: type[ValueError] 
     return copied
 
 
+def reflectance(name: str, values: np.ndarray) -> None:
+    """Raise ValueError unless all values are finite and in [0, 1]."""
+    finite(name, values)
+    if (values < 0).any() or (values > 1).any():
+        raise ValueError(
+            f"{name}: got values from {values.min()} to {values.max()}, expected reflectances in [0, 1], linear: those "
+            "of sRGB colors from 0 to 255 are warpshadow.srgb_to_linear(colors / 255)"
+        )
+
+
 def channels_last(got: tuple[int, ...]) -> str:
     """What makes [height, width, 3] of an image's shape that has it not, for messages; nothing if that is not known."""
     if len(got) == 2:

@@ -10,7 +10,6 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import warpshadow as ws
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -330,27 +329,6 @@ def test_without_uvs_nothing_is_welded(tmp_path, name):
     mesh = load_mesh(export(tmp_path, name, vertices=vertices, faces=faces))
     np.testing.assert_array_equal(mesh.faces, faces)
     assert mesh.uvs is None and mesh.vertex_count == 10
-
-
-@pytest.mark.parametrize("name", ["a.ply", "a.glb"])
-def test_colors_of_vertices_are_dropped_with_a_warning(tmp_path, name):
-    vertices, faces, _ = cylinder()
-    colors = np.full((len(vertices), 4), 200, np.uint8)
-    colors[0] = 0
-    with pytest.warns(UserWarning, match=r"a\..*: colors of vertices dropped, which Body\(albedo=…\) takes"):
-        load_mesh(export(tmp_path, name, vertices=vertices, faces=faces, colors=colors))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ws.Body(tmp_path / name, albedo=ws.srgb_to_linear(colors[:, :3] / 255), blockers=0)
-
-
-def test_colors_of_vertices_in_an_obj_are_dropped_with_a_warning_and_weights_are_not_colors(tmp_path):
-    lines = ("v 0 0 0{0}", "v 1 0 0{0}", "v 0 1 0{0}", "f 1 2 3")
-    with pytest.warns(UserWarning, match="colors of vertices dropped"):
-        load_mesh(write(tmp_path, "a.obj", "\n".join(lines).format(" 1 0.5 0")))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load_mesh(write(tmp_path, "b.obj", "\n".join(lines).format(" 1")))
 
 
 def test_an_stl_stays_flat_shaded(tmp_path):

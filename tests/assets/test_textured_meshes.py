@@ -59,6 +59,23 @@ def test_a_body_of_trimesh_is_that_of_its_file(tmp_path, kind):
     np.testing.assert_array_equal(body.texture, TEXTURE)
 
 
+@pytest.mark.parametrize("shape", ["box", "icosphere"])
+def test_what_trimesh_was_asked_before_changes_nothing(shape):
+    """A box keeps its edges, and a sphere is smooth, though each face has its own vertices."""
+
+    def made():
+        mesh = getattr(trimesh.creation, shape)()
+        mesh.unmerge_vertices()
+        mesh.visual = trimesh.visual.TextureVisuals(uv=np.tile([(0, 0), (1, 0), (0, 1)], (len(mesh.faces), 1)))
+        return mesh
+
+    asked = made()
+    assert len(asked.vertex_normals) and len(asked.face_normals) and asked.visual.kind and not asked.is_watertight
+    faces = ws.load_mesh(asked).faces
+    np.testing.assert_array_equal(faces, ws.load_mesh(made()).faces)
+    assert len(np.unique(faces)) == {"box": 24, "icosphere": 642}[shape]
+
+
 def test_a_scene_of_trimesh_is_one_mesh_where_its_nodes_are():
     ball = trimesh.creation.icosphere(subdivisions=1)
     scene = trimesh.Scene()
@@ -69,11 +86,7 @@ def test_a_scene_of_trimesh_is_one_mesh_where_its_nodes_are():
     np.testing.assert_allclose(mesh.bounds, [(-1, -1, -1), (4, 1, 1)])
 
 
-def test_colors_of_vertices_of_trimesh_are_remarked_on_as_those_of_files():
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    ball.visual.vertex_colors = [255, 0, 0, 255]
-    with pytest.warns(UserWarning, match=r"^mesh: colors of vertices dropped, which Body\(albedo=…\) takes"):
-        ws.Body(ball)
+def test_a_scene_of_trimesh_without_faces_is_refused():
     with pytest.raises(ws.MeshError, match="^mesh: faces: got none"):
         ws.Body(trimesh.Scene())
 

@@ -269,15 +269,23 @@ def test_what_is_no_number_of_a_body_is_refused_by_whatever_is_free_of_one(make,
         make(body)
 
 
-def test_an_albedo_must_be_of_the_kind_that_the_body_has():
+def test_the_albedo_of_a_body_with_a_texture_is_refused():
     scene = small_scene()
     ball, ground = scene.bodies
-    colored = dataclasses.replace(ball, albedo=noise(ball.mesh.vertex_count, 3))
-    textured = dataclasses.replace(ground, texture=noise(4, 4, 3))
-    scene = dataclasses.replace(scene, bodies=(colored, textured))
-    for free, message in ((Albedo(0), "expected per_vertex=True"), (Albedo(1), "which has a texture")):
-        with pytest.raises(ValueError, match=message):
-            Problem(scene, Target(noise(24, 24, 3)), free)
+    scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=noise(4, 4, 3))))
+    with pytest.raises(ValueError, match="which has a texture"):
+        Problem(scene, Target(noise(24, 24, 3)), Albedo(1))
+
+
+@pytest.mark.parametrize("free", [Albedo(1), Texture(1, (2, 2))])
+def test_one_color_starts_as_the_mean_of_the_colors_of_vertices(free):
+    scene = small_scene()
+    ball, ground = scene.bodies
+    colors = noise(ground.mesh.vertex_count, 3)
+    scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, albedo=colors)))
+    problem = Problem(scene, Target(noise(24, 24, 3)), free)
+    (start,) = free.start(problem.setting(torch.device("cpu"))).values()
+    np.testing.assert_allclose(start, np.broadcast_to(colors.mean(axis=0), start.shape), rtol=1e-5)
 
 
 def test_spheres_that_the_method_does_not_use_cannot_be_free():

@@ -118,6 +118,12 @@ def test_bodies_can_be_ones_own_and_keep_their_texture():
         np.testing.assert_array_equal(body.texture, texture)
 
 
+def test_bodies_keep_colors_of_their_vertices():
+    own = ws.Body(ws.plane(1.0, 1), albedo=np.linspace(0, 1, 12).reshape(4, 3), blockers=0)
+    for body in RandomScenes(0, bodies=[own])[0].bodies[:-1]:
+        np.testing.assert_array_equal(body.albedo, own.albedo)
+
+
 def test_primitives_are_closed_face_outward_and_are_made_once():
     assert primitives() is primitives()
     for body in primitives():

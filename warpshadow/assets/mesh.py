@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
+from warpshadow.assets.color import linear_to_srgb
 from warpshadow.assets.topology import CREASE, Surface, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
 from warpshadow.maths.plane import plane_normal
@@ -38,10 +39,13 @@ class Mesh:
         uv_faces: Indices of uvs, int32, shape [face, 3], or None.
         name: What messages call the mesh.
         origins: Where :meth:`creased` parted vertices, the one of the mesh before that each is a copy of, int32, shape
-            [vertex]: ``colors[mesh.origins]``. Files do not have it. By default None.
+            [vertex]: ``values[mesh.origins]``. Files do not have it. By default None.
+        colors: Reflectance at vertices, linear RGB in [0, 1], float32, shape [vertex, 3], or None. It is the default of
+            ``Body(mesh)``.
 
     Raises:
         MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
+        ValueError: for colors or origins of another shape, and colors out of range.
     """
 
     positions: np.ndarray = field(repr=False)
@@ -50,6 +54,7 @@ class Mesh:
     uv_faces: np.ndarray | None = field(repr=False)
     name: str
     origins: np.ndarray | None = field(repr=False)
+    colors: np.ndarray | None = field(repr=False)
 
     def __init__(
         self,
@@ -59,11 +64,12 @@ class Mesh:
         uv_faces: npt.ArrayLike | None = None,
         name: str = "mesh",
         origins: npt.ArrayLike | None = None,
+        colors: npt.ArrayLike | None = None,
     ):
         if (uvs is None) != (uv_faces is None):
             missing = "uvs" if uvs is None else "uv_faces"
             raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
-        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None}
+        held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None, "colors": None}
         held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
         held["faces"] = _indices("faces", faces, len(vertices), "vertex")
         if uvs is not None and uv_faces is not None:
@@ -72,6 +78,11 @@ class Mesh:
         if origins is not None:
             held["origins"] = copied = np.array(origins, np.int32)
             check.shape("origins", copied.shape, (len(vertices),))
+        if colors is not None:
+            expected = "linear RGB [vertex, 3]"
+            held["colors"] = reflectances = check.pixels("colors", colors, expected=expected, error=MeshError)
+            check.shape("colors", reflectances.shape, (len(vertices), 3))
+            check.reflectance("colors", reflectances)
         for array in held.values():
             if array is not None:
                 array.setflags(write=False)
@@ -104,7 +115,7 @@ class Mesh:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of the arrays, in hexadecimal; the name does not count."""
+        """SHA-256 of the shape and its uvs, in hexadecimal; the name and colors do not count."""
         digest = hashlib.sha256()
         for array in (self.positions, self.faces, self.uvs, self.uv_faces):
             digest.update(b"none" if array is None else f"{array.shape}".encode() + array.tobytes())
@@ -164,7 +175,8 @@ class Mesh:
         if not (check.is_number(angle) and 0 <= angle <= 180):
             raise MeshError(f"angle: got {check.described(angle)}, expected degrees from 0 to 180")
         faces, origins = part_at_creases(self.faces, self.surface, self.positions, angle)
-        return replace(self, positions=self.positions[origins], faces=faces, origins=origins)
+        colors = None if self.colors is None else self.colors[origins]
+        return replace(self, positions=self.positions[origins], faces=faces, origins=origins, colors=colors)
 
     @functools.cached_property
     def rounds_edges(self) -> bool:
@@ -172,11 +184,14 @@ class Mesh:
         return rounds_edges(self.surface, self.positions)
 
     def write(self, path: AnyPath) -> None:
-        """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit."""
+        """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit; colors stand in it as sRGB."""
         path = Path(path)
         if path.suffix.lower() != ".obj":
             raise MeshError(f"{path}: got extension {path.suffix!r}, expected .obj")
-        lines = ["v {:.9g} {:.9g} {:.9g}".format(*position) for position in self.positions.tolist()]
+        columns = [self.positions.astype(np.float64)]
+        if self.colors is not None:
+            columns.append(linear_to_srgb(self.colors.astype(np.float64)))
+        lines = ["v " + " ".join(f"{value:.9g}" for value in row) for row in np.hstack(columns).tolist()]
         if self.uvs is None or self.uv_faces is None:
             lines += ["f {} {} {}".format(*face) for face in (self.faces + 1).tolist()]
         else:
@@ -233,8 +248,8 @@ class BaseColor(NamedTuple):
 class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
-    ``has_colors`` says that there are colors of vertices, which are not read. ``pictures`` are those of its materials,
-    None for one that has none.
+    ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` are those of its
+    materials, None for one that has none.
     """
 
     positions: np.ndarray
@@ -243,7 +258,8 @@ class MeshPart(NamedTuple):
     uv_faces: np.ndarray | None = None
     welded: int = 0
     remark: str = ""
-    has_colors: bool = False
+    colors: np.ndarray | None = None
+    colorless: str = ""
     pictures: tuple[BaseColor | None, ...] = (None,)
 
 

@@ -6,14 +6,15 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, moved_part, turned_over
+from warpshadow.assets.topology import CREASE
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -38,10 +39,13 @@ def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
     return trimesh is not None and isinstance(value, (trimesh.Trimesh, trimesh.Scene))
 
 
-COLORS_DROPPED = (
-    "colors of vertices dropped, which Body(albedo=…) takes, linear, [vertex, 3]: srgb_to_linear(colors / 255)"
-)
-"""A remark on files whose colors are not read."""
+class _Found(NamedTuple):
+    """A mesh, the picture that all its faces have, and remarks on what may surprise: on its shape, and on colors."""
+
+    mesh: Mesh
+    picture: BaseColor | None
+    remarks: list[str]
+    of_colors: list[str]
 
 
 def load_mesh(path: MeshSource) -> Mesh:
@@ -49,11 +53,15 @@ def load_mesh(path: MeshSource) -> Mesh:
 
     Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes
     of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), faces refer
-    to the first of the vertices that are duplicated only for their uvs (same position, and same normal where
-    the file stores normals), so that a seam does not break the shading; without uvs they stay as they are.
+    to the first of the vertices that are duplicated only for their uvs (same position and color, and same normal
+    where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does not
+    break the shading; without uvs they stay as they are.
     A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
-    uvs are kept only when every face has them. Colors, materials and textures are not read: they are a body's, and
-    ``Body(path)`` takes the texture, too.
+    uvs are kept only when every face has them. Textures are not read: they are a body's, and ``Body(path)`` takes them.
+
+    Colors are, where each vertex has one: those of vertices; of faces, where no vertex has faces of two colors; and the
+    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and USD
+    (``displayColor``) have linear values. Transparency does not count, nor the ``Kd`` of .mtl files.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the
@@ -69,13 +77,12 @@ def load_mesh(path: MeshSource) -> Mesh:
 
     Warns:
         Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and what was dropped: uvs
-        that some faces lack, textures, and the colors of vertices in OBJ, PLY and glTF files.
+        that some faces lack, textures, and colors that vertices cannot have.
     """
-    mesh, picture, remarks = _read(path)
-    if picture is not None:
-        remarks.append("its texture dropped, which Body(path) takes")
-    _remark(path, remarks)
-    return mesh
+    found = _read(path)
+    of_texture = ["its texture dropped, which Body(path) takes"] if found.picture is not None else []
+    _remark(path, [*found.remarks, *found.of_colors, *of_texture])
+    return found.mesh
 
 
 def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, np.ndarray | None]:
@@ -86,24 +93,24 @@ def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, 
 
     Args:
         path: As there.
-        wanted: Whether the texture is to be read, and colors of vertices are to be warned of.
+        wanted: Whether the texture is to be read, and what of textures and colors is dropped is to be warned of.
 
     Returns:
         The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
 
     Warns:
-        As there; and of a texture that cannot be read.
+        As there; and of a texture that cannot be read, or that counts in place of colors.
     """
-    mesh, picture, remarks = _read(path)
+    mesh, picture, remarks, of_colors = _read(path)
     texture = None
-    if not wanted:
-        remarks = [remark for remark in remarks if remark != COLORS_DROPPED]
     if wanted and picture is not None:
         try:
             texture = _texels(picture)
+            if mesh.colors is not None:
+                of_colors.append("colors of vertices do not count beside its texture")
         except (OSError, ValueError) as error:
-            remarks.append(f"its texture dropped ({error})")
-    _remark(path, remarks)
+            of_colors.append(f"its texture dropped ({error})")
+    _remark(path, remarks + of_colors if wanted else remarks)
     return mesh, texture
 
 
@@ -112,8 +119,7 @@ def _remark(path: MeshSource, remarks: list[str]) -> None:
         check.warn(f"{path if check.is_path(path) else 'mesh'}: {', '.join(remarks)}")
 
 
-def _read(source: MeshSource) -> tuple[Mesh, BaseColor | None, list[str]]:
-    """A mesh, the picture that all its faces have, and remarks on what may surprise."""
+def _read(source: MeshSource) -> _Found:
     if is_of_trimesh(source):
         return _concatenate(_trimesh_parts(source), Path(source.metadata.get("file_name") or "mesh").stem)
     path = check.path("path", source)
@@ -138,8 +144,8 @@ def _texels(picture: BaseColor) -> np.ndarray:
     return (srgb_to_linear(codes / 255) * picture.factor).astype(np.float32)
 
 
-def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, BaseColor | None, list[str]]:
-    """Join parts into one mesh, find the picture that all have, and remark on what may surprise."""
+def _concatenate(parts: list[MeshPart], name: str) -> _Found:
+    """Join parts into one mesh, and find the picture that all have."""
     vertex_count = sum(len(part.positions) for part in parts)
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -147,7 +153,7 @@ def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, BaseColor | No
     positions, faces = _stack((part.positions, part.faces) for part in parts)
     textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
     uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
-    mesh = Mesh(positions, faces, uvs, uv_faces, name)
+    mesh = Mesh(positions, faces, uvs, uv_faces, name, colors=_joined_colors(parts))
 
     a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
     counts = {
@@ -159,13 +165,27 @@ def _concatenate(parts: list[MeshPart], name: str) -> tuple[Mesh, BaseColor | No
     remarks += [part.remark for part in parts if part.remark]
     if 0 < len(textured) < len(parts):
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
-    if any(part.has_colors for part in parts):
-        remarks.append(COLORS_DROPPED)
+    of_colors = sorted({part.colorless for part in parts if part.colorless})
     pictures = [picture for part in parts for picture in part.pictures]
     is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
     if any(pictures) and not is_one:
-        remarks.append("textures dropped, since a body takes one that all its faces have")
-    return mesh, pictures[0] if is_one else None, remarks
+        why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
+        of_colors.append(f"textures dropped, {why}")
+    return _Found(mesh, pictures[0] if is_one else None, remarks, of_colors)
+
+
+def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:
+    """Colors of the vertices of all parts, gray where a part has none; None if no part has any."""
+    if all(part.colors is None for part in parts):
+        return None
+    gray = np.array(GRAY, np.float32)
+    shapes = [(len(part.positions), 3) for part in parts]
+    return np.concatenate(
+        [
+            np.broadcast_to(gray if part.colors is None else part.colors, shape)
+            for part, shape in zip(parts, shapes, strict=True)
+        ]
+    )
 
 
 def _stack(blocks: Iterable[tuple]) -> tuple[np.ndarray, np.ndarray]:
@@ -194,9 +214,48 @@ def _weld(faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:
     return first[group.reshape(-1)][faces]
 
 
+def _joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Normals [vertex, 3], where vertices at one place get the first one's, unless they bend by more than a crease."""
+    _, place = np.unique(positions + 0.0, axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    joined, first, left = np.array(normals), np.empty(len(place), np.int64), np.arange(len(place))
+    while len(left):
+        first[place[left[::-1]]] = left[::-1]
+        of_first = normals[first[place[left]]]
+        is_close = (normals[left] * of_first).sum(axis=1) >= np.cos(np.radians(CREASE))
+        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # those of no face are zero
+        joined[left[is_close]] = of_first[is_close]
+        left = left[~is_close]
+    return joined
+
+
+def _colored(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> MeshPart:
+    """Give a part colors of its vertices, or of the corners of its faces if no vertex gets two.
+
+    Args:
+        part: Their mesh.
+        values: Unsigned codes of a picture, or floats from 0 to 1, of shape [vertex, 3 or 4] or [face, 3, 3 or 4].
+        linear: Whether they are; else they are sRGB.
+    """
+    values = values[..., :3]
+    values = values / np.iinfo(values.dtype).max if values.dtype.kind == "u" else values.astype(np.float64)
+    if not ((values >= 0) & (values <= 1)).all():
+        why = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
+        return part._replace(colorless=f"colors dropped ({why})")
+    colors = (values if linear else srgb_to_linear(values)).astype(np.float32)
+    if colors.ndim == 2:
+        return part._replace(colors=colors)
+    of_vertices = np.tile(np.array(GRAY, np.float32), (len(part.positions), 1))
+    of_vertices[part.faces] = colors
+    if np.array_equal(of_vertices[part.faces], colors):
+        return part._replace(colors=of_vertices)
+    why = "faces of different colors share vertices, which trimesh's unmerge_vertices() parts"
+    return part._replace(colorless=f"colors of faces dropped ({why})")
+
+
 def _read_obj(path: Path) -> list[MeshPart]:
     """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
-    positions, uvs, corners, uv_corners, corner_counts, has_colors = [], [], [], [], [], False
+    positions, colors, uvs, corners, uv_corners, corner_counts = [], [], [], [], [], []
     libraries, material, materials = [], "", set()
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
@@ -204,7 +263,8 @@ def _read_obj(path: Path) -> list[MeshPart]:
             match line.partition("#")[0].split():
                 case ["v", x, y, z, *rest]:
                     positions.append((float(x), float(y), float(z)))
-                    has_colors |= len(rest) >= 3  # one number is a weight
+                    if len(rest) >= 3:  # one number is a weight
+                        colors.append((float(rest[0]), float(rest[1]), float(rest[2])))
                 case ["vt", u, *rest]:
                     uvs.append((float(u), float(rest[0]) if rest else 0.0))
                 case ["mtllib", *words]:
@@ -224,14 +284,18 @@ def _read_obj(path: Path) -> list[MeshPart]:
         except ValueError as error:
             raise MeshError(f"line {number}: {error}, got {line.strip()!r}") from None
     faces = _fan(np.array(corner_counts, dtype=np.int64))
-    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces], has_colors=has_colors)
+    pictures = _obj_pictures([path.parent / library for library in libraries])
+    part = MeshPart(np.array(positions).reshape(-1, 3), np.array(corners, dtype=np.int64)[faces])
+    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
+    if 0 < len(colors) < len(positions):
+        part = part._replace(colorless=f"colors dropped, which {len(positions) - len(colors)} vertices lack")
+    elif colors:
+        part = _colored(part, np.array(colors))
     if not uv_corners:
         return [part]
     if len(uv_corners) < len(corners):
         missing = len(corners) - len(uv_corners)
         return [part._replace(remark=f"uvs dropped because {missing} of {len(corners)} corners have none")]
-    pictures = _obj_pictures([path.parent / library for library in libraries])
-    part = part._replace(pictures=tuple(pictures.get(name) for name in sorted(materials)))
     return [part._replace(uvs=np.array(uvs).reshape(-1, 2), uv_faces=np.array(uv_corners)[faces])]
 
 
@@ -261,39 +325,61 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
 
     if path.suffix.lower() == ".gltf":
         json.loads(path.read_bytes())  # on bad JSON trimesh would read a model.gltf beside the file instead
-    return _trimesh_parts(trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False))
+    loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
+    return _trimesh_parts(loaded, of_file=True)
 
 
-def _trimesh_parts(given: trimesh.Trimesh | trimesh.Scene) -> list[MeshPart]:
+def _trimesh_parts(given: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False) -> list[MeshPart]:
     """The meshes of a scene of trimesh in world space; or one mesh, as it is."""
     import trimesh
 
     if isinstance(given, trimesh.Trimesh):
-        return [_trimesh_part(given)]
+        return [_trimesh_part(given, of_file)]
     scene, parts = given, []
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
         shape = scene.geometry[geometry]
         if isinstance(shape, trimesh.Trimesh):
-            parts.append(moved_part(_trimesh_part(shape), transform[:3, :3], transform[:3, 3]))
+            parts.append(moved_part(_trimesh_part(shape, of_file), transform[:3, :3], transform[:3, 3]))
     return parts
 
 
-def _trimesh_part(shape) -> MeshPart:
+def _trimesh_part(shape, of_file: bool) -> MeshPart:
     """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
     pictures = (_trimesh_picture(getattr(shape.visual, "material", None)),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
+    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures), shape)
     corner_uvs = _ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
-        return MeshPart(positions, faces, corner_uvs, np.arange(len(corner_uvs)).reshape(-1, 3), pictures=pictures)
+        return part._replace(uvs=corner_uvs, uv_faces=np.arange(len(corner_uvs)).reshape(-1, 3))
     uvs = getattr(shape.visual, "uv", None)
     if uvs is None:
-        return MeshPart(positions, faces, has_colors=shape.visual.kind == "vertex")
-    # Normals in the cache are the file's; shape.vertex_normals computes missing ones, which differ at seams.
-    normals = [shape.vertex_normals] if "vertex_normals" in shape._cache else []
-    welded = _weld(faces, positions, *normals)
-    part = MeshPart(positions, welded, uvs, faces, pictures=pictures)
-    return part._replace(welded=len(np.unique(faces)) - len(np.unique(welded)))
+        return part
+    told = [] if part.colors is None else [part.colors]
+    if not of_file:  # its normals may be those of a file, or computed; these differ a little at seams
+        told.append(_joined_normals(positions, shape.vertex_normals))
+    elif "vertex_normals" in shape._cache:  # the file's: none were computed yet
+        told.append(shape.vertex_normals)
+    welded = _weld(faces, positions, *told)
+    lost = len(np.unique(faces)) - len(np.unique(welded))
+    return part._replace(faces=welded, uvs=uvs, uv_faces=faces, welded=lost)
+
+
+def _trimesh_colored(part: MeshPart, shape) -> MeshPart:
+    """Give a part the colors that a mesh of trimesh has: of vertices, of faces, or of its material."""
+    visual, linear = shape.visual, shape.source.file_type in ("glb", "gltf")
+    if visual.kind == "face":
+        return _colored(part, visual.face_colors[:, None].repeat(3, axis=1), linear=linear)
+    if visual.kind != "texture":
+        return part if visual.kind is None else _colored(part, visual.vertex_colors, linear=linear)
+    colors = visual.vertex_attributes["color"] if "color" in visual.vertex_attributes else _ply_colors(shape)
+    if colors is not None:
+        part = _colored(part, colors, linear=linear)
+    factor = getattr(visual.material, "baseColorFactor", None)  # in steps of 1/255, and linear
+    if factor is None or any(part.pictures) or (factor[:3] == 255).all():  # white, glTF's default, says nothing
+        return part
+    white = np.ones((len(part.positions), 3), np.float32)
+    return part._replace(colors=(white if part.colors is None else part.colors) * np.float32(factor[:3] / 255))
 
 
 def _trimesh_picture(material) -> BaseColor | None:
@@ -320,6 +406,15 @@ def _ply_corner_uvs(shape) -> np.ndarray | None:
     if corners is None or not np.array_equal(points[_ply_values(corners)], shape.triangles.astype(np.float32)):
         return None  # the faces are no longer those of the file
     return _ply_values(data["texcoord"]).reshape(-1, 2)
+
+
+def _ply_colors(shape) -> np.ndarray | None:
+    """The colors [vertex, 3] of a PLY file, which trimesh leaves where vertices have uvs, too."""
+    data = shape.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = data.dtype.names or () if isinstance(data, np.ndarray) else data
+    channels = [np.ravel(data[name]) for name in ("red", "green", "blue") if name in names]
+    is_whole = len(channels) == 3 and len(channels[0]) == len(shape.vertices)
+    return np.stack(channels, axis=1) if is_whole else None
 
 
 def _ply_values(lists) -> np.ndarray:
@@ -362,12 +457,18 @@ def _usd_part(mesh, primvars, time) -> MeshPart:
         raise MeshError(f"{mesh.GetPath()}: got {len(corners)} corners, expected {corner_counts.sum()} from the counts")
     faces = _fan(corner_counts)
     part = MeshPart(positions, corners[faces])
+    polygons = np.repeat(np.arange(len(corner_counts)), corner_counts)
+    items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
+    color_items = items | {"uniform": polygons, "constant": np.zeros_like(corners)}
+    shown = primvars.GetPrimvar("displayColor")
+    if shown.HasValue() and shown.GetInterpolation() in color_items:
+        colors = np.array(shown.ComputeFlattened(time), dtype=np.float32)
+        part = _colored(part, colors[color_items[shown.GetInterpolation()]][faces], linear=True)
     st = primvars.GetPrimvar("st")
-    uv_items = {"faceVarying": np.arange(len(corners)), "vertex": corners, "varying": corners}
-    if st.HasValue() and st.GetInterpolation() in uv_items:
+    if st.HasValue() and st.GetInterpolation() in items:
         uvs = np.array(st.Get(time), dtype=np.float32)
         indices = np.array(st.GetIndices(time) if st.IsIndexed() else np.arange(len(uvs)))
-        part = part._replace(uvs=uvs, uv_faces=indices[uv_items[st.GetInterpolation()]][faces])
+        part = part._replace(uvs=uvs, uv_faces=indices[items[st.GetInterpolation()]][faces])
     return turned_over(part) if mesh.GetOrientationAttr().Get() == "leftHanded" else part
 
 

@@ -170,15 +170,16 @@ class _Read(NamedTuple):
     body: Body
     """With its spheres, creased if that is wanted."""
     content_hash: str
-    """Of what is in the file, and in that of its texture, however it is creased."""
+    """Of what is in the file, colors and texture among it, however it is creased."""
 
 
 @functools.lru_cache(_KEPT_BODIES)
 def _read_body(path: Path, blockers: int, creased: float | None, fits: bool, device: str) -> _Read:
     body = Body(path, blockers=blockers)
     content_hash = body.mesh.content_hash
-    if body.texture is not None:
-        content_hash = hashlib.sha256(content_hash.encode() + body.texture.tobytes()).hexdigest()
+    colors = body.albedo if body.texture is None else body.texture
+    if colors.ndim > 1:
+        content_hash = hashlib.sha256(content_hash.encode() + colors.tobytes()).hexdigest()
     body = body if creased is None else body.creased(creased)
     return _Read(_fitted(body, device) if fits else body, content_hash)
 

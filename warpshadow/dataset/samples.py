@@ -119,7 +119,7 @@ def _about(data_set: DataSet, number: int, drawn: Drawn) -> dict[str, Plain]:
 
 
 def _placed(body: Body, mesh: str) -> dict[str, Plain]:
-    albedo = None if body.texture is not None else _numbers(body.albedo)
+    albedo = None if body.texture is not None or body.albedo.ndim > 1 else _numbers(body.albedo)
     place = {"rotation": body.rotation.tolist(), "translation": body.translation.tolist(), "scale": float(body.scale)}
     return {"mesh": mesh, "albedo": albedo, **place}
 

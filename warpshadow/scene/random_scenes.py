@@ -69,7 +69,7 @@ class Ranges:
         size: Longest edge of a body's bounds before it is turned [scene units].
         upright: Part of the bodies that are turned about the vertical alone; the others lie in any way.
         gap: How far apart bodies stand, 1 where those two whose bounds are widest could just touch.
-        albedo: Reflectance of a body without a texture, in each of red, green and blue.
+        albedo: Reflectance of a body without a texture or a color for each vertex, in each of red, green and blue.
         ground_albedo: Reflectance of the ground, which is gray.
         rotation: How far a given map is turned about the vertical [degrees].
         scale: What the light is multiplied by; drawn evenly in its logarithm.
@@ -155,7 +155,7 @@ class RandomScenes:
         seed: Number of the data set, 0 or more.
         count: Number of scenes; scene ``index`` is the same whatever the count.
         size: Width and height of the images [pixels].
-        bodies: What bodies are drawn from; they get new poses, sizes and, if they have no texture, colors.
+        bodies: What bodies are drawn from; they get new poses and sizes, and new colors if they have one each.
             Bodies of one's own: ``[Body(load_mesh("bunny.obj"), blockers=32)]``. Like maps, a sequence that may read
             them when they are asked for.
         visibility: How visibility is computed.
@@ -256,9 +256,10 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: R
     prototype = prototypes[chosen]
     axis = np.array([0.0, 1.0, 0.0]) if rng.random() < ranges.upright else _random_direction(rng)
     low, high = prototype.mesh.bounds
+    color = rng.uniform(*ranges.albedo, 3)
     body = replace(
         prototype,
-        albedo=rng.uniform(*ranges.albedo, 3),
+        albedo=color if prototype.albedo.ndim == 1 else prototype.albedo,
         rotation=rng.uniform(0, 360) * axis,
         translation=np.zeros(3),
         scale=_drawn(rng, ranges.size) / (high - low).max(),

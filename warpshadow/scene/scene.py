@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.color import srgb_to_linear
+from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.assets.mesh import Mesh, MeshError
@@ -59,10 +59,6 @@ COLORS = ".npy"
 """What a file of colors for each vertex is called; other text is no albedo."""
 
 _SPHERES = ".npz"
-
-_GRAY = (0.8, 0.8, 0.8)
-"""Reflectance of a body of which nothing is said."""
-
 
 MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """What likely names of a body's arguments, and keys, are called here."""
@@ -156,7 +152,8 @@ class Body:
     Args:
         mesh: The mesh, or what :func:`warpshadow.load_mesh` reads: a file, or a mesh or a scene of trimesh.
         albedo: Reflectance, linear RGB, for the body [3] or for each vertex [vertex, 3], or an .npy file of it. By
-            default the texture that what is read has, where all its faces have the same, or gray, 0.8.
+            default the texture that what is read has, where all its faces have the same, or else the colors that the
+            mesh has, or gray, 0.8.
         texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
@@ -257,7 +254,7 @@ class Body:
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
     def _read_mesh(self) -> None:
-        """Put what the mesh's file, or trimesh, holds in its place; its texture where no reflectance is given."""
+        """Put what the mesh's file, or trimesh, holds in its place; its reflectance where none is given."""
         mesh, texture = self.mesh, None
         source = check.file("mesh", mesh) if check.is_path(mesh) else mesh
         if check.is_path(source) or is_of_trimesh(source):
@@ -265,7 +262,7 @@ class Body:
                 mesh, texture = load_textured_mesh(source, wanted=self.albedo is None and self.texture is None)
         vars(self).update(
             mesh=mesh,
-            albedo=_GRAY if self.albedo is None else self.albedo,
+            albedo=_colors(mesh) if self.albedo is None else self.albedo,
             texture=texture if self.texture is None else self.texture,
         )
 
@@ -291,7 +288,8 @@ class Body:
         albedo = check.numbers("albedo", self.albedo, expected=expected)
         if albedo.shape not in ((3,), (count, 3)):
             raise ValueError(f"albedo: got shape {albedo.shape}, expected [3] or [{count}, 3] (one for each vertex)")
-        _check_reflectance("albedo", albedo)
+        check.reflectance("albedo", albedo)
+        albedo.setflags(write=False)
         if getattr(self.albedo, "dtype", None) == np.uint8:  # as it is, all but black
             check.pixels("albedo", self.albedo, expected=expected)
         return albedo
@@ -306,7 +304,8 @@ class Body:
         check.shape("texture", texture.shape, ("height", "width", 3), check.channels_last(texture.shape))
         if texture.size == 0:
             raise ValueError(f"texture: got shape {texture.shape}, expected at least one texel")
-        _check_reflectance("texture", texture)
+        check.reflectance("texture", texture)
+        texture.setflags(write=False)
         return texture
 
     def rotation_matrix(self) -> np.ndarray:
@@ -364,6 +363,14 @@ class Body:
 _DIRECTIONAL = Visibility()
 
 
+def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
+    """The colors of a mesh, one where all are the same, or gray."""
+    colors = mesh.colors if isinstance(mesh, Mesh) else None
+    if colors is None:
+        return GRAY
+    return colors if np.ptp(colors, axis=0).any() else colors[0]
+
+
 def _read_colors(path: Path) -> np.ndarray:
     try:
         return np.load(path, allow_pickle=False)
@@ -380,17 +387,6 @@ def _meant(color: str) -> str:
     except ValueError:
         return ""
     return f": that color is ({', '.join(f'{value:.4g}' for value in linear)})"
-
-
-def _check_reflectance(name: str, values: np.ndarray) -> None:
-    """Raise ValueError unless all values are in [0, 1]; seal them."""
-    check.finite(name, values)
-    if (values < 0).any() or (values > 1).any():
-        raise ValueError(
-            f"{name}: got values from {values.min()} to {values.max()}, expected reflectances in [0, 1], linear: those "
-            "of sRGB colors from 0 to 255 are warpshadow.srgb_to_linear(colors / 255)"
-        )
-    values.setflags(write=False)
 
 
 def check_supersampling(count: object) -> None:

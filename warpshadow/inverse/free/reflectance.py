@@ -14,13 +14,18 @@ from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import Found, Setting, World
 from warpshadow.pipeline.renderer import Renderer
-from warpshadow.scene.scene import Scene, Visibility
+from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.stages.textures.seen import fill_unseen
 
 _SHORT = 1e-3
 """Length of a difference of reflectances below which its variation is smooth: lengths have no derivative at 0."""
 _PLAIN = 1e-3
 """Deviation below which texels are of one color."""
+
+
+def _one_color(body: Body) -> np.ndarray:
+    """A body's albedo, or the mean over its vertices, shape [3]."""
+    return np.atleast_2d(body.albedo).mean(axis=0)
 
 
 @dataclass(frozen=True)
@@ -42,19 +47,15 @@ class Albedo(FreeOfBody):
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body whose reflectance is of another kind."""
-        body = scene.bodies[self.number]
-        if body.texture is not None:
+        if scene.bodies[self.number].texture is not None:
             raise ValueError(f"body: got {self.number}, which has a texture; expected one without, or Texture")
-        if np.ndim(body.albedo) > 1 and not self.per_vertex:
-            raise ValueError(f"body: got {self.number}, which has a color for each vertex; expected per_vertex=True")
 
     def start(self, setting: Setting) -> Values:
-        """The body's albedo."""
+        """The body's albedo; the mean of its vertices' colors, where one is free."""
         body = setting.scene.bodies[self.number]
-        colors = np.atleast_2d(body.albedo)
         if self.per_vertex:
-            colors = np.broadcast_to(colors, (body.mesh.vertex_count, 3))
-        return {"color": setting.tensor(colors)}
+            return {"color": setting.tensor(np.broadcast_to(body.albedo, (body.mesh.vertex_count, 3)))}
+        return {"color": setting.tensor(_one_color(body)[None])}
 
     def place(self, values: Values, setting: Setting, world: World) -> None:
         """Color the body."""
@@ -116,13 +117,11 @@ class Texture(FreeOfBody):
             raise ValueError(
                 f"body: got {self.number}, whose mesh has no uvs; expected uvs, as warpshadow.unwrap makes them"
             )
-        if body.texture is None and np.ndim(body.albedo) > 1:
-            raise ValueError(f"body: got {self.number}, which has a color for each vertex; expected one color")
 
     def start(self, setting: Setting) -> Values:
-        """The body's texture, or its color."""
+        """The body's texture, or its color: the mean of its vertices' colors, where each has one."""
         body = setting.scene.bodies[self.number]
-        image = np.reshape(body.albedo, (1, 1, 3)) if body.texture is None else body.texture
+        image = _one_color(body)[None, None] if body.texture is None else body.texture
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
         planes = setting.tensor(image).permute(2, 0, 1)[None]
         mode = "area" if size[0] <= image.shape[0] else "bilinear"
