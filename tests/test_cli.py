@@ -27,7 +27,7 @@ EIGHT_BITS = 0.006
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
 """What the command that is installed runs."""
 
-COMMANDS = ("render", "insert", "view", "tune", "fit", "dataset", "spheres", "envmap", "warmup")
+COMMANDS = ("render", "insert", "view", "tune", "fit", "dataset", "spheres", "envmap", "cache", "warmup")
 
 SCENE = """
 [camera]
@@ -693,6 +693,20 @@ def test_spheres_refuses_what_it_cannot_read_or_write(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_cache_is_shown_and_cleared_of_what_is_kept_there_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    ws.fit_spheres(ws.icosphere(subdivisions=0), 1, steps=1)
+    (tmp_path / "spheres/mine.txt").write_text("mine")
+    (tmp_path / "mine.npz").write_text("mine")
+    result = run("cache")
+    assert result.stdout.splitlines()[0] == str(tmp_path)
+    assert re.search(r"fits of spheres +1 files +0\.0 MB", result.stdout)
+    assert re.search(rf"{wp.config.kernel_cache_dir}\n  compiled kernels.* [1-9]\d* files", result.stdout)
+    assert f"{tmp_path}: cleared" in run("cache", "--clear").stdout
+    assert re.search(r"fits of spheres +0 files", run("cache").stdout)
+    assert sorted(path.name for path in tmp_path.rglob("mine*")) == ["mine.npz", "mine.txt"]
+
+
 def test_warmup_says_when_a_device_is_ready():
     result = run("warmup")
     assert result.exit_code == 0, result.output

@@ -660,6 +660,37 @@ def envmap(
 
 
 @app.command()
+def cache(
+    clear: Annotated[
+        bool, typer.Option("--clear", help="Remove all but Warp's kernels; it is made again when needed.")
+    ] = False,
+    is_quiet: Quiet = False,
+) -> None:
+    """Print where spheres, shadows and kernels are kept, and how large that is."""
+    from warpshadow.assets.cache import KINDS, cache_folder, cached_files
+
+    with _clear_errors():
+        typer.echo(cache_folder())
+        for kind, what in KINDS.items():
+            kept = cached_files(kind)
+            typer.echo(f"  {what:40}{_size(kept)}")
+            if clear:
+                for file in kept:
+                    file.unlink(missing_ok=True)  # another process may clear, too
+        wp.init()
+        kernels = Path(wp.config.kernel_cache_dir)
+        typer.echo(kernels)
+        typer.echo(f"  {'compiled kernels, of all that uses Warp':40}{_size([*kernels.rglob('*')])}")
+        if clear:
+            _note(f"{cache_folder()}: cleared", is_quiet)
+
+
+def _size(paths: list[Path]) -> str:
+    sizes = [path.stat().st_size for path in paths if path.is_file()]
+    return f"{len(sizes):6} files {sum(sizes) / 1e6:10.1f} MB"
+
+
+@app.command()
 def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
     """Compile every kernel that rendering needs, so that the first render need not."""
     from warpshadow.assets.camera import Camera

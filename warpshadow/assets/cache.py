@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -14,15 +14,32 @@ from warpshadow import check
 from warpshadow.assets import files
 
 Item = TypeVar("Item")
+Kind = Literal["spheres", "own_shadows", "form_factors"]
+
+KINDS: Mapping[Kind, str] = {
+    "spheres": "fits of spheres",
+    "own_shadows": "shadows of bodies on themselves",
+    "form_factors": "form factors of bounces within bodies",
+}
+"""What is kept, by the folder that it is in."""
 
 
-def cache_path(kind: str, key: str) -> Path:
-    """Where something is kept: under WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
+def cache_folder() -> Path:
+    """Where all is kept: WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
     from platformdirs import user_cache_path
 
     override = os.environ.get("WARPSHADOW_CACHE_DIR")
-    folder = Path(override) if override else user_cache_path("warpshadow", appauthor=False, opinion=False)
-    return folder / kind / f"{key}.npz"
+    return Path(override) if override else user_cache_path("warpshadow", appauthor=False, opinion=False)
+
+
+def cache_path(kind: Kind, key: str) -> Path:
+    """Where something is kept."""
+    return cache_folder() / kind / f"{key}.npz"
+
+
+def cached_files(kind: Kind) -> list[Path]:
+    """What is kept of a kind, and what a killed process left half written."""
+    return sorted((cache_folder() / kind).glob("*.npz"))
 
 
 def remembered(
