@@ -1,29 +1,19 @@
 """The viewer in a real browser: pixels of its page, where a Chromium and Playwright are found."""
 
-import io
-import shutil
 import time
 
 import numpy as np
 import pytest
-from PIL import Image
+from browser import PATIENCE, chromium, opened, shot
 
 import warpshadow as ws
 
 pytest.importorskip("viser", reason="viser is not installed")
-playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
+chromium()
 
 from warpshadow.viewer.site import Site  # noqa: E402
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-if CHROMIUM is None:
-    pytest.skip("no Chromium: apt-get install chromium", allow_module_level=True)
-
-# WebGL in software, which needs no GPU
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-FLAGS += ["--ignore-gpu-blocklist"]
-
-PATIENCE = 60.0  # seconds: software WebGL on a busy machine
 WIDTH, HEIGHT = 900, 600
 PANEL = 560  # column where the panel begins
 
@@ -60,29 +50,19 @@ def site():
 
 @pytest.fixture(scope="module")
 def page(site):
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-        page.goto(site.url)
-        page.get_by_text("at rest").wait_for(timeout=1e3 * PATIENCE)
+    with opened(site.url, WIDTH, HEIGHT) as page:
+        page.get_by_text("at rest").wait_for()
         yield page
-        browser.close()
-
-
-def pixels(page):
-    """Left of the panel, below notices: float of shape [row, column, 3]."""
-    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    return np.asarray(image).astype(float)[:, :PANEL]
 
 
 def settled(page):
-    """Pixels once they do not change any more."""
-    last, end = pixels(page), time.monotonic() + PATIENCE
+    """Pixels left of the panel, once they do not change any more."""
+    last, end = shot(page)[:, :PANEL], time.monotonic() + PATIENCE
     quiet = 0
     while quiet < 3:
         assert time.monotonic() < end
         time.sleep(0.5)
-        now = pixels(page)
+        now = shot(page)[:, :PANEL]
         quiet = quiet + 1 if np.abs(now - last).max() < 8 else 0
         last = now
     return last

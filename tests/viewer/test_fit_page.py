@@ -20,6 +20,7 @@ from warpshadow import inverse
 from warpshadow.inverse import checkpoint, watch
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
+from browser import opened, shot  # noqa: E402
 from pages import PATIENCE, WirePage  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
@@ -124,6 +125,27 @@ def test_a_page_shows_pictures_losses_and_candidates_and_the_fit_is_as_without_i
     middle = slice(80, 110), slice(110, 140)
     assert found[middle].mean() > target[middle].mean() + 20  # it starts white, and the ball is gray
     assert difference[middle].mean() > difference[:20].mean() + 20 and abs(difference[:20].mean() - 128) < 3
+
+
+@pytest.mark.slow
+def test_a_browser_shows_pictures_losses_and_candidates_and_its_buttons_are_pressed(viewer, tmp_path):
+    with opened(viewer.url, 1300, 700) as page:
+        page.get_by_text("preparing").wait_for()
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Go on").wait_for()
+        running = Running(viewer, checkpoint=tmp_path / "fit")
+        page.get_by_text("waits · stage 1 of 2 · iteration 1 ").wait_for()
+        page.get_by_text("least loss").wait_for()
+        image = shot(page.locator("img[src^='data:image/jpeg'], img[src^='blob:']").last)
+        height, width = (length // 6 for length in image.shape[:2])
+        assert (image[3 * height, 3 * width] > 150).all()  # a ball, which starts white
+        assert (image[3 * height, 5 * width] > 140).all()  # where it is brighter than in the target
+        assert np.abs(image[5, 4 * width + 20] - 128).max() < 5  # and beside it, where both are black
+        page.get_by_role("button", name="Go on").click()
+        page.get_by_text("finished after 24 iterations").wait_for()
+        assert page.get_by_role("button", name="Stop").is_disabled()
+        assert page.locator("polyline").count() == 3  # of two candidates, and of the second stage
+    assert_same(running.ended(), unwatched())
 
 
 @pytest.fixture
