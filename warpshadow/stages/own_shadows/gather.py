@@ -4,127 +4,280 @@
 
 over the lookups of cell q (:mod:`.lookup`) and the three rows of the receiver with their weights b (:mod:`.sites`).
 It is found where the receiver's horizon is below, and 1 elsewhere, where the cosine is zero.
+
+Receivers of a group look up the same coarse cells, each in rows of its own. So these are first brought into lanes: then
+a lookup is one vector, where it would be bytes from all over memory. A single lane reads its bytes.
 """
+
+import functools
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
+from warpshadow.device.lanes import (
+    Chunk,
+    as_chunks,
+    group_count,
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    use_vector_registers,
+)
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import split_row
+from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.stages.own_shadows.lookup import Lookup, Supports
 from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.own_shadows.trace import OwnRows
 
-_LOOKUP_COST = 2.0
+_LOOKUP_COST = 0.2
 """Nanoseconds that a lookup takes."""
 
 _MEAN_LOOKUPS = 6
 """Lookups of a cell, for the cost."""
 
-
-@wp.func
-def _open_share(
-    bits: wp.array2d(dtype=wp.uint32), cells: wp.array2d(dtype=wp.uint8), of_rays: int, row: int, index: int
-):
-    """S of a row, from 0 to 1."""
-    if of_rays == 1:
-        return float((bits[row, index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
-    return float(cells[row, index]) * (1.0 / 255.0)
+_WORD = wp.constant(4)
+"""Coarse cells of a word of 32 bits."""
 
 
-@wp.kernel(enable_backward=False)
-def _gather(
-    first_row: int,
-    worker: int,
-    # in
-    normals: wp.array2d(dtype=wp.vec3),
-    rows: wp.array2d(dtype=wp.vec3i),
-    place_weights: wp.array2d(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    looks_at_rays: wp.array(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-    indices: wp.array3d(dtype=wp.int32),
-    weights: wp.array3d(dtype=wp.float32),
-    bits: wp.array2d(dtype=wp.uint32),
-    cells: wp.array2d(dtype=wp.uint8),
-    # out
-    own: wp.array3d(dtype=wp.float32),
-):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), own.shape[1])
-    normal = normals[instance_in(batch, normals.shape[0]), receiver]
-    turn = instance_in(batch, counts.shape[0])
-    place = instance_in(batch, rows.shape[0])
-    row = rows[place, receiver]
-    weight = place_weights[instance_in(batch, place_weights.shape[0]), receiver]
-    is_vertex = row[0] == row[1] and row[0] == row[2]
-    for q in range(directions.shape[0]):
-        passing = float(1.0)
-        if wp.dot(normal, directions[q]) > 0.0:
-            passing = float(0.0)
-            of_rays = looks_at_rays[q]
-            for k in range(counts[turn, q]):
-                index = indices[turn, q, k]
-                seen = _open_share(bits, cells, of_rays, row[0], index)
-                if not is_vertex:
-                    seen = (
-                        weight[0] * seen
-                        + weight[1] * _open_share(bits, cells, of_rays, row[1], index)
-                        + weight[2] * _open_share(bits, cells, of_rays, row[2], index)
-                    )
-                passing += weights[turn, q, k] * seen
-        own[batch, receiver, q] = passing
+@functools.cache
+def _sites_type(lanes: int) -> Any:
+    """Struct of where a group of receivers lies."""
+    Rows = wp.types.matrix(shape=(3, lanes), dtype=wp.int32)
+    Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+
+    @wp.struct
+    class Sites:
+        rows: Rows  # of each corner, the first of them thrice where all receivers are vertices
+        weights: Weights
+        corner_count: int  # 1 where all receivers are vertices
+
+    return Sites
 
 
-@wp.kernel(enable_backward=False)
-def _gather_adjoint(
-    first_row: int,
-    worker: int,
-    # in
-    normals: wp.array2d(dtype=wp.vec3),
-    rows: wp.array2d(dtype=wp.vec3i),
-    place_weights: wp.array2d(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    looks_at_rays: wp.array(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-    indices: wp.array3d(dtype=wp.int32),
-    weights: wp.array3d(dtype=wp.float32),
-    bits: wp.array2d(dtype=wp.uint32),
-    cells: wp.array2d(dtype=wp.uint8),
-    adj_own: wp.array3d(dtype=wp.float32),
-    # out
-    adj_place_weights: wp.array2d(dtype=wp.vec3),
-    adj_weights: wp.array3d(dtype=wp.float32),
-):
-    """A thread owns a receiver:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_own.shape[1])
-    normal = normals[instance_in(batch, normals.shape[0]), receiver]
-    turn = instance_in(batch, counts.shape[0])
-    place = instance_in(batch, rows.shape[0])
-    row = rows[place, receiver]
-    weight = place_weights[instance_in(batch, place_weights.shape[0]), receiver]
-    is_vertex = row[0] == row[1] and row[0] == row[2]
-    adj_weight = wp.vec3()
-    for q in range(directions.shape[0]):
-        adj = adj_own[batch, receiver, q]
-        if adj != 0.0 and wp.dot(normal, directions[q]) > 0.0:
-            of_rays = looks_at_rays[q]
-            for k in range(counts[turn, q]):
-                index = indices[turn, q, k]
-                seen = _open_share(bits, cells, of_rays, row[0], index)
-                if not is_vertex:
-                    others = wp.vec3(
-                        seen,
-                        _open_share(bits, cells, of_rays, row[1], index),
-                        _open_share(bits, cells, of_rays, row[2], index),
-                    )
-                    adj_weight += adj * weights[turn, q, k] * others
-                    seen = wp.dot(weight, others)
-                if adj_weights:
-                    wp.atomic_add(adj_weights, turn, q, k, adj * seen)
-    if adj_place_weights:
-        adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + adj_weight
+class _SiteFunctions(NamedTuple):
+    """Kernel functions on the sites of a group."""
+
+    load_sites: wp.Function
+    spread: wp.Function
+    look: wp.Function
+
+
+@functools.cache
+def _make_site_functions(lanes: int) -> _SiteFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane, Sites = lane_type(lanes), _sites_type(lanes)
+    Rows = wp.types.vector(length=lanes, dtype=wp.int32)
+
+    @wp.func
+    def load_sites(rows: wp.array(dtype=wp.vec3i), weights: wp.array(dtype=wp.vec3), group: int):
+        sites = Sites()
+        sites.corner_count = 1
+        for lane in range(lanes):
+            receiver = wp.min(group * lanes + lane, rows.shape[0] - 1)
+            row = rows[receiver]
+            weight = wp.vec3(1.0, 0.0, 0.0)
+            if row[0] != row[1] or row[0] != row[2]:
+                weight = weights[receiver]
+                sites.corner_count = 3
+            for corner in range(3):
+                sites.rows[corner, lane] = row[corner]
+                sites.weights[corner, lane] = weight[corner]
+        return sites
+
+    # In plain Warp, which finds the address of each word by itself, it takes six times as long.
+    @wp.func_native(f"""
+    const wp::float32 unit = 1.0 / 255.0;
+    for (int word = 0; word < words.shape[1]; ++word) {{
+        unsigned packed[{lanes}];
+        for (int lane = 0; lane < {lanes}; ++lane)
+            packed[lane] = wp::index(words, rows.c[lane], word);
+        for (int part = 0; part < {_WORD}; ++part) {{
+            auto& share = wp::index(shares, word * {_WORD} + part);
+            for (int lane = 0; lane < {lanes}; ++lane)
+                share.c[lane] += weights.c[lane] * ((wp::float32)((packed[lane] >> 8 * part) & 255) * unit);
+        }}
+    }}
+    """)
+    def spread(rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), shares: wp.array(dtype=Lane)):
+        """shares[cell] += weight · S of all coarse cells in a row of each receiver."""
+        ...
+
+    @wp.func
+    def look(
+        rows: Rows, of_rays: int, index: int, bits: wp.array2d(dtype=wp.uint32), words: wp.array2d(dtype=wp.uint32)
+    ):
+        """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
+        share = Lane()
+        for lane in range(lanes):
+            if of_rays == 1:
+                share[lane] = float(int((bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
+            else:
+                word = words[rows[lane], index // _WORD]
+                byte = (word >> wp.uint32(8 * (index % _WORD))) & wp.uint32(255)
+                share[lane] = float(int(byte)) * (1.0 / 255.0)
+        return share
+
+    return _SiteFunctions(load_sites, spread, look)
+
+
+@functools.cache
+def _make_gather(lanes: int) -> wp.Kernel:
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    load_sites, spread, look = _make_site_functions(lanes)
+    find_group, load, along, is_any_above = fn.find_group, fn.load, fn.along, fn.is_any_above
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def gather(
+        first_row: int,
+        worker: int,
+        # in
+        normals: wp.array2d(dtype=wp.vec3),
+        rows: wp.array2d(dtype=wp.vec3i),
+        place_weights: wp.array2d(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        looks_at_rays: wp.array(dtype=wp.int32),
+        all_counts: wp.array2d(dtype=wp.int32),
+        all_indices: wp.array3d(dtype=wp.int32),
+        all_weights: wp.array3d(dtype=wp.float32),
+        bits: wp.array2d(dtype=wp.uint32),
+        words: wp.array2d(dtype=wp.uint32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        own: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers."""
+        item = first_row + wp.tid()
+        batch, group = find_group(item, own.shape[1])
+        normal = load(normals[instance_in(batch, normals.shape[0])], group)
+        weights_of_places = place_weights[instance_in(batch, place_weights.shape[0])]
+        sites = load_sites(rows[instance_in(batch, rows.shape[0])], weights_of_places, group)
+        turn = instance_in(batch, all_counts.shape[0])
+        shares = scratch[scratch_place(worker, item), 0]
+        if wp.static(lanes > 1):
+            for cell in range(shares.shape[0]):
+                shares[cell] = Lane(0.0)
+            for corner in range(sites.corner_count):
+                spread(sites.rows[corner], sites.weights[corner], words, shares)
+        for q in range(directions.shape[0]):
+            passing = Lane(0.0)
+            cosine = along(directions[q], normal)
+            if is_any_above(cosine, 0.0):
+                indices = all_indices[turn, q]
+                weights = all_weights[turn, q]
+                of_rays = looks_at_rays[q]
+                if wp.static(lanes == 1) or of_rays == 1:
+                    for k in range(all_counts[turn, q]):
+                        for corner in range(sites.corner_count):
+                            share = look(sites.rows[corner], of_rays, indices[k], bits, words)
+                            passing += weights[k] * wp.cw_mul(sites.weights[corner], share)
+                else:
+                    for k in range(all_counts[turn, q]):
+                        passing += weights[k] * shares[indices[k]]
+            for lane in range(wp.min(lanes, own.shape[1] - group * lanes)):
+                own[batch, group * lanes + lane, q] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
+
+    return gather
+
+
+@functools.cache
+def _make_gather_adjoint(lanes: int) -> wp.Kernel:
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    load_sites, spread, look = _make_site_functions(lanes)
+    find_group, load, along, is_any_above, total = fn.find_group, fn.load, fn.along, fn.is_any_above, fn.total
+    Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def gather_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        normals: wp.array2d(dtype=wp.vec3),
+        rows: wp.array2d(dtype=wp.vec3i),
+        place_weights: wp.array2d(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        looks_at_rays: wp.array(dtype=wp.int32),
+        all_counts: wp.array2d(dtype=wp.int32),
+        all_indices: wp.array3d(dtype=wp.int32),
+        all_weights: wp.array3d(dtype=wp.float32),
+        bits: wp.array2d(dtype=wp.uint32),
+        words: wp.array2d(dtype=wp.uint32),
+        adj_own: wp.array3d(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        adj_place_weights: wp.array2d(dtype=wp.vec3),
+        adj_all_weights: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
+
+        The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
+        """
+        item = first_row + wp.tid()
+        batch, group = find_group(item, adj_own.shape[1])
+        normal = load(normals[instance_in(batch, normals.shape[0])], group)
+        weights_of_places = place_weights[instance_in(batch, place_weights.shape[0])]
+        sites = load_sites(rows[instance_in(batch, rows.shape[0])], weights_of_places, group)
+        turn = instance_in(batch, all_counts.shape[0])
+        place = scratch_place(worker, item)
+        shares = scratch[place, 0]
+        adj_shares = scratch[place, 1]
+        if wp.static(lanes > 1):
+            for cell in range(shares.shape[0]):
+                shares[cell] = Lane(0.0)
+                adj_shares[cell] = Lane(0.0)
+            for corner in range(sites.corner_count):
+                spread(sites.rows[corner], sites.weights[corner], words, shares)
+        receiver_count = wp.min(lanes, adj_own.shape[1] - group * lanes)
+        adj_place = Weights()
+        for q in range(directions.shape[0]):
+            cosine = along(directions[q], normal)
+            if is_any_above(cosine, 0.0):
+                adj = Lane()
+                for lane in range(receiver_count):
+                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, group * lanes + lane, q], 0.0)
+                indices = all_indices[turn, q]
+                weights = all_weights[turn, q]
+                of_rays = looks_at_rays[q]
+                if wp.static(lanes == 1) or of_rays == 1:
+                    for k in range(all_counts[turn, q]):
+                        for corner in range(sites.corner_count):
+                            pull = wp.cw_mul(adj, look(sites.rows[corner], of_rays, indices[k], bits, words))
+                            adj_place[corner] += weights[k] * pull
+                            if adj_all_weights:
+                                adj_weight = total(wp.cw_mul(sites.weights[corner], pull))
+                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                else:
+                    for k in range(all_counts[turn, q]):
+                        adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
+                        if adj_all_weights:
+                            wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
+        if adj_place_weights:
+            for corner in range(sites.corner_count):
+                adj_corner = adj_place[corner]
+                if wp.static(lanes > 1):
+                    for cell in range(shares.shape[0]):
+                        shares[cell] = Lane(0.0)
+                    spread(sites.rows[corner], Lane(1.0), words, shares)
+                    for cell in range(shares.shape[0]):
+                        adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
+                for lane in range(receiver_count):
+                    receiver = group * lanes + lane
+                    gained = wp.vec3()
+                    gained[corner] = adj_corner[lane]
+                    adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + gained
+
+    return gather_adjoint
+
+
+def _as_words(cells: wp.array) -> wp.array:
+    """View rows of bytes as rows of words."""
+    row_count, count = cells.shape
+    words = wp.array(ptr=cells.ptr, dtype=wp.uint32, shape=(row_count, count // _WORD), device=cells.device)
+    words.viewed = cells  # the memory stays while the view does
+    return words
 
 
 def gather_own(normals: wp.array, places: Places, lookup: Lookup, supports: Supports, rows: OwnRows) -> wp.array:
@@ -147,14 +300,20 @@ def gather_own(normals: wp.array, places: Places, lookup: Lookup, supports: Supp
     shape = count, normals.shape[1], direction_count
     if places.weights.requires_grad:
         places = Places(places.rows, expand(places.weights, count))  # whose gradients are apart
-    inputs = [normals, *places, supports.directions, supports.looks_at_rays, *lookup, *rows]
-    cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count / 2
+    lanes = lane_count(normals.device)
+    words = _as_words(rows.cells)
+    inputs = [normals, *places, supports.directions, supports.looks_at_rays, *lookup, rows.bits, words]
+    row_count = count * group_count(shape[1], lanes)
+    cell_count = _WORD * words.shape[1] if lanes > 1 else 1
+    scratch = [Scratch((2, cell_count), lane_type(lanes))]
+    cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
     return differentiable(
-        lambda own: launch(_gather, shape[0] * shape[1], inputs=inputs, outputs=[own], cost=cost),
+        lambda own: launch(_make_gather(lanes), row_count, inputs=inputs, scratch=scratch, outputs=[own], cost=cost),
         lambda adj_own: launch(
-            _gather_adjoint,
-            shape[0] * shape[1],
+            _make_gather_adjoint(lanes),
+            row_count,
             inputs=[*inputs, adj_own],
+            scratch=scratch,
             outputs=[places.weights.grad],
             sums=[lookup.weights.grad],
             cost=2 * cost,
