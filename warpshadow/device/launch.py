@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from warpshadow.device.memory import in_huge_pages, require_gradient
 from warpshadow.device.parallel import Scratch, launch_slices
 from warpshadow.device.tape import record_adjoint
 from warpshadow.device.warp_internals import is_view, scalar_type
@@ -64,15 +65,16 @@ def differentiable(
         forward: Launches that write the result, which they get.
         adjoint: Launches that add to the gradients of the variables, those that have one; they get the result's. It is
             called whenever the tape plays back, and not at all where no variable requires a gradient.
-        result: Memory for the result. It requires a gradient if a variable does.
+        result: Memory for the result, which nobody has written to if it is large. It requires a gradient if a variable
+            does.
         variables: What the result depends on differentiably; None is passed over.
 
     Returns:
         The result.
     """
     if varies(variables):
-        result.requires_grad = True
-    forward(result)
+        require_gradient(result)
+    forward(in_huge_pages(result))
     record_adjoint(lambda: adjoint(result.grad), [*variables, result])
     return result
 
@@ -88,4 +90,4 @@ def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
         return
     if is_view(output):
         raise RuntimeError(f"{kernel.key}: got an output that is a view, whose gradient nobody else would have")
-    output.requires_grad = True
+    require_gradient(output)

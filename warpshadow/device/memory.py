@@ -1,0 +1,48 @@
+"""Memory: huge pages for large arrays.
+
+Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
+receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
+one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them to who asks; elsewhere nobody is asked.
+"""
+
+import ctypes
+import functools
+import mmap
+from collections.abc import Callable
+
+import warp as wp
+
+_HUGE = 2**21
+"""Bytes of a huge page."""
+
+_LEAST = 2 * _HUGE
+"""Bytes of an array that is worth asking."""
+
+
+@functools.cache
+def _advise() -> Callable[[int, int, int], int] | None:
+    """The system's function that is told how memory will be used: address, bytes, advice; None where there is none."""
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return None
+    advise = ctypes.CDLL(None).madvise
+    advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+    return advise
+
+
+def in_huge_pages(array: wp.array) -> wp.array:
+    """Ask for huge pages for an array that nobody has written to yet, if it is large. Returns the array.
+
+    It is a request: where the system refuses, memory comes in small pages as before.
+    """
+    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+    if size >= _LEAST and array.device.is_cpu and (advise := _advise()) is not None:
+        first, end = -(-array.ptr // _HUGE) * _HUGE, (array.ptr + size) // _HUGE * _HUGE
+        advise(first, end - first, mmap.MADV_HUGEPAGE)
+    return array
+
+
+def require_gradient(array: wp.array) -> None:
+    """Let an array require a gradient, which is zero."""
+    if not array.requires_grad:
+        array.grad = in_huge_pages(wp.empty(array.shape, dtype=array.dtype, device=array.device))
+        array.grad.zero_()
