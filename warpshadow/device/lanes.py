@@ -318,15 +318,19 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
             for k in range(rows.shape[1]):
                 rows[vertex, k] = rows[vertex, k] + scratch[k][lane]
 
-    @wp.func
+    # Plain Warp loads a whole vector for each of its numbers.
+    @wp.func_native(f"""
+    const int first = group * {lanes};
+    const int past = first + {lanes} < rows.shape[0] ? first + {lanes} : rows.shape[0];
+    for (int vertex = first; vertex < past; ++vertex)
+        for (int k = 0; k < count; ++k)
+            wp::index(rows, vertex, begin + k) = wp::index(scratch, k).c[vertex - first];
+    """)
     def store_columns(
         scratch: wp.array(dtype=Lane), begin: int, count: int, group: int, rows: wp.array2d(dtype=wp.float32)
     ):
         """rows[the group's vertices, begin + k] = scratch[k] for ``count`` columns."""
-        for lane in range(wp.min(lanes, rows.shape[0] - group * lanes)):
-            vertex = group * lanes + lane
-            for k in range(count):
-                rows[vertex, begin + k] = scratch[k][lane]
+        ...
 
     @wp.func
     def store_rows(scratch: wp.array(dtype=Lane), group: int, rows: wp.array2d(dtype=wp.float32)):

@@ -126,7 +126,8 @@ def _make_site_functions(lanes: int) -> _SiteFunctions:
 def _make_gather(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
     load_sites, spread, look = _make_site_functions(lanes)
-    find_group, load, along, is_any_above = fn.find_group, fn.load, fn.along, fn.is_any_above
+    find_group, load, store_columns = fn.find_group, fn.load, fn.store_columns
+    along, is_any_above = fn.along, fn.is_any_above
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def gather(
@@ -156,6 +157,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
         sites = load_sites(rows[instance_in(batch, rows.shape[0])], weights_of_places, group)
         turn = instance_in(batch, all_counts.shape[0])
         shares = scratch[scratch_place(worker, item), 0]
+        columns = scratch[scratch_place(worker, item), 1]
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 shares[cell] = Lane(0.0)
@@ -176,8 +178,14 @@ def _make_gather(lanes: int) -> wp.Kernel:
                 else:
                     for k in range(all_counts[turn, q]):
                         passing += weights[k] * shares[indices[k]]
-            for lane in range(wp.min(lanes, own.shape[1] - group * lanes)):
-                own[batch, group * lanes + lane, q] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
+            for lane in range(lanes):
+                passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
+            if wp.static(lanes == 1):
+                own[batch, group, q] = passing[0]
+            else:
+                columns[q] = passing
+        if wp.static(lanes > 1):
+            store_columns(columns, 0, directions.shape[0], group, own[batch])
 
     return gather
 
@@ -304,7 +312,7 @@ def gather_own(normals: wp.array, places: Places, lookup: Lookup, supports: Supp
     words = _as_words(rows.cells)
     inputs = [normals, *places, supports.directions, supports.looks_at_rays, *lookup, rows.bits, words]
     row_count = count * group_count(shape[1], lanes)
-    cell_count = _WORD * words.shape[1] if lanes > 1 else 1
+    cell_count = max(_WORD * words.shape[1], direction_count) if lanes > 1 else 1
     scratch = [Scratch((2, cell_count), lane_type(lanes))]
     cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
     return differentiable(
