@@ -33,6 +33,9 @@ _WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind
 # In boxes wider than this each row is trimmed to the span inside the edges; else testing samples is faster.
 _TRIM_WIDTH = 8
 
+_VERTEX_COST, _FACE_COST = 15.0, 30.0
+"""Nanoseconds that a vertex and a face take, if faces are small. Images are shared by threads."""
+
 _INT32_MASK = (1 << 32) - 1
 _DEPTH_ONE = 0x3F800000
 
@@ -68,6 +71,8 @@ class Fragments:
 
 @wp.kernel(enable_backward=False)
 def _snap(
+    first_row: int,
+    worker: int,
     # in
     clip_positions: wp.array2d(dtype=wp.vec4),
     width: int,
@@ -75,13 +80,14 @@ def _snap(
     # out
     corners: wp.array2d(dtype=wp.vec2i),
     depths: wp.array2d(dtype=float),
-    faults: wp.array(dtype=int),
+    faults: wp.array2d(dtype=int),
 ):
     """One thread owns one vertex: its fixed-point position and its depth z/w."""
-    instance, vertex = wp.tid()
+    row, vertex = wp.tid()
+    instance = first_row + row
     p = clip_positions[instance, vertex]
     if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2]) and wp.isfinite(p[3])):
-        wp.atomic_add(faults, 0, 1)
+        wp.atomic_add(faults, instance, 0, 1)
     corner = wp.vec2i(_WILD, _WILD)
     depth = 0.0
     if p[3] > 0.0:
@@ -220,6 +226,8 @@ def _outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
 
 @wp.kernel(enable_backward=False)
 def _cover(
+    first_row: int,
+    worker: int,
     # in
     clip_positions: wp.array2d(dtype=wp.vec4),
     corners: wp.array2d(dtype=wp.vec2i),
@@ -230,19 +238,20 @@ def _cover(
     strips: int,
     # out
     keys: wp.array3d(dtype=wp.int64),
-    faults: wp.array(dtype=int),
+    faults: wp.array2d(dtype=int),
 ):
     """One thread owns every ``strips``-th row of one face and offers the face to the samples there.
 
     A sample keeps the largest key: nearest depth above, lowest face below. Zero is the background.
     """
-    instance, face, strip = wp.tid()
+    image, face, strip = wp.tid()
+    instance = first_row + image
     i = faces[face][0]
     j = faces[face][1]
     k = faces[face][2]
     if wp.min(i, wp.min(j, k)) < 0 or wp.max(i, wp.max(j, k)) >= corners.shape[1]:
         if strip == 0:
-            wp.atomic_add(faults, 1, 1)
+            wp.atomic_add(faults, instance, 1, 1)
         return
     a = corners[instance, i]
     b = corners[instance, j]
@@ -384,18 +393,25 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     depths = wp.empty((batch_count, vertex_count), dtype=float, device=device)
     keys = wp.zeros((batch_count, height, width), dtype=wp.int64, device=device)
     face_ids = wp.empty((batch_count, height, width), dtype=wp.int32, device=device)
-    faults = wp.zeros(2, dtype=int, device=device)
+    faults = wp.zeros((batch_count, 2), dtype=int, device=device)
     strips = strip_count(device)
-    launch(_snap, clip_positions.shape, inputs=[clip_positions, width, height], outputs=[corners, depths, faults])
+    launch(
+        _snap,
+        clip_positions.shape,
+        cost=_VERTEX_COST,
+        inputs=[clip_positions, width, height],
+        outputs=[corners, depths, faults],
+    )
     launch(
         _cover,
         (batch_count, faces.shape[0], strips),
+        cost=_FACE_COST,
         inputs=[clip_positions, corners, depths, faces, width, height, strips],
         outputs=[keys, faults],
     )
     launch(_resolve, keys.size, inputs=[keys.flatten()], outputs=[face_ids.flatten()])
     if not device.is_capturing:
-        bad_vertex_count, bad_face_count = faults.numpy().tolist()
+        bad_vertex_count, bad_face_count = faults.numpy().sum(axis=0).tolist()
         if bad_vertex_count:
             raise ValueError(f"clip_positions: got {bad_vertex_count} with NaN or Inf, expected finite numbers")
         if bad_face_count:
