@@ -165,6 +165,8 @@ def test_the_shadow_is_direct_light_over_that_which_nothing_blocks(recipe):
     white = [replace(body, albedo=(1, 1, 1)) for body in scene.bodies]
     plain = [replace(body, blockers=0) for body in white]
     one, other = (ws.render(replace(scene, bodies=bodies))[..., :3] for bodies in (white, plain))
+    batch = ws.Renderer(scene, cameras=[scene.camera] * 2).shadow()
+    np.testing.assert_array_equal(batch[0], shadows[0])
     inside = other > 0
     np.testing.assert_allclose(shadows[0][inside], (one[inside] / other[inside]), rtol=1e-6)
     assert (shadows[0][~inside] == 1).all()

@@ -11,6 +11,9 @@ from warpshadow import check
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.maths import sh
 
+_AT_ONCE = 2**14
+"""Sums in rows of cells that are found at once: few enough to stay in a cache, and row by row in the same order."""
+
 
 class CellLight(NamedTuple):
     """The light of cells of directions, and where in its cell it comes from.
@@ -56,13 +59,18 @@ def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.nd
     count, height = len(directions), len(radiance)
     split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
     owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
-    weights = sh.pixel_solid_angles(height * split)
+    weights, towards = sh.pixel_solid_angles(height * split), sh.equirectangular_directions(height * split)
     integrals = np.zeros((6, count))
-    for row, towards in enumerate(sh.equirectangular_directions(height * split)):
-        power = weights[row] * np.repeat(radiance[row // split], split, axis=0).astype(np.float64)
-        values = np.concatenate([power, (power @ LUMINANCE)[:, None] * towards], axis=1)
-        for integral, value in zip(integrals, values.T, strict=True):
-            integral += np.bincount(owners[row], value, minlength=count)
+    at_once = max(_AT_ONCE // count, 1)
+    for first in range(0, height * split, at_once):
+        rows = np.arange(first, min(first + at_once, height * split))
+        power = weights[rows, None, None] * np.repeat(radiance[rows // split], split, axis=1).astype(np.float64)
+        values = np.concatenate([power, (power @ LUMINANCE)[..., None] * towards[rows]], axis=2)
+        cells = (owners[rows] + count * np.arange(len(rows))[:, None]).ravel()
+        for integral, value in zip(integrals, values.reshape(-1, 6).T, strict=True):
+            of_rows = np.bincount(cells, value, minlength=count * len(rows)).reshape(len(rows), count)
+            of_rows[0] += integral
+            integral[:] = of_rows.sum(axis=0)
     return integrals[:3].T, integrals[3:].T
 
 

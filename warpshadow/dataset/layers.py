@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from warpshadow.dataset.png import Channels, Coding, Even, Srgb
-from warpshadow.device.tape import unrecorded
 from warpshadow.scene.scene import Scene
 from warpshadow.tuning.renderer import Renderer
-
-_WHITE = (1.0, 1.0, 1.0)
 
 
 class Shown:
@@ -29,8 +24,7 @@ class Shown:
 
     def __init__(self, scene: Scene, device: str, most_bodies: int):
         self.most_bodies = most_bodies
-        self._make = functools.partial(Renderer, device=device, progress=False)
-        self.renderer = self._make(scene)
+        self.renderer = Renderer(scene, device=device, progress=False)
 
     @functools.cached_property
     def _channels(self) -> Channels:
@@ -42,18 +36,8 @@ class Shown:
         return _named("RGBA", self.renderer.render())
 
     def shadow(self) -> Channels:
-        """Direct light on the bodies over that which they would get if nothing blocked any.
-
-        All surfaces count as white. Where no light would come from, and where there is no body, it is 1.
-        """
-        renderer = self.renderer
-        if renderer.scene.bounces:
-            renderer = self._make(replace(renderer.scene, bounces=0))
-        bodies = tuple(replace(body, blockers=0) for body in renderer.scene.bodies)
-        others = self._make(replace(renderer.scene, bodies=bodies))
-        received, unblocked = (_white_image(each)[..., :3] for each in (renderer, others))
-        ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
-        return _named([f"shadow.{color}" for color in "RGB"], ratio)
+        """Direct light on the bodies over that which they would get if nothing blocked any."""
+        return _named([f"shadow.{color}" for color in "RGB"], self.renderer.shadow())
 
     def some(self, *names: str) -> Channels:
         """Some of the channels of the renderer's layers."""
@@ -67,19 +51,6 @@ class Shown:
 
 def _named(names: Sequence[str], values: np.ndarray) -> Channels:
     return dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
-
-
-def _white_image(renderer: Renderer) -> np.ndarray:
-    """The image if all bodies were white."""
-    white = functools.partial(wp.full, value=wp.vec3(_WHITE), dtype=wp.vec3, device=renderer.device)
-    albedo, textures = {}, {}
-    for number, body in enumerate(renderer.scene.bodies):
-        if body.texture is None:
-            albedo[number] = white((1, 1))
-        else:
-            textures[number] = white((1, 1, 1))
-    with unrecorded():
-        return renderer.draw(albedo=albedo, textures=textures).numpy()[0].copy()
 
 
 # ---------------------------------------------------------------------------------------------- the table

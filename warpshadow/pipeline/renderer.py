@@ -669,6 +669,33 @@ class Renderer:
             layers = find_layers(self._own(view), (width, height), across=self.scene.supersampling)
         return layers if has_batch else Layers(*(each[0] for each in layers))
 
+    @one_at_a_time
+    def shadow(self) -> np.ndarray:
+        """Find the direct light on the bodies over that which they would get if nothing blocked any.
+
+        All surfaces count as white. Where no light would come from, and where there is no body, it is 1.
+
+        Returns:
+            float32 of shape [height, width, 3], or [camera, height, width, 3] where cameras were given. Not
+            differentiable.
+        """
+        given: dict[str, Any] = self._arguments
+        if self.scene.bounces:
+            return Renderer(**given | {"scene": replace(self.scene, bounces=0)}).shadow()
+        bodies = tuple(replace(body, blockers=0) for body in self.scene.bodies)
+        others = Renderer(**given | {"scene": replace(self.scene, bodies=bodies)})
+        with unrecorded():
+            view = self._own_view
+            call = self._call(view)
+            receivers = Node("", Receivers.without_owners, view.receivers_node)
+            none = tuple(wp.empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
+            spheres = Source("spheres", none)
+            free = LitPoints(others._method, others._materials, self._vertices, spheres, receivers, call)
+            images = (view.white_image(each.shading(None)).value(call) for each in (view, free))
+            received, unblocked = (image.numpy()[..., :3].copy() for image in images)
+        ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
+        return ratio if self.has_camera_batch else ratio[0]
+
     # ------------------------------------------------------------------------------------------ what runs
 
     @one_at_a_time

@@ -181,6 +181,10 @@ class View(LitPoints):
         """
         return self._white_radiance_of(self.shading(light, self.materials.replaced(albedo, textures)))
 
+    def white_image(self, lit: Node) -> Node:
+        """The image if every surface were white, of light on the receivers; vec4 of shape [batch, height, width]."""
+        return self._averaged(self._white_radiance_of(lit))
+
     def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another of the same cameras, among what blocks light in this one."""
 

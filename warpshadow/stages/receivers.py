@@ -47,6 +47,10 @@ class Receivers(NamedTuple):
     vertices: wp.array | None = None  # [vertex receiver] int32, the vertices and backs that the first of them are, …
     seen: Fragments | None = None  # … and what the rest see: sides and barycentrics, [batch, own]; −1 for none
 
+    def without_owners(self) -> "Receivers":
+        """The same receivers, as points of which nobody knows the body."""
+        return self._replace(spans=(), vertices=None, seen=None)
+
 
 @wp.kernel
 def _gather(

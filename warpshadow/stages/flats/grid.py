@@ -179,11 +179,8 @@ def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[Cov
     from_middle = np.abs(np.arange(_TESTED**2) - _TESTED**2 // 2).argsort(kind="stable")
     best = (tested[:, from_middle] >= 0).argmax(axis=1)
     chosen = tested[np.arange(len(tested)), from_middle[best]]
-    found = [
-        CoveredPoint(faces[item], np.maximum(barycentrics[item], 0), texel)
-        for texel, item in enumerate(chosen)
-        if item >= 0
-    ]
+    inner = np.maximum(barycentrics, 0)
+    found = [CoveredPoint(faces[item], inner[item], texel) for texel, item in enumerate(chosen) if item >= 0]
     return covered.reshape(height, width).astype(np.float32), found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -124,8 +125,12 @@ class Flats:
         return multiply(self.frames_of_vertices, positions)
 
 
+@functools.lru_cache(16)
 def _halvings(height: int, width: int) -> list[tuple[csr_matrix, tuple[int, int]]]:
-    """Matrices from a grid to each of its mip levels, each half as large as the one before, and their sizes."""
+    """Matrices from a grid to each of its mip levels, each half as large as the one before, and their sizes.
+
+    Not to be written to: grids of different scenes are often of one size.
+    """
     from scipy.sparse import kron
 
     sizes = [(height, width)]
