@@ -1,16 +1,8 @@
-"""Rendering with torch tensors: images that are differentiable in light, reflectance, geometry and cameras.
+"""A renderer of one scene, whose arguments are tensors."""
 
-While geometry and camera do not move, visibility and rasterization are computed once, by any method, the ray-traced
-mesh included; an iteration is then a matrix product and a gather.
-"""
-
-import functools
 import json
-import os
-import sys
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,24 +12,15 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.batch import common_batch
-from warpshadow.device.tape import recorded, unrecorded
-from warpshadow.device.threads import one_at_a_time, one_call
-from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
-from warpshadow.stages import rotations
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
-from warpshadow.stages.rotations import Vec6
+from warpshadow.torch.arguments import Arguments
 from warpshadow.tuning.renderer import Renderer
-
-_ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
-
-
-__all__ = ["TorchRenderer", "apply", "rotation_matrices"]
 
 
 class TorchRenderer(torch.nn.Module):
@@ -218,10 +201,10 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None,
         geometry: Geometry[torch.Tensor] | None,
         clip_matrices: torch.Tensor | None,
-    ) -> "_Arguments":
+    ) -> "Arguments":
         """The tensors among the arguments of a call, checked."""
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
-        given = _Arguments(self.device, cameras=self.cameras if has_cameras else None)
+        given = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             given.add("light", light, wp.vec3, (self.basis.size,), what)
@@ -250,7 +233,7 @@ class TorchRenderer(torch.nn.Module):
 
     def _inputs(
         self,
-        given: "_Arguments",
+        given: "Arguments",
         arrays: Mapping[str, wp.array],
         light: torch.Tensor | EnvironmentMap | None,
     ) -> dict[str, Any]:
@@ -298,7 +281,7 @@ class TorchRenderer(torch.nn.Module):
         """
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
-        given = _Arguments(self.device)
+        given = Arguments(self.device)
         remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
         given.add("rotations", rotations, wp.mat33, (count,), remedy)
         given.add("translations", translations, wp.vec3, (count,))
@@ -365,7 +348,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all.
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
-        given = _Arguments(self.device)
+        given = Arguments(self.device)
         for name, tensor in parts.items():
             if tensor is not None:
                 given.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
@@ -401,7 +384,7 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, so focal lengths and the principal point, too.
         """
         camera = self.cameras[0]
-        given = _Arguments(self.device)
+        given = Arguments(self.device)
         given.add("intrinsics", intrinsics, wp.mat33, ())
         given.add("rotations", rotations, wp.mat33, ())
         given.add("translations", translations, wp.vec3, ())
@@ -410,301 +393,3 @@ class TorchRenderer(torch.nn.Module):
             return compose_clip_matrices(*arrays.values(), size=(camera.width, camera.height), near=camera.near)
 
         return given.apply(compose)
-
-
-def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
-    """Make rotation matrices of free parameters, as :func:`warpshadow.stages.rotations.rotation_matrices` does.
-
-    Args:
-        parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
-            axis-angle vectors [radians], smooth at 0; 6, the first two columns; 9, the rows of any matrix, whose
-            nearest rotation is taken (``matrices.flatten(-2)``).
-
-    Returns:
-        Rotations, shape [..., 3, 3].
-
-    Raises:
-        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.stages.rotations.rotation_matrices`
-            says.
-
-    Differentiable: parameters.
-    """
-    _check_float32("parameters", parameters)
-    check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
-    dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
-    rows = parameters.reshape(1, -1, *item_shape(dtype))
-    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
-    return matrices.reshape(*parameters.shape[:-1], 3, 3)
-
-
-class _Arguments:
-    """Tensors that become arguments of a function of Warp arrays, checked and with a leading batch dimension."""
-
-    def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
-        self.device = device
-        self._cameras = cameras  # a batch that there is beside those of tensors
-        self._has_batch = cameras is not None  # of results
-        self.names: list[str] = []
-        self.tensors: list[torch.Tensor] = []
-        self.dtypes: list[type] = []
-        self._bodies: dict[str, dict[str, Any]] = {}  # of geometries, those that move and those that are deformed
-
-    def add(
-        self,
-        name: str,
-        tensor: torch.Tensor,
-        dtype: type,
-        shape: tuple[int | str, ...],
-        meaning: str = "",
-        *,
-        said: str | None = None,
-    ) -> None:
-        """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it.
-
-        Messages about it call it ``said``, by default its name.
-        """
-        shape = (*shape, *item_shape(dtype))
-        _check_tensor(said or name, tensor, self.device, shape, meaning)
-        has_batch = tensor.ndim > len(shape)
-        self._has_batch |= has_batch
-        self.names.append(name)
-        self.tensors.append(tensor if has_batch else tensor[None])
-        self.dtypes.append(dtype)
-
-    def expand(self) -> None:
-        """Repeat tensors with a batch of 1 for every instance of the others."""
-        count = self._common_batch()
-        self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
-
-    def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> None:
-        """Add the tensors of a geometry, of which arrays there are as many items as of another."""
-        geometry, own = as_geometry(name, geometry), like.arrays()
-        self._bodies[name] = {"moving": geometry.moving, "deformed": geometry.deformed}
-        for part, tensor in geometry.arrays().items():
-            self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:], PLACED)
-        if geometry.rotations is not None:
-            assert like.rotations is not None
-            self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
-
-    def geometry(self, name: str, arrays: Mapping[str, wp.array]) -> Geometry[wp.array] | None:
-        """A geometry that was added, of arrays; None if none was."""
-        if name not in self._bodies:
-            return None
-        parts = (arrays[f"{name}.{part}"] for part in GEOMETRY_DTYPES)
-        return Geometry(*parts, rotations=arrays.get(f"{name}.rotations"), **self._bodies[name])
-
-    def arrays(self) -> dict[str, wp.array]:
-        """The tensors as arrays, which require a gradient as they do."""
-        found = {}
-        for name, tensor, dtype in zip(self.names, self.tensors, self.dtypes, strict=True):
-            found[name] = _as_array(tensor, dtype)
-            found[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
-        return found
-
-    def apply(self, function: Callable[[Mapping[str, wp.array]], Any]) -> Any:
-        """Apply a function of arrays by their names; results lose a batch dimension that no tensor had."""
-        self._common_batch()
-        results = apply(
-            lambda *arrays: function(dict(zip(self.names, arrays, strict=True))),
-            *self.tensors,
-            dtypes=self.dtypes,
-            device=self.device,
-        )
-        if self._has_batch:
-            return results
-        return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
-
-    def apply_geometry(
-        self, function: Callable[[Mapping[str, wp.array]], Geometry[wp.array]]
-    ) -> Geometry[torch.Tensor]:
-        """Apply a function that makes a geometry."""
-        made: list[Geometry[wp.array]] = []
-
-        def make(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
-            made.append(function(arrays))
-            rotations = made[0].rotations
-            return (*made[0].arrays().values(), *([] if rotations is None else [rotations]))
-
-        positions, centers, radii, *rotations = self.apply(make)
-        return Geometry(
-            positions,
-            centers,
-            radii,
-            moving=made[0].moving,
-            rotations=rotations[0] if rotations else None,
-            deformed=made[0].deformed,
-        )
-
-    def _common_batch(self) -> int:
-        return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
-
-
-def _check_float32(name: str, tensor: object) -> None:
-    """Raise ValueError unless it is a tensor of float32."""
-    if not isinstance(tensor, torch.Tensor):
-        raise ValueError(
-            f"{name}: got {type(tensor).__name__}, expected a tensor of torch.float32: "
-            "torch.as_tensor(…, dtype=torch.float32)"
-        )
-    if tensor.dtype != torch.float32:
-        raise ValueError(f"{name}: got {tensor.dtype}, expected a tensor of torch.float32: .float() converts it")
-
-
-def _check_tensor(
-    name: str, tensor: torch.Tensor, device: torch.device, shape: tuple[int | str, ...], meaning: str
-) -> None:
-    """Raise ValueError unless a tensor is of float32, finite, on the device, and of the shape or a batch of it."""
-    _check_float32(name, tensor)
-    if tensor.device != device:
-        raise ValueError(f"{name}: got device {tensor.device}, expected {device}: .to({str(device)!r}) moves it")
-    check.shape(name, tuple(tensor.shape), ("batch", *shape) if tensor.ndim > len(shape) else shape, meaning)
-    if tensor.numel() == 0 and 0 not in shape:
-        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected at least one value")
-    if not _is_capturing(device) and not np.isfinite(float(tensor.detach().sum())):
-        check.finite(name, tensor.detach().cpu().numpy())
-
-
-# ---------------------------------------------------------------------------------------------- autograd
-
-
-@overload
-def apply(
-    function: Callable[..., tuple[wp.array, ...]],
-    *tensors: torch.Tensor,
-    dtypes: Sequence[type],
-    device: torch.device | None = None,
-) -> tuple[torch.Tensor, ...]: ...
-
-
-@overload
-def apply(
-    function: Callable[..., wp.array],
-    *tensors: torch.Tensor,
-    dtypes: Sequence[type],
-    device: torch.device | None = None,
-) -> torch.Tensor: ...
-
-
-def apply(
-    function: Callable[..., wp.array | tuple[wp.array, ...]],
-    *tensors: torch.Tensor,
-    dtypes: Sequence[type],
-    device: torch.device | None = None,
-) -> torch.Tensor | tuple[torch.Tensor, ...]:
-    """Apply a differentiable function of Warp arrays to tensors.
-
-    Args:
-        function: Takes an array for each tensor and returns an array, or a tuple of them; what it launches is recorded
-            on a tape of this thread's if a tensor requires a gradient.
-        tensors: Float32; contiguous or not. Items of a dtype lie in the last dimensions: a [batch, vertex, 3] tensor
-            is an array of vec3 of shape [batch, vertex].
-        dtypes: Warp's dtype of each.
-        device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
-
-    Returns:
-        The array as a tensor, or a tuple of tensors for a tuple of arrays.
-
-    Differentiable: as the function is, once.
-    """
-    for number, tensor in enumerate(tensors):
-        _check_float32(f"tensors[{number}]", tensor)
-    wp.init()
-    if torch.get_num_threads() > 1:
-        _let_waiting_threads_sleep()
-    wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
-    results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)
-    return results if len(results) > 1 else results[0]
-
-
-@functools.cache
-def _let_waiting_threads_sleep() -> None:
-    """Let the threads of torch's OpenMP sleep where they wait for each other, rather than spin.
-
-    They spin for milliseconds before they sleep, which is quickest if each has a core to itself. Beside other work, or
-    the threads of our own pool, they use up their share of the cores by spinning, and the thread that all wait for is
-    the last to run: each operation on more than 32 768 numbers then takes tens of milliseconds. GNU's OpenMP spins for
-    microseconds once it has more threads than there are cores (its manual, GOMP_SPINCOUNT). So it is given some that
-    sleep for good. No setting of torch changes; and what the environment says about waiting is left alone.
-    """
-    is_said = "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ
-    if is_said or sys.platform != "linux" or not torch.backends.openmp.is_available():
-        return
-    others = torch.get_num_threads() - 1  # that a team has beside the thread that begins it
-    started = [threading.Event() for _ in range(-(-len(os.sched_getaffinity(0)) // others))]
-
-    def begin_team(is_started: threading.Event) -> None:
-        torch.zeros(1 << 17).add_(1.0)
-        is_started.set()
-        threading.Event().wait()  # a team ends with the thread that began it
-
-    for event in started:
-        threading.Thread(target=begin_team, args=(event,), name="warpshadow-sleeper", daemon=True).start()
-    for event in started:
-        event.wait()
-
-
-def _as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
-    """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
-    array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
-    if not tensor.is_inference():  # a renderer on a GPU knows by it what has not been written to
-        array.origin, array.version = tensor if tensor._base is None else tensor._base, tensor._version
-    return array
-
-
-class _WarpFunction(torch.autograd.Function):
-    """Records Warp launches on a tape in forward and plays it back in backward, as often as asked."""
-
-    @staticmethod
-    def forward(
-        ctx,
-        function: Callable,
-        dtypes: tuple[type, ...],
-        wants: tuple[bool, ...],
-        device: torch.device,
-        *tensors: torch.Tensor,
-    ):
-        arguments = [_as_array(*pair) for pair in zip(tensors, dtypes, strict=True)]
-        # streams are the device's, as Warp has it, not a thread's
-        with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
-            for argument, is_wanted in zip(arguments, wants, strict=True):
-                argument.requires_grad = is_wanted  # here, so that a graph that is captured zeroes the gradient
-            results = function(*arguments)
-        results = results if isinstance(results, tuple) else (results,)
-        outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
-        if any(wants):
-            ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
-            ctx.tape, ctx.arguments, ctx.results, ctx.is_played = tape, arguments, results, False
-            pairs = zip(outputs, results, strict=True)
-            ctx.mark_non_differentiable(*(output for output, result in pairs if not result.requires_grad))
-        return outputs
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients: torch.Tensor):
-        ctx.saved_tensors  # noqa: B018
-        with one_call, _current_stream(gradients[0].device), unrecorded():
-            if ctx.is_played:  # before, gradients are zero
-                ctx.tape.zero()
-            ctx.is_played = True
-            # copies, since memory shared with torch is reused behind the tape's back
-            for result, gradient in zip(ctx.results, gradients, strict=True):
-                if result.requires_grad:
-                    wp.copy(result.grad, wp.from_torch(gradient.detach().contiguous(), dtype=result.dtype))
-            ctx.tape.backward()
-            found = [
-                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
-                for argument in ctx.arguments
-            ]
-        return None, None, None, None, *found
-
-
-def _current_stream(device: torch.device) -> wp.ScopedStream:
-    """Launch on torch's current stream, which while it is captured must not wait for streams that are not."""
-    is_cuda = device.type == "cuda"
-    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None
-    return wp.ScopedStream(stream, sync_enter=not _is_capturing(device))
-
-
-def _is_capturing(device: torch.device) -> bool:
-    """Whether torch captures a CUDA graph on its current stream."""
-    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()

@@ -1,0 +1,11 @@
+"""Rendering with torch tensors: images that are differentiable in light, reflectance, geometry and cameras.
+
+While geometry and camera stand still, visibility and rasterization are computed once, by any method, the ray-traced
+mesh included; an iteration is then a matrix product and a gather.
+"""
+
+from warpshadow.torch.autograd import apply
+from warpshadow.torch.renderer import TorchRenderer
+from warpshadow.torch.rotations import rotation_matrices
+
+__all__ = ["TorchRenderer", "apply", "rotation_matrices"]

@@ -1,0 +1,37 @@
+"""Rotations as tensors."""
+
+import torch
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.warp_internals import item_shape
+from warpshadow.stages import rotations
+from warpshadow.stages.rotations import Vec6
+from warpshadow.torch.autograd import apply, check_float32
+
+_ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
+
+
+def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
+    """Make rotation matrices of free parameters, as :func:`warpshadow.stages.rotations.rotation_matrices` does.
+
+    Args:
+        parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
+            axis-angle vectors [radians], smooth at 0; 6, the first two columns; 9, the rows of any matrix, whose
+            nearest rotation is taken (``matrices.flatten(-2)``).
+
+    Returns:
+        Rotations, shape [..., 3, 3].
+
+    Raises:
+        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.stages.rotations.rotation_matrices`
+            says.
+
+    Differentiable: parameters.
+    """
+    check_float32("parameters", parameters)
+    check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
+    dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
+    rows = parameters.reshape(1, -1, *item_shape(dtype))
+    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
+    return matrices.reshape(*parameters.shape[:-1], 3, 3)
