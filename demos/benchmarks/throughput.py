@@ -3,7 +3,8 @@
     python demos/benchmarks/throughput.py [--sizes 64 256] [--instances 1 8 64] [--seconds 2]
 
 The scene is that of benchmark.py. Of "light" each instance has light of its own, five bands, and what is seen is kept;
-of "pose" each has a bunny that moved, so all is computed. A process has all threads; two have half of them each, and
+of "pose" each has a bunny that moved, so all is computed; of "mixed" one after another shows the bunny and six other
+shapes, each moved. A process has all threads; two have half of them each, and
 work at the same time. An image is forward alone, or forward and backward to what varies. Figures are whole rates, host
 work included, after a warm-up.
 """
@@ -22,9 +23,10 @@ import torch
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.benchmarks.lane_choice import cpu_text
-from demos.scenes import bunny_scene
+from demos.scenes import bunny_scene, on_ground
 from warpshadow.device.workers import run_tasks
-from warpshadow.torch import TorchRenderer
+from warpshadow.scene.random_scenes import primitives
+from warpshadow.torch import MixedRenderer, TorchRenderer
 
 WARM_UP = 3  # calls
 
@@ -32,7 +34,7 @@ WARM_UP = 3  # calls
 class Case(NamedTuple):
     """What is timed."""
 
-    what: str  # "light" or "pose"
+    what: str  # "light", "pose" or "mixed"
     size: int  # of images [pixels]
     instances: int  # of a call
     has_gradient: bool
@@ -45,30 +47,34 @@ class Run(NamedTuple):
     seconds: float  # of each
 
 
-def renderer_of(case: Case) -> TorchRenderer:
-    scene = bunny_scene()
-    camera = scene.camera.resized(case.size / scene.camera.width)
+def renderer_of(case: Case) -> MixedRenderer:
+    scenes = [bunny_scene()]
+    if case.what == "mixed":
+        sky, ground = scenes[0].light, scenes[0].bodies[1]
+        bodies = [on_ground(shape.mesh, sky, blockers=32).bodies[0] for shape in primitives()[1:]]
+        scenes += [dataclasses.replace(scenes[0], bodies=(body, ground)) for body in bodies]
+    camera = scenes[0].camera.resized(case.size / scenes[0].camera.width)
     basis = ws.HarmonicBasis(5) if case.what == "light" else None
-    return TorchRenderer(dataclasses.replace(scene, camera=camera), basis=basis)
+    return MixedRenderer(TorchRenderer(dataclasses.replace(scene, camera=camera), basis=basis) for scene in scenes)
 
 
-def step_of(case: Case, renderer: TorchRenderer) -> Callable[[], None]:
+def step_of(case: Case, renderer: MixedRenderer) -> Callable[[], None]:
     """A function that renders the images of a call once."""
     generator = torch.Generator().manual_seed(0)
-    rotations, translations, scales = renderer.scene_poses()
+    which = torch.arange(case.instances) % len(renderer.renderers)
+    rotations, translations, scales = (poses[which] for poses in renderer.scene_poses())
 
     def varied() -> torch.Tensor:
         if case.what == "light":
             return torch.rand(case.instances, 25, 3, generator=generator)
-        shifts = 0.05 * torch.randn(case.instances, *translations.shape, generator=generator)
+        shifts = 0.05 * torch.randn(translations.shape, generator=generator)
         shifts[:, 1:] = 0  # the ground stays
         return translations + shifts
 
     def image(values: torch.Tensor) -> torch.Tensor:
         if case.what == "light":
-            return renderer(values)
-        turns = rotations.expand(case.instances, *rotations.shape)
-        return renderer(geometry=renderer.placed(turns, values, scales))
+            return renderer(which, values)
+        return renderer(which, geometry=renderer.placed(which, rotations, values, scales))
 
     def step() -> None:
         if case.has_gradient:
@@ -110,7 +116,9 @@ def all_rates(cases: tuple[Case, ...], processes: int, seconds: float) -> Iterat
 
 def main(sizes: list[int], instances: list[int], seconds: float) -> None:
     print(cpu_text())
-    cases = tuple(itertools.starmap(Case, itertools.product(("light", "pose"), sizes, instances, (False, True))))
+    cases = tuple(
+        itertools.starmap(Case, itertools.product(("light", "pose", "mixed"), sizes, instances, (False, True)))
+    )
     one, two = (list(all_rates(cases, processes, seconds)) for processes in (1, 2))
     print("\nimages a second, and ms an image")
     print(f"{'varies':7} {'size':>9} {'instances':>9}  {'':21} {'one process':>19} {'two processes':>19}")
