@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import twins
 import warp as wp
 
+from warpshadow.maths.directions import fibonacci
 from warpshadow.stages import shading
 
 # Sums of up to 10⁴ float32 products of size 1/100.
@@ -93,3 +95,61 @@ def test_a_gradient_that_nobody_asks_for_is_not_computed(device):
     assert transfer.grad is None
     expected = np.repeat(transfer.numpy().sum(axis=1)[..., None], 3, axis=-1)
     assert np.abs(light.grad.numpy() - expected).max() < FLOAT32 * 10
+
+
+# ---------------------------------------------------------------------------------------------------- known light
+
+
+def known_light(device, requires_grad=False):
+    """Transmittance, normals, directions and light of two instances."""
+    rng = np.random.default_rng(7)
+    directions = fibonacci(32)
+    normals = rng.normal(size=(2, 5, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    return (
+        wp.array(rng.uniform(size=(2, 5, 32)), dtype=wp.float32, device=device, requires_grad=requires_grad),
+        wp.array(normals, dtype=wp.vec3, device=device, requires_grad=requires_grad),
+        directions,
+        wp.array(rng.uniform(size=(1, 32, 3)), dtype=wp.vec3, device=device),
+    )
+
+
+def known_light_twin(transmittance, normals, directions, light):
+    """The same in float64."""
+    return np.stack(
+        [twins.directional_transfer(t, n, directions) @ light for t, n in zip(transmittance, normals, strict=True)]
+    )
+
+
+def test_known_light_is_shaded_as_transfer_vectors_shade_it(device):
+    transmittance, normals, directions, light = known_light(device)
+    got = shading.shade_cells(transmittance, normals, directions, light)
+    arrays = [array.numpy().astype(float) for array in (transmittance, normals)]
+    expected = known_light_twin(*arrays, directions, light.numpy()[0].astype(float))
+    assert not got.requires_grad
+    assert np.abs(got.numpy() - expected).max() < FLOAT32 * np.abs(expected).max()
+
+
+def test_the_gradients_of_known_light_are_those_of_the_twin(device):
+    transmittance, normals, directions, light = known_light(device, requires_grad=True)
+    weights = np.random.default_rng(8).normal(size=(2, 5, 3))
+    got = tape_gradients(
+        lambda t, n: shading.shade_cells(t, n, directions, light), [transmittance, normals], weights, device
+    )
+    given = [array.numpy().astype(float) for array in (transmittance, normals)]
+    for number, gradient in enumerate(got):
+        expected = np.zeros(gradient.shape)
+        for index in np.ndindex(gradient.shape):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved = [array.copy() for array in given]
+                moved[number][index] += step
+                ends.append((weights * known_light_twin(*moved, directions, light.numpy()[0].astype(float))).sum())
+            expected[index] = (ends[0] - ends[1]) / 2e-6
+        assert np.abs(gradient - expected).max() < FLOAT32 * np.abs(expected).max()
+
+
+def test_known_light_that_does_not_fit_the_cells_is_refused(device):
+    transmittance, normals, directions, light = known_light(device)
+    with pytest.raises(ValueError, match=r"light: got shape \(1, 16\), expected \[batch, 32\]"):
+        shading.shade_cells(transmittance, normals, directions, light[:, :16].contiguous())

@@ -53,11 +53,13 @@ class SphereMethod(Method):
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         bounces: How light bounces; None where it does not.
         joins_kept: Whether visibility is found of kept rows and of what moves together.
+        shades_what_is_seen: Whether known light is shaded without transfer vectors, by :meth:`light_seen`.
     """
 
     taken_if_free: Any
     why_no_shadows = ""
     joins_kept = False
+    shades_what_is_seen = False
     bounces: Bouncing | None = None
 
     @functools.cached_property
@@ -104,6 +106,10 @@ class SphereMethod(Method):
     def light_part(self, transfer: wp.array, group: Group, taken: Any) -> wp.array:
         """Shading of a group in known light."""
         return shade(transfer, taken.coefficients, most=LARGEST_COEFFICIENT)
+
+    def light_seen(self, seen: Seen, group: Group, taken: Any) -> wp.array:
+        """Shading of a group in known light."""
+        raise NotImplementedError
 
     def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """Rows of what static bodies block, of known light or of any."""
@@ -204,18 +210,22 @@ class InParts(Node):
             idle="" if flats else "spheres stand in for what casts shadows",
             keeps=False,
         )
+        is_lit = light is not None and is_shaded
+        self._is_transferred = not (is_lit and method.shades_what_is_seen)
         self._transfer = result = Node(
             f"transfer{where}",
-            method.transfer,
+            method.transfer if self._is_transferred else None,
             self._passing,
             taken,
             items=lambda: f"{words()} × {method.coefficient_count(light)} coefficients",
+            idle="" if self._is_transferred else "known light is shaded without transfer vectors",
             keeps=False,
         )
         self._shading = None
-        if light is not None and is_shaded:
+        if is_lit:
+            shade_part = method.light_part if self._is_transferred else method.light_seen
             given = self._transfer, taken
-            self._shading = result = Node(f"shading{where}", method.light_part, *given, items=words, keeps=False)
+            self._shading = result = Node(f"shading{where}", shade_part, *given, items=words, keeps=False)
         shadows = _static_shadows(method, points, light)
         kept_rows = shadows if shadows.function else None
         looked_up: Node | dict = own_shadows if own_shadows.function else {}
@@ -248,6 +258,9 @@ class InParts(Node):
 
     def light(self, call: Call, part: Group, seen: Seen, taken: Any) -> wp.array:
         """Transfer vectors of a part that sees something, or its shading."""
+        if not self._is_transferred:
+            assert self._shading is not None
+            return self._shading.run(call, seen, part, taken)
         transfer = self._transfer.run(call, seen, part, taken)
         return transfer if self._shading is None else self._shading.run(call, transfer, part, taken)
 

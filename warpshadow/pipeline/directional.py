@@ -13,7 +13,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Seen
-from warpshadow.pipeline.lighting import KnownLight, map_of
+from warpshadow.pipeline.lighting import LARGEST_COEFFICIENT, KnownLight, map_of
 from warpshadow.pipeline.node import Source
 from warpshadow.pipeline.own_shadows import Blocking, OwnLookup
 from warpshadow.pipeline.static import Rows, Static
@@ -23,6 +23,7 @@ from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
 from warpshadow.stages.ray_tracing import trace_cells
+from warpshadow.stages.shading import shade_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
@@ -42,6 +43,7 @@ class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
 
     traces_own_shadows = True
+    shades_what_is_seen = True
 
     def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(assembly.scene.visibility.directions)
@@ -135,6 +137,14 @@ class Directional(SphereMethod):
         if group.kept_rows is not None and _has_light(group.kept_rows):
             return light_cells(transfer, group.kept_rows)
         return super().light_part(transfer, group, taken)
+
+    def light_seen(self, seen: Seen, group: Group, taken: Cells) -> wp.array:
+        """Shading of a group in known light."""
+        if group.kept_rows is not None:
+            return self.light_part(self.transfer(seen, group, taken), group, taken)
+        assert seen.past_all is not None and taken.coefficients is not None
+        given = seen.past_all, group.normals, taken.directions, taken.coefficients
+        return shade_cells(*given, most=LARGEST_COEFFICIENT)
 
     def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""

@@ -26,8 +26,8 @@ _LEAST_SHARE = 0.1
 _LEAST_RADIUS = cell_radius(2048)
 """Radius [rad] down to which cells are narrow: an edge of ±0.9° at κ = 0.35, sharper than shadows of spheres are."""
 
-_CELL_COST = 0.4
-"""Nanoseconds that a cell takes."""
+_CELL_COST = 5.0
+"""Nanoseconds that a narrow cell takes."""
 
 
 class Narrow(NamedTuple):
@@ -72,20 +72,15 @@ def _put_narrow(
     first_row: int,
     worker: int,
     # in
-    passing: wp.array3d(dtype=wp.float32),
     narrow: wp.array3d(dtype=wp.float32),
-    places: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
     # out
-    result: wp.array3d(dtype=wp.float32),
+    passing: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), result.shape[1])
-    for cell in range(result.shape[2]):
-        place = places[cell]
-        if place < 0:
-            result[batch, receiver, cell] = passing[batch, receiver, cell]
-        else:
-            result[batch, receiver, cell] = narrow[batch, receiver, place]
+    """A thread owns a receiver; a pair is a narrow cell and its place."""
+    batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
+    for i in range(pairs.shape[0]):
+        passing[batch, receiver, pairs[i][0]] = narrow[batch, receiver, pairs[i][1]]
 
 
 @wp.kernel(enable_backward=False)
@@ -93,46 +88,41 @@ def _put_narrow_adjoint(
     first_row: int,
     worker: int,
     # in
-    places: wp.array(dtype=wp.int32),
-    adj_result: wp.array3d(dtype=wp.float32),
+    pairs: wp.array(dtype=wp.vec2i),
     # out
     adj_passing: wp.array3d(dtype=wp.float32),
     adj_narrow: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_result.shape[1])
-    for cell in range(adj_result.shape[2]):
-        place = places[cell]
-        if place < 0:
-            adj_passing[batch, receiver, cell] += adj_result[batch, receiver, cell]
-        else:
-            adj_narrow[batch, receiver, place] += adj_result[batch, receiver, cell]
+    """A thread owns a receiver: what a cell had before does not matter any more."""
+    batch, receiver = split_row(first_row + wp.tid(), adj_passing.shape[1])
+    for i in range(pairs.shape[0]):
+        cell = pairs[i][0]
+        place = pairs[i][1]
+        adj_narrow[batch, receiver, place] = adj_narrow[batch, receiver, place] + adj_passing[batch, receiver, cell]
+        adj_passing[batch, receiver, cell] = 0.0
 
 
 def put_narrow(passing: wp.array, narrow: wp.array, places: np.ndarray) -> wp.array:
-    """Put what passes towards narrow cells in the place of what they had.
+    """Put what passes towards narrow cells in the place of what they had, which nobody may have read.
+
+    A copy of all cells would take as long as to shade them.
 
     Args:
-        passing: Transmittance of all cells, float32 of shape [batch, receiver, direction].
+        passing: Transmittance of all cells, float32 of shape [batch, receiver, direction]; it is changed.
         narrow: That of :attr:`Narrow.directions`, float32 of shape [batch, receiver, 16].
         places: Of :class:`Narrow`.
 
     Returns:
-        Transmittance of the shape of ``passing``.
+        ``passing``.
 
     Differentiable: passing, narrow.
     """
     device, row_count = passing.device, passing.shape[0] * passing.shape[1]
-    table, cost = constant(places, wp.int32, device), _CELL_COST * passing.shape[2]
+    cells = np.flatnonzero(places >= 0)
+    pairs, cost = constant(np.stack([cells, places[cells]], axis=1), wp.vec2i, device), _CELL_COST * len(cells)
     return differentiable(
-        lambda result: launch(_put_narrow, row_count, inputs=[passing, narrow, table], outputs=[result], cost=cost),
-        lambda adj_result: launch(
-            _put_narrow_adjoint,
-            row_count,
-            inputs=[table, adj_result],
-            outputs=[passing.grad, narrow.grad],
-            cost=2 * cost,
-        ),
-        result=wp.empty(passing.shape, dtype=wp.float32, device=device),
+        lambda result: launch(_put_narrow, row_count, inputs=[narrow, pairs], outputs=[result], cost=cost),
+        lambda adj: launch(_put_narrow_adjoint, row_count, inputs=[pairs], outputs=[adj, narrow.grad], cost=cost),
+        result=passing,
         variables=[passing, narrow],
     )
