@@ -19,7 +19,7 @@ import numpy.typing as npt
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import linear_to_srgb
-from warpshadow.assets.topology import CREASE, Surface, join_faces, part_at_creases, rounds_edges
+from warpshadow.assets.topology import CREASE, Surface, creases, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
 from warpshadow.maths.plane import plane_normal
 
@@ -182,6 +182,11 @@ class Mesh:
     def rounds_edges(self) -> bool:
         """Whether it has many sharp edges whose faces share normals, and looks better :meth:`creased`."""
         return rounds_edges(self.surface, self.positions)
+
+    @functools.cached_property
+    def creases(self) -> np.ndarray:
+        """Edges across which normals jump, 2ᵏ for that opposite to corner k of each face, int32 of shape [face]."""
+        return creases(self.surface, self.positions)
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit; colors stand in it as sRGB."""

@@ -112,15 +112,41 @@ def rounds_edges(surface: Surface, positions: np.ndarray) -> bool:
     man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
     """
     corners = positions[surface.faces].astype(np.float64)
-    face, edge = np.nonzero(surface.neighbors > np.arange(len(corners))[:, None])
-    across, ends = surface.neighbors[face, edge], (edge + [[1], [2]]) % 3
-    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in surface.faces[face, ends]]
+    face, edge, across, is_parted = _inner_edges(surface)
+    is_rounded = ~is_parted & (face < across)
+    face, edge, across = face[is_rounded], edge[is_rounded], across[is_rounded]
     normals = face_normals(corners)
     cosines = np.einsum("ij,ij->i", normals[face], normals[across])
-    lengths = np.linalg.norm(np.subtract(*corners[face, ends]), axis=1) * np.logical_and(*is_shared)
+    lengths = np.linalg.norm(np.subtract(*corners[face, (edge + [[1], [2]]) % 3]), axis=1)
     sharp, bent = (lengths[cosines < np.cos(np.radians(angle))].sum() for angle in (50, 20))
     diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
     return bool(diagonal < sharp < 25 * diagonal and bent - sharp < 0.1 * sharp)
+
+
+def creases(surface: Surface, positions: np.ndarray) -> np.ndarray:
+    """Find the edges across which color jumps: their faces bend by more than a degree, and share no vertices there.
+
+    A jump of the normal by a degree changes what a face receives by up to 1.7% of the light.
+
+    Returns:
+        2ᵏ for the edge opposite to corner k of each face, int32 of shape [face].
+    """
+    face, edge, across, is_parted = _inner_edges(surface)
+    face, edge, across = face[is_parted], edge[is_parted], across[is_parted]
+    normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, across))
+    is_bent = np.einsum("ij,ij->i", *normals) < np.cos(np.radians(1.0))
+    found = np.zeros(surface.faces.shape, np.int32)
+    found[face[is_bent], edge[is_bent]] = 1
+    return found @ np.int32([1, 2, 4])
+
+
+def _inner_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Edges with a face across: face, opposite corner, face across, and whether an end is a vertex of one face only."""
+    face, edge = np.nonzero(surface.neighbors >= 0)
+    across = surface.neighbors[face, edge]
+    ends = surface.faces[face, (edge + [[1], [2]]) % 3]
+    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in ends]
+    return face, edge, across, ~np.logical_and(*is_shared)
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:

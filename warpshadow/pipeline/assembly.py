@@ -150,6 +150,12 @@ class Assembly:
         return self._array(np.concatenate(moved), wp.vec3i)
 
     @functools.cached_property
+    def creases(self) -> wp.array | None:
+        """Edges of each face that are creases, int32 of shape [face]: ``Mesh.creases``; None where there are none."""
+        found = np.concatenate([body.mesh.creases for body in self.scene.bodies])
+        return self._array(found, wp.int32) if found.any() else None
+
+    @functools.cached_property
     def is_two_sided(self) -> np.ndarray:
         """Bodies that may be seen from behind, those that are not closed, bool of shape [body]."""
         return np.array([not body.mesh.surface.is_closed for body in self.scene.bodies])

@@ -7,7 +7,6 @@ import operator
 import numpy as np
 import warp as wp
 
-from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
@@ -15,7 +14,6 @@ from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import Blocking
 from warpshadow.pipeline.reflectance import Given, Materials, SeenSurfaces
 from warpshadow.pipeline.static import Static
-from warpshadow.scene.creases import unmoved_edges
 from warpshadow.stages import film
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.photograph import Division, compose, divide_samples, over_nothing
@@ -91,7 +89,7 @@ class View(LitPoints):
             sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
         else:
             sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
-        around = assembly.edges, clip, assembly.face_bodies
+        around = assembly.edges, clip, assembly.face_bodies, assembly.creases
         silhouettes = Node("silhouettes", find_silhouettes, sides, faces, *around, items=samples, has_adjoint=False)
         if static is None:
             normals = Node("normals", vertex_normals, vertices, faces, items=corners)
@@ -201,8 +199,6 @@ class View(LitPoints):
         """Node of the samples."""
         samples_of = functools.partial(Node, "radiance", items=self._samples, keeps=False)
         if self.clip_positions.requires_grad:
-            for remark in unmoved_edges(self.assembly.scene):
-                check.warn(remark)
             moving = self.silhouettes, self.clip_positions
             return samples_of(_moving_radiance, self.receivers_node, lit, reflected, *moving)
         return samples_of(_radiance, self.receivers_node, lit, reflected)

@@ -25,6 +25,7 @@ from warpshadow.stages.screen import (
     half_size,
     lean,
     neighbor,
+    opposite,
     plane,
     relative,
     relative_adjoint,
@@ -41,14 +42,15 @@ def _measure(
     # in
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
+    entries: wp.array(dtype=wp.int32),
     seen: Seen,
     # out
-    shares: wp.array2d(dtype=wp.vec2),
+    shares: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a way of an entry: the area e beyond the line there, and how much it counts, ω."""
+    """A thread owns a way of an entry: the area e beyond the line there, how much it counts, ω, and what ends there."""
     entry, way = wp.tid()
     edge = edges[entry, way]
-    share = wp.vec2()
+    share = wp.vec3()
     if edge[0] != NOTHING:
         half = half_size(seen.width, seen.height)
         line = line_between(seen, samples[entry], way, edge)
@@ -62,7 +64,10 @@ def _measure(
             rest = 0.5 * (1.0 + m) - t
             area = 0.5 * rest * rest / m
         if wp.isfinite(line / line[way / 2]):  # else vertices are so far away that products overflow
-            share = wp.vec2(area, 1.0 / (1.0 + steepness * steepness * steepness * steepness))
+            its_edge = edges[entries[neighbor(samples[entry], way, seen.width)], opposite(way)]
+            is_end = edge[0] == its_edge[0] and edge[1] == its_edge[1]
+            counts = 1.0 / (1.0 + steepness * steepness * steepness * steepness)
+            share = wp.vec3(area, counts, wp.where(is_end, 1.0, 0.0))
     shares[entry, way] = share
 
 
@@ -118,19 +123,21 @@ def _measure_adjoint(
                     wp.atomic_add(adj_clip_positions, batch, corners[k], seen.barycentrics[at][k] * pull)
 
 
-def measure_areas(samples: wp.array, edges: wp.array, seen: Seen) -> wp.array:
+def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: Seen) -> wp.array:
     """Measure what lies beyond the lines beside samples.
 
     Args:
         samples: Of each entry, int32 of shape [entry].
         edges: Vertices of the line on each way, vec2i of shape [entry, 4].
+        entries: Of each sample, int32 of shape [sample].
         seen: What the samples see.
 
     Returns:
-        (e, ω), the area beyond each line, and how much it counts; vec2 of shape [entry, 4], zero where there is none.
+        The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
+        vec3 of shape [entry, 4], zero where there is no line.
     """
-    shares = wp.empty(edges.shape, dtype=wp.vec2, device=edges.device)
-    launch(_measure, edges.shape, inputs=[samples, edges, seen], outputs=[shares])
+    shares = wp.empty(edges.shape, dtype=wp.vec3, device=edges.device)
+    launch(_measure, edges.shape, inputs=[samples, edges, entries, seen], outputs=[shares])
     return shares
 
 

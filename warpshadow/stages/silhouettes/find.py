@@ -1,9 +1,10 @@
 """Silhouettes: where neighboring samples see different surfaces, one of which ends between them.
 
 The line between two samples is the edge where the surface of the nearer one ends before the center of the other, or
-that where two surfaces intersect. Lines that cut a row of samples are found between neighbors in the row, those that
-cut a column between neighbors in the column, and a line that leans may do both. It
-counts ω = 1 / (1 + m⁴) where it leans by m samples from one row (or column) to the next.
+that where two surfaces intersect. Where both see one surface it is a crease between them, an edge across which normals
+jump, and so does color. Lines that cut a row of samples are found between neighbors in the row, those that cut a column
+between neighbors in the column, and a line that leans may do both. It counts ω = 1 / (1 + m⁴) where it leans by m
+samples from one row (or column) to the next.
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import run_length, strip_count
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import (
+    ends_before,
     half_size,
     has_neighbor,
     neighbor,
@@ -51,8 +53,9 @@ class Silhouettes:
             of shape [entry].
         edges: Vertices a, b of the edge between it and its neighbor to the right, left, below and above, in the order
             in which the line a × b is positive on its surface; (−1, −1) where there is none, (−2, −2) where their
-            faces intersect; vec2i of shape [entry, 4].
-        shares: The area e of the sample that lies beyond each, and how much it counts, ω; vec2 of shape [entry, 4].
+            faces intersect; vec2i of shape [entry, 4]. At a crease each of the two has the vertices of its own side.
+        shares: The area e of the sample that lies beyond each, how much it counts, ω, and whether a surface ends
+            there, 1, or has a crease, 0; vec3 of shape [entry, 4].
         entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
         fragments: What each sample sees.
         faces: The rasterized faces, vec3i of shape [face].
@@ -71,12 +74,15 @@ class Silhouettes:
         return images.shape[0] // batch_count, batch_count * height * width
 
 
+_Crossing = wp.types.vector(length=6, dtype=wp.int32)
+
+
 @wp.struct
 class _Crossings:
     """What lies between neighboring samples, a list in no order."""
 
     count: wp.array(dtype=wp.int32)
-    items: wp.array(dtype=wp.vec4i)  # sample, way to its neighbor, and vertices of the edge
+    items: wp.array(dtype=_Crossing)  # sample, way to its neighbor, and vertices of the edge as each of them has it
     claims: wp.array(dtype=wp.int32)  # one item that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
 
 
@@ -97,6 +103,13 @@ def _depth(seen: Seen, sample: int):
 
 
 @wp.func
+def _corner_before(face: int, across: int, neighbors: wp.array(dtype=wp.vec3i)):
+    """Corner of a face that is opposite to the edge which it shares with another."""
+    around = neighbors[across]
+    return wp.where(around[0] == face, 0, wp.where(around[1] == face, 1, 2))
+
+
+@wp.func
 def _is_silhouette(
     face: int,
     across: int,
@@ -110,9 +123,16 @@ def _is_silhouette(
     """Whether the faces on both sides of edge ab lie on one side of it on screen, however they wind."""
     if across < 0:
         return True
-    back = neighbors[across]
-    corner = wp.where(back[0] == face, 0, wp.where(back[1] == face, 1, 2))
-    return volume * orientation(a, b, clip_positions[faces[across][corner]]) >= 0.0
+    corner = faces[across][_corner_before(face, across, neighbors)]
+    return volume * orientation(a, b, clip_positions[corner]) >= 0.0
+
+
+@wp.func
+def _is_crease(face: int, corner: int, creases: wp.array(dtype=wp.int32)):
+    """Whether the edge opposite to a face's corner is a crease."""
+    if creases:
+        return (creases[face] >> corner) & 1 == 1
+    return False
 
 
 @wp.func
@@ -123,13 +143,16 @@ def _end_of_surface(
     axis: int,
     faces: wp.array(dtype=wp.vec3i),
     neighbors: wp.array(dtype=wp.vec3i),
+    creases: wp.array(dtype=wp.int32),
     clip_positions: wp.array(dtype=wp.vec4),
 ):
     """Walk over a surface, from face to face along a row or column, until a position on screen is reached.
 
-    Returns 3 face + corner of the silhouette edge at which the surface ends before, −1 if it does not.
+    Returns 3 face + corner of the silhouette edge at which the surface ends before, −1 if it does not; and that of the
+    first crease on the way to the goal, −1 if there is none or the goal is not reached.
     """
     found = int(-1)
+    crease = int(-1)
     face = start
     step = int(0)
     while face >= 0 and face != goal and step < MOST_STEPS:
@@ -152,17 +175,21 @@ def _end_of_surface(
                         found = 3 * face + k
                     else:
                         onward = around[k]
+                        if crease < 0 and _is_crease(face, k, creases):
+                            crease = 3 * face + k
         face = wp.where(found >= 0, -1, onward)
         step += 1
-    return found
+    return found, wp.where(face == goal, crease, -1)
 
 
 @wp.func
-def _silhouette_between(seen: Seen, neighbors: wp.array(dtype=wp.vec3i), sample: int, way: int):
-    """The one silhouette edge between a sample and its neighbor on a way, as 3 face + corner, or −1.
+def _edge_between(
+    seen: Seen, neighbors: wp.array(dtype=wp.vec3i), creases: wp.array(dtype=wp.int32), sample: int, way: int
+):
+    """The one edge between a sample and its neighbor on a way, as 3 face + corner, or −1.
 
     It is where the surface of the nearer sample ends before the other's center. If that surface goes on, hidden behind
-    the other's, it is where the other's ends instead.
+    the other's, it is where the other's ends instead. If they are one surface, it is its first crease.
     """
     other = neighbor(sample, way, seen.width)
     here = seen.face_ids[sample]
@@ -173,21 +200,41 @@ def _silhouette_between(seen: Seen, neighbors: wp.array(dtype=wp.vec3i), sample:
     margin = _SNAP * (last - first)
     clip = seen.clip_positions[image_of(seen, sample)]
     found = int(-1)
+    crease = int(-1)
     for attempt in range(2):
-        if found < 0:
+        if found < 0 and crease < 0:
             from_here = is_nearer == (attempt == 0)
             start = wp.where(from_here, here, there)
             goal = wp.where(from_here, there, here)
             end = wp.where(from_here, last + margin, first - margin)
-            found = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, clip)
-    return found
+            found, crease = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, creases, clip)
+    return wp.where(found >= 0, found, crease)
 
 
 @wp.func
-def _add_crossing(seen: Seen, sample: int, way: int, edge: wp.vec2i, crossings: _Crossings):
-    """Add what lies between two samples to the list; of the crossings beside a sample one claims it, any."""
+def _edge_of(
+    face: int,
+    corner: int,
+    faces: wp.array(dtype=wp.vec3i),
+    clip_positions: wp.array(dtype=wp.vec4),
+):
+    """The edge opposite to a face's corner, in the order in which its line is positive on the face."""
+    corners = faces[face]
+    a = corners[(corner + 1) % 3]
+    b = corners[(corner + 2) % 3]
+    if orientation(clip_positions[corners[0]], clip_positions[corners[1]], clip_positions[corners[2]]) < 0.0:
+        return wp.vec2i(b, a)
+    return wp.vec2i(a, b)
+
+
+@wp.func
+def _add_crossing(seen: Seen, sample: int, way: int, edge: wp.vec2i, its_edge: wp.vec2i, crossings: _Crossings):
+    """Add what lies between a sample and its neighbor, which may have an edge of its own.
+
+    Of the crossings beside a sample one claims it, any.
+    """
     crossing = wp.atomic_add(crossings.count, 0, 1)
-    crossings.items[crossing] = wp.vec4i(sample, way, edge[0], edge[1])
+    crossings.items[crossing] = _Crossing(sample, way, edge[0], edge[1], its_edge[0], its_edge[1])
     crossings.claims[sample] = 2 * crossing
     crossings.claims[neighbor(sample, way, seen.width)] = 2 * crossing + 1
 
@@ -213,12 +260,13 @@ def _find_edges(
     # in
     seen: Seen,
     neighbors: wp.array(dtype=wp.vec3i),
+    creases: wp.array(dtype=wp.int32),
     strips: int,
     # out
     between: wp.array2d(dtype=wp.int32),
     crossings: _Crossings,
 ):
-    """A thread owns every ``strips``-th row and column that the silhouette edges of a face of an instance cut.
+    """A thread owns every ``strips``-th row and column that silhouette edges and creases of a face of an instance cut.
 
     Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings. Several edges
     pass between two samples, so which of them the samples see is kept, in ``between``.
@@ -230,13 +278,15 @@ def _find_edges(
     half = half_size(seen.width, seen.height)
     volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
     for k in range(3):
-        edge = wp.vec2i(corners[(k + 1) % 3], corners[(k + 2) % 3])
-        a = clip[edge[0]]
-        b = clip[edge[1]]
+        a = clip[corners[(k + 1) % 3]]
+        b = clip[corners[(k + 2) % 3]]
         is_before_near_plane = a[3] > a[2] or b[3] > b[2]
-        if is_before_near_plane and _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip):
-            if volume < 0.0:
-                edge = wp.vec2i(edge[1], edge[0])
+        ends = _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip)
+        if is_before_near_plane and (ends or _is_crease(face, k, creases)):
+            edge = _edge_of(face, k, seen.faces, clip)
+            edge_across = edge
+            if not ends:
+                edge_across = _edge_of(around[k], _corner_before(face, around[k], neighbors), seen.faces, clip)
             p = _end_on_screen(a, b, half)
             q = _end_on_screen(b, a, half)
             for axis in range(2):
@@ -259,10 +309,14 @@ def _find_edges(
                         if seen.face_ids[sample] != seen.face_ids[neighbor(sample, 2 * axis, seen.width)]:
                             found = between[axis, sample]
                             if found == _UNKNOWN:
-                                found = _silhouette_between(seen, neighbors, sample, 2 * axis)
+                                found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
                                 between[axis, sample] = found
                             if found == 3 * face + k:
-                                _add_crossing(seen, sample, 2 * axis, edge, crossings)
+                                line = line_between(seen, sample, 2 * axis, edge)
+                                is_own = ends_before(line, 2 * axis)
+                                own = wp.where(is_own, edge, edge_across)
+                                its = wp.where(is_own, edge_across, edge)
+                                _add_crossing(seen, sample, 2 * axis, own, its, crossings)
                         column += 1
                     row += strips
 
@@ -288,6 +342,7 @@ def _find_intersections(
     seen: Seen,
     neighbors: wp.array(dtype=wp.vec3i),
     bodies: wp.array(dtype=wp.int32),
+    creases: wp.array(dtype=wp.int32),
     run: int,
     # out
     crossings: _Crossings,
@@ -309,10 +364,10 @@ def _find_intersections(
                     if differs and has_neighbor(sample, way, seen.width, seen.height):
                         is_face = seen.face_ids[neighbor(sample, way, seen.width)] >= 0
                         if is_face and _approach(seen, sample, way):
-                            found = _silhouette_between(seen, neighbors, sample, way)
+                            found = _edge_between(seen, neighbors, creases, sample, way)
                             if found < 0:
                                 edge = wp.vec2i(INTERSECTION, INTERSECTION)
-                                _add_crossing(seen, sample, way, edge, crossings)
+                                _add_crossing(seen, sample, way, edge, edge, crossings)
 
 
 # ---------------------------------------------------------------------------------------------------- entries
@@ -343,7 +398,7 @@ def _make_entries(
             entry = wp.where(has_all, sample, crossings.claims[sample])
             samples[entry] = sample
             entries[sample] = entry
-            edges[entry, crossing[1] + end] = wp.vec2i(crossing[2], crossing[3])
+            edges[entry, crossing[1] + end] = wp.vec2i(crossing[2 + 2 * end], crossing[3 + 2 * end])
 
 
 def find_silhouettes(
@@ -352,8 +407,9 @@ def find_silhouettes(
     neighbors: wp.array,
     clip_positions: wp.array,
     bodies: wp.array | None = None,
+    creases: wp.array | None = None,
 ) -> Silhouettes:
-    """Find the edges at which the surfaces in an image end, and the lines where they intersect.
+    """Find the edges at which the surfaces in an image end, the lines where they intersect, and creases.
 
     Args:
         fragments: What each sample sees.
@@ -362,6 +418,8 @@ def find_silhouettes(
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
         bodies: Number of each face's body, int32 of shape [face]. Intersections are looked for between different ones;
             without it there are none, and where bodies intersect they have no gradient.
+        creases: Of each face the edges that are creases, 2ᵏ for that opposite to corner k, int32 of shape [face]; None
+            where there are none.
 
     Returns:
         Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. While a
@@ -374,20 +432,22 @@ def find_silhouettes(
     device, sample_count = faces.device, fragments.face_ids.size
     seen, crossings, strips = make_seen(fragments, faces, clip_positions), _Crossings(), strip_count(device)
     crossings.count = wp.zeros(1, dtype=wp.int32, device=device)
-    crossings.items = wp.empty(2 * sample_count, dtype=wp.vec4i, device=device)
+    crossings.items = wp.empty(2 * sample_count, dtype=_Crossing, device=device)
     crossings.claims = wp.empty(sample_count, dtype=wp.int32, device=device)
     between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
+    if creases is not None:
+        check.shape("creases", creases.shape, faces.shape)
     launch(
         _find_edges,
         (clip_positions.shape[0], faces.shape[0], strips),
-        inputs=[seen, neighbors, strips],
+        inputs=[seen, neighbors, creases, strips],
         outputs=[between, crossings],
     )
     if bodies is not None:
         check.shape("bodies", bodies.shape, faces.shape)
         run = run_length(device, seen.width)
         dim = -(-sample_count // run)
-        launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, run], outputs=[crossings])
+        launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, creases, run], outputs=[crossings])
     has_all = bool(device.is_capturing)
     most = crossings.items.size if has_all else int(crossings.count.numpy()[0])
     entry_count = sample_count if has_all else 2 * most
@@ -395,4 +455,4 @@ def find_silhouettes(
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
     entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
     launch(_make_entries, most, inputs=[crossings, seen.width, has_all], outputs=[samples, edges, entries])
-    return Silhouettes(samples, edges, measure_areas(samples, edges, seen), entries, fragments, faces)
+    return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)

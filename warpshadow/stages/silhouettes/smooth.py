@@ -5,10 +5,11 @@ the other's color what of itself lies beyond the line (:mod:`warpshadow.stages.s
 2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond the
 lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
 
-    c + Σ_k e_k (ω_k − ½ Σ_l max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
+    c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
 
 which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common: nothing
-if they lie beyond one line, their product if they lie beyond two upright ones.
+if they lie beyond one line, their product if they lie beyond two upright ones. Of that each loses half, π = ½; but
+where one is beyond the end of a surface and the other beyond a crease of it, the latter loses all, π = 0 and 1.
 """
 
 import functools
@@ -27,17 +28,18 @@ from warpshadow.stages.silhouettes.lines import make_seen
 
 
 @wp.func
-def _in_common(share: wp.vec2, across: wp.vec2):
-    """Half of the overlap of two areas beyond neighboring lines, as a fraction of the first."""
-    return 0.5 * wp.max(share[1] + across[1] - 1.0, 0.0) * across[0]
+def _loss(share: wp.vec3, across: wp.vec3):
+    """What an area loses to one beyond a neighboring line, as a fraction of their product."""
+    part = 0.5 * (1.0 + across[2] - share[2])
+    return part * wp.max(share[1] + across[1] - 1.0, 0.0)
 
 
 @wp.func
-def _counts(shares: wp.array(dtype=wp.vec2), way: int):
-    """How much the area on a way counts: ω, less what it has in common with those on both ways across."""
+def _counts(shares: wp.array(dtype=wp.vec3), way: int):
+    """How much the area on a way counts: ω, less what it loses to those on both ways across."""
     across = wp.where(way < 2, 2, 0)
-    counts = shares[way][1] - _in_common(shares[way], shares[across])
-    return counts - _in_common(shares[way], shares[across + 1])
+    counts = shares[way][1] - _loss(shares[way], shares[across]) * shares[across][0]
+    return counts - _loss(shares[way], shares[across + 1]) * shares[across + 1][0]
 
 
 @functools.cache
@@ -49,7 +51,7 @@ def _make_blend(dtype: type) -> wp.Kernel:
         # in
         image: wp.array2d(dtype=dtype),
         samples: wp.array(dtype=wp.int32),
-        shares: wp.array2d(dtype=wp.vec2),
+        shares: wp.array2d(dtype=wp.vec3),
         width: int,
         # out
         smoothed: wp.array2d(dtype=dtype),
@@ -80,7 +82,7 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         # in
         image: wp.array2d(dtype=dtype),
         samples: wp.array(dtype=wp.int32),
-        shares: wp.array2d(dtype=wp.vec2),
+        shares: wp.array2d(dtype=wp.vec3),
         width: int,
         entries: wp.array(dtype=wp.int32),
         edge_colors: wp.array3d(dtype=dtype),
@@ -115,8 +117,8 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                         wp.atomic_add(adj_areas, entry, way, counts * change)
                         across = wp.where(way < 2, 2, 0)
                         for k in range(2):
-                            common = _in_common(own_shares[across + k], share)
-                            wp.atomic_sub(adj_areas, entry, across + k, common * change)
+                            loss = _loss(share, own_shares[across + k]) * share[0]
+                            wp.atomic_sub(adj_areas, entry, across + k, loss * change)
 
     return blend_adjoint
 
