@@ -36,24 +36,25 @@ MOTION = 5e-2
 CAMERA = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=45, size=(97, 81))
 
 
-def setup(positions, faces, device, *, camera=CAMERA, requires_grad=False, neighbors=None, surfaces=None):
+def setup(positions, faces, device, *, camera=CAMERA, requires_grad=False, **options):
     """Everything there is from positions [vertex, 3] to silhouettes."""
     world = wp.array(np.float32(positions)[None], dtype=wp.vec3, device=device, requires_grad=requires_grad)
     clip = to_clip(world, wp.array(camera.clip_matrix()[None], dtype=wp.mat44, device=device))
-    found = found_in(clip, faces, camera.width, camera.height, neighbors=neighbors, surfaces=surfaces)
+    found = found_in(clip, faces, camera.width, camera.height, **options)
     found.world = world
     return found
 
 
-def found_in(clip, faces, width, height, *, neighbors=None, surfaces=None):
+def found_in(clip, faces, width, height, *, neighbors=None, surfaces=None, creases=None):
     faces = np.asarray(faces, np.int32).reshape(-1, 3)
     neighbors = edge_neighbors(faces) if neighbors is None else neighbors
     indices = wp.array(faces, dtype=wp.vec3i, device=clip.device)
     fragments = rasterize(clip, indices, width, height)
-    if surfaces is not None:
-        surfaces = wp.array(np.int32(surfaces), device=clip.device)
+    surfaces, creases = (
+        None if numbers is None else wp.array(np.int32(numbers), device=clip.device) for numbers in (surfaces, creases)
+    )
     neighbors = wp.array(neighbors, dtype=wp.vec3i, device=clip.device)
-    silhouettes = find_silhouettes(fragments, indices, neighbors, clip, surfaces)
+    silhouettes = find_silhouettes(fragments, indices, neighbors, clip, surfaces, creases)
     return SimpleNamespace(clip=clip, faces=indices, fragments=fragments, silhouettes=silhouettes)
 
 
@@ -74,16 +75,23 @@ def coverage(found):
     return smooth_silhouettes(image, found.silhouettes, found.clip).numpy()[0]
 
 
-def lines(found):
-    """What lies between pixels: {(pixel, side 0 or 2): the two numbers of the edge}."""
+def lines_as_seen(found):
+    """What lies between pixels: {(pixel, side 0 or 2): [the edge as the pixel has it, as its neighbor has it]}."""
     width = found.fragments.face_ids.shape[2]
     between = {}
     for pixel, sides in zip(found.silhouettes.samples.numpy(), found.silhouettes.edges.numpy().tolist(), strict=True):
         for side, edge in enumerate(sides):
             if pixel >= 0 and edge[0] != -1:
                 first = pixel - (0, 1, 0, width)[side]
-                assert between.setdefault((int(first), side & 2), edge) == edge  # both pixels know the same
+                between.setdefault((int(first), side & 2), [None, None])[side & 1] = edge
     return between
+
+
+def lines(found):
+    """What lies between pixels, of which both know the same: {(pixel, side 0 or 2): the two numbers of the edge}."""
+    between = lines_as_seen(found)
+    assert all(edge == its_edge for edge, its_edge in between.values())
+    return {place: edge for place, (edge, _) in between.items()}
 
 
 def triangle(angle=0.3):
@@ -146,18 +154,21 @@ def twin(image, found, clip, at_rest):
         area = 0.5 - t if t <= (1 - m) / 2 else max((1 + m) / 2 - t, 0) ** 2 / (2 * m)
         return area, 1 / (1 + lean**4)
 
-    for pixel, edges in zip(found.silhouettes.samples.numpy(), found.silhouettes.edges.numpy(), strict=True):
+    found_edges, entries = found.silhouettes.edges.numpy(), found.silhouettes.entries.numpy()
+    for pixel, edges in zip(found.silhouettes.samples.numpy(), found_edges, strict=True):
         if pixel >= 0:
             others = pixel + np.array([1, -1, width, -width])
-            shares = [
-                (0.0, 0.0) if edge[0] == -1 else share(pixel, other, edge, side // 2)
-                for side, (other, edge) in enumerate(zip(others, edges, strict=True))
-            ]
-            for side, (area, counts) in enumerate(shares):
+            shares = [(0.0, 0.0, False)] * 4
+            for side, (other, edge) in enumerate(zip(others, edges, strict=True)):
+                if edge[0] != -1:
+                    is_crease = (found_edges[entries[other], side ^ 1] != edge).any()
+                    shares[side] = *share(pixel, other, edge, side // 2), is_crease
+            for side, (area, counts, is_crease) in enumerate(shares):
                 if area > 0:
-                    across = shares[2:] if side < 2 else shares[:2]
-                    common = sum(max(counts + its_counts - 1, 0) * its_area for its_area, its_counts in across)
-                    smoothed[pixel] += area * (counts - common / 2) * (colors[others[side]] - colors[pixel])
+                    for its_area, its_counts, is_its_crease in shares[2:] if side < 2 else shares[:2]:
+                        part = 0.5 if is_crease == is_its_crease else float(is_crease)
+                        counts -= part * max(shares[side][1] + its_counts - 1, 0) * its_area
+                    smoothed[pixel] += area * counts * (colors[others[side]] - colors[pixel])
     return smoothed.reshape(image.shape)
 
 
@@ -170,11 +181,13 @@ TETRAHEDRON = SimpleNamespace(
 
 @pytest.fixture
 def small(device):
-    """Edges and intersections in an image of 26 × 22."""
+    """Edges, creases and intersections in an image of 26 × 22."""
     positions, faces, bodies = through_plane(TETRAHEDRON)
-    found = setup(positions, faces, device, camera=SMALL, surfaces=bodies)
-    kinds = [edge[0] >= 0 for edge in lines(found).values()]
-    assert kinds.count(True) > 50 and kinds.count(False) > 5
+    mesh = ws.Mesh(positions, faces).creased()
+    given = {"neighbors": mesh.surface.neighbors, "surfaces": bodies, "creases": mesh.creases}
+    found = setup(mesh.positions, mesh.surface.faces, device, camera=SMALL, **given)
+    kinds = [edge[0] if edge == its_edge else "crease" for edge, its_edge in lines_as_seen(found).values()]
+    assert kinds.count("crease") > 15 and kinds.count(-2) > 5 and len(kinds) > 100
     return found
 
 
@@ -201,14 +214,14 @@ def test_gradients_are_central_differences_of_the_twin(small, device, verified_t
     along = np.sum(weights * twin(other_image, small, at_rest, at_rest))  # linear in the image
     assert np.sum(values.grad.numpy()[0] * other_image) == pytest.approx(along, rel=FLOAT32)
 
-    expected = np.zeros_like(at_rest)
-    for index in np.ndindex(at_rest.shape):
-        step = np.zeros_like(at_rest)
-        step[index] = 1e-6
+    gradient, expected = clip.grad.numpy()[0].astype(np.float64), []
+    assert (np.abs(gradient).sum(axis=1) > 0).sum() >= 10  # vertices that are seen
+    directions = rng.normal(size=(16, *at_rest.shape))
+    for step in 1e-6 * directions:
         change = twin(image, small, at_rest + step, at_rest) - twin(image, small, at_rest - step, at_rest)
-        expected[index] = np.sum(weights * change) / 2e-6
-    assert (np.abs(expected).sum(axis=1) > 0).sum() == len(at_rest)
-    assert np.linalg.norm(clip.grad.numpy()[0] - expected) < FLOAT32 * np.linalg.norm(expected)
+        expected.append(np.sum(weights * change) / 2e-6)
+    along = np.sum(gradient * directions, axis=(1, 2))
+    assert np.linalg.norm(along - expected) < FLOAT32 * np.linalg.norm(expected)
 
 
 # --------------------------------------------------------------------------------------------------- what is found
@@ -354,6 +367,39 @@ def test_small_faces_are_walked_over(device):
     row_changes = np.sum(mask(fine)[0][:, 1:] != mask(fine)[0][:, :-1])
     assert sum(side == 0 for _, side in lines(fine)) == row_changes
     assert np.abs(coverage(fine) - coverage(coarse)).max() < 0.05
+
+
+ROOF = ws.Mesh(
+    np.array([[-1, -0.7, 0], [-1, 0.7, 0], [0.1, -0.9, 0.6], [0.2, 0.8, 0.5], [1, -0.7, 0], [1, 0.7, 0]]),
+    np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]),
+)
+"""Two slopes, whose ridge is upright in the image."""
+
+
+@pytest.mark.parametrize("turn", [1, -1], ids=["from above", "from below"])
+def test_at_a_crease_each_pixel_has_the_edge_of_its_side(turn, device):
+    mesh = ROOF.creased()
+    flip = [turn, 1, turn]
+    given = {"neighbors": mesh.surface.neighbors, "creases": mesh.creases}
+    found = setup(mesh.positions * flip, mesh.faces, device, **given)
+    outline = lines(setup(ROOF.positions * flip, ROOF.faces, device))
+    creases = {place: edges for place, edges in lines_as_seen(found).items() if edges[0] != edges[1]}
+    assert lines_as_seen(found).keys() - creases.keys() == outline.keys()
+    slope = np.append([1, 1, 2, 2], 0)[found.fragments.face_ids.numpy()[0]]
+    differs = {0: slope[:, 1:] * slope[:, :-1] == 2, 2: slope[1:] * slope[:-1] == 2}
+    between = {(row * CAMERA.width + column, side) for side in differs for row, column in np.argwhere(differs[side])}
+    assert creases.keys() == between and len(between) > 30
+    for (pixel, side), edges in creases.items():
+        for place, edge in zip((pixel, pixel + (1 if side == 0 else CAMERA.width)), edges, strict=True):
+            assert np.isin(edge, mesh.faces[2 * slope.ravel()[place] - 2 : 2 * slope.ravel()[place]]).all()
+            assert sorted(mesh.origins[edge]) == [2, 3]
+
+
+def test_where_a_crease_ends_a_pixel_has_the_coverage_that_it_has_without(device):
+    mesh = ROOF.creased()
+    given = {"neighbors": mesh.surface.neighbors, "creases": mesh.creases}
+    found = setup(mesh.positions, mesh.faces, device, **given)
+    np.testing.assert_array_equal(coverage(found), coverage(setup(ROOF.positions, ROOF.faces, device)))
 
 
 BALL, GROUND = 2, 3
@@ -720,7 +766,8 @@ def test_whatever_is_seen_values_and_gradients_are_finite_and_means(device, seed
     rng = np.random.default_rng(seed)
     clip, faces = hostile_triangles(rng, 24, size)
     clip = wp.array(clip[None], dtype=wp.vec4, device=device, requires_grad=True)
-    found = found_in(clip, faces, *size, surfaces=rng.integers(4, size=len(faces)))
+    given = {"surfaces": rng.integers(4, size=len(faces)), "creases": rng.integers(8, size=len(faces))}
+    found = found_in(clip, faces, *size, **given)
     image = rng.normal(size=(1, size[1], size[0])).astype(np.float32)
     values = wp.array(image, device=device, requires_grad=True)
     with wp.Tape() as tape:
@@ -731,7 +778,7 @@ def test_whatever_is_seen_values_and_gradients_are_finite_and_means(device, seed
     assert (smoothed.numpy()[0] >= np.nanmin(near, axis=0) - 1e-5).all()
     assert (smoothed.numpy()[0] <= np.nanmax(near, axis=0) + 1e-5).all()
     assert np.isfinite(clip.grad.numpy()).all() and np.isfinite(values.grad.numpy()).all()
-    for pixel, side in lines(found):  # between neighbors
+    for pixel, side in lines_as_seen(found):  # between neighbors
         assert pixel % size[0] < size[0] - 1 if side == 0 else pixel // size[0] < size[1] - 1
 
 
@@ -760,5 +807,8 @@ def test_arrays_that_do_not_belong_together_are_refused(small, device):
         find_silhouettes(small.fragments, faces, neighbors[:3], small.clip)
     with pytest.raises(ValueError, match="^clip_positions: got shape"):
         find_silhouettes(small.fragments, faces, neighbors, wp.zeros((2, 8), dtype=wp.vec4, device=device))
+    wrong = wp.zeros(3, dtype=int, device=device)
     with pytest.raises(ValueError, match="^bodies: got shape"):
-        find_silhouettes(small.fragments, faces, neighbors, small.clip, wp.zeros(3, dtype=int, device=device))
+        find_silhouettes(small.fragments, faces, neighbors, small.clip, wrong)
+    with pytest.raises(ValueError, match="^creases: got shape"):
+        find_silhouettes(small.fragments, faces, neighbors, small.clip, None, wrong)

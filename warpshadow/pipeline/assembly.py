@@ -151,8 +151,14 @@ class Assembly:
 
     @functools.cached_property
     def creases(self) -> wp.array | None:
-        """Edges of each face that are creases, int32 of shape [face]: ``Mesh.creases``; None where there are none."""
-        found = np.concatenate([body.mesh.creases for body in self.scene.bodies])
+        """Creases of bodies that are shaded by pixel, int32 of shape [face]: ``Mesh.creases``; None where none has any.
+
+        On bodies that are shaded at vertices the mean slopes of :mod:`warpshadow.stages.slopes` go across creases.
+        """
+        is_by_pixel = [body.receivers == "pixel" for body in self.scene.bodies]
+        found = np.zeros(self.first_face[-1], np.int32)
+        for body in np.flatnonzero(is_by_pixel):
+            found[self.first_face[body] : self.first_face[body + 1]] = self.scene.bodies[body].mesh.creases
         return self._array(found, wp.int32) if found.any() else None
 
     @functools.cached_property

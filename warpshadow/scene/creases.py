@@ -12,13 +12,3 @@ def rounded_edges(scene: Scene) -> list[str]:
         for number, body in enumerate(scene.bodies)
         if body.mesh.rounds_edges
     ]
-
-
-def unmoved_edges(scene: Scene) -> list[str]:
-    """Say which bodies are creased and shaded by pixel: pixels do not notice that creases move, where color jumps."""
-    return [
-        f"{body.called!r} is creased and shaded by pixel, so gradients to geometry leave out that its sharp "
-        'edges move; receivers = "vertex" has them'
-        for body in scene.bodies
-        if body.mesh.origins is not None and body.receivers == "pixel"
-    ]
