@@ -137,7 +137,7 @@ def creases(surface: Surface, positions: np.ndarray) -> np.ndarray:
     is_bent = np.einsum("ij,ij->i", *normals) < np.cos(np.radians(1.0))
     found = np.zeros(surface.faces.shape, np.int32)
     found[face[is_bent], edge[is_bent]] = 1
-    return found @ np.int32([1, 2, 4])
+    return found @ np.array([1, 2, 4], np.int32)
 
 
 def _inner_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Sharp edges: which bodies have normals that round them, and of which gradients leave out that they move."""
+"""Sharp edges: which bodies have normals that round them."""
 
 from warpshadow.assets.topology import CREASE
 from warpshadow.scene.scene import Scene
