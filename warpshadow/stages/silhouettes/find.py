@@ -280,13 +280,13 @@ def _find_edges(
     for k in range(3):
         a = clip[corners[(k + 1) % 3]]
         b = clip[corners[(k + 2) % 3]]
-        is_before_near_plane = a[3] > a[2] or b[3] > b[2]
-        ends = _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip)
-        if is_before_near_plane and (ends or _is_crease(face, k, creases)):
+        is_crease = bool(False)
+        is_line = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
+        if is_line and not _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip):
+            is_crease = _is_crease(face, k, creases)
+            is_line = is_crease
+        if is_line:
             edge = _edge_of(face, k, seen.faces, clip)
-            edge_across = edge
-            if not ends:
-                edge_across = _edge_of(around[k], _corner_before(face, around[k], neighbors), seen.faces, clip)
             p = _end_on_screen(a, b, half)
             q = _end_on_screen(b, a, half)
             for axis in range(2):
@@ -312,11 +312,15 @@ def _find_edges(
                                 found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
                                 between[axis, sample] = found
                             if found == 3 * face + k:
-                                line = line_between(seen, sample, 2 * axis, edge)
-                                is_own = ends_before(line, 2 * axis)
-                                own = wp.where(is_own, edge, edge_across)
-                                its = wp.where(is_own, edge_across, edge)
-                                _add_crossing(seen, sample, 2 * axis, own, its, crossings)
+                                here = edge
+                                there = edge
+                                if is_crease:
+                                    across = _corner_before(face, around[k], neighbors)
+                                    if ends_before(line_between(seen, sample, 2 * axis, edge), 2 * axis):
+                                        there = _edge_of(around[k], across, seen.faces, clip)
+                                    else:
+                                        here = _edge_of(around[k], across, seen.faces, clip)
+                                _add_crossing(seen, sample, 2 * axis, here, there, crossings)
                         column += 1
                     row += strips
 
