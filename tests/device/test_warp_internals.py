@@ -1,7 +1,10 @@
 """What Warp does not call public works as it did, all that we use of it, and no other file uses any."""
 
+import os
 import re
+import tempfile
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,7 @@ import warp as wp
 from packaging.requirements import Requirement
 
 from warpshadow.device import warp_internals
+from warpshadow.device.workers import run_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -67,6 +71,25 @@ def modules_list_their_kernels():
     assert any("_count_up" in str(key) for key in module.kernels)
 
 
+def a_module_that_two_processes_need_is_compiled_once():
+    with tempfile.TemporaryDirectory() as folder:
+        ended = [*run_tasks(_compiles, [folder, folder], workers=2)]
+        assert sorted(result for _, result, _ in ended) == [[False], [True]], ended
+        assert not [*Path(folder).glob("*.lock")]
+
+
+def _compiles(folder):
+    """Launch a kernel that is not in the cache, as another process does; whether its module was compiled here."""
+    compile_or_wait, was_compiled = wp.Module._compile, []
+    wp.Module._compile = lambda *args, **options: was_compiled.append(compile_or_wait(*args, **options))
+    wp.config.kernel_cache_dir = folder
+    Path(folder, str(os.getpid())).touch()
+    while len([*Path(folder).glob("[0-9]*")]) < 2:
+        time.sleep(0.01)
+    wp.launch(_count_up, dim=1, inputs=[0], outputs=[wp.zeros(1, dtype=wp.int32, device="cpu")], device="cpu")
+    return was_compiled
+
+
 def check(works):
     """Run a check; that it fails is a fault of the Warp that is installed."""
     try:
@@ -84,6 +107,7 @@ def check(works):
         a_dtype_says_of_what_its_items_are,
         views_know_that_they_are_views,
         modules_list_their_kernels,
+        pytest.param(a_module_that_two_processes_need_is_compiled_once, marks=pytest.mark.slow),
     ],
 )
 def test_the_installed_warp_works_as_those_before(works):

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -21,6 +22,31 @@ class Unpicklable(Exception):
         super().__init__(first)
 
 
+def refuse(*_):
+    raise ValueError("not again")
+
+
+class Unreadable:
+    """Can be pickled, but not unpickled."""
+
+    def __reduce__(self):
+        return refuse, ()
+
+
+class Mute(Exception):
+    def __str__(self):
+        raise ValueError("no words")
+
+
+ODD = {
+    "return a lock": "the result cannot be pickled (TypeError: cannot pickle '_thread.lock' object)",
+    "return what cannot be read": "the result cannot be unpickled (ValueError: not again)",
+    "raise what cannot be sent": "test_workers.Unpicklable: so",
+    "raise what says nothing": "test_workers.Mute: <exception str() failed>",
+}
+"""Tasks, and what their errors say."""
+
+
 def play(task):
     """Do as the task says."""
     what, value = task
@@ -29,9 +55,15 @@ def play(task):
     if what == "raise":
         raise ValueError(f"value: got {value}")
     if what == "raise what cannot be sent":
-        raise Unpicklable(value, 1)
-    if what == "return what cannot be sent":
-        return lambda: value
+        raise Unpicklable("so", 1)
+    if what == "raise what says nothing":
+        raise Mute
+    if what == "return a lock":
+        return threading.Lock()
+    if what == "return what cannot be read":
+        return Unreadable()
+    if what == "exit":
+        sys.exit(value)
     if what == "die once":
         if not Path(value).exists():
             Path(value).touch()
@@ -43,10 +75,12 @@ def play(task):
 def test_tasks_are_shared_out_and_failures_cost_only_themselves(tmp_path):
     others = [
         ("raise", 7),
-        ("raise what cannot be sent", "so"),
-        ("return what cannot be sent", 1),
         ("die once", str(tmp_path / "died")),
         ("die", 0),
+        ("exit", 3),
+        *((what, 0) for what in ODD),
+        (lock := threading.Lock(), 0),
+        (unreadable := Unreadable(), 0),
     ]
     tasks = [*(("square", k) for k in range(6)), *others, *(("square", k) for k in range(6, 12))]
     ended = {task: (result, error) for task, result, error in run_tasks(play, tasks, workers=2, threads=3)}
@@ -58,9 +92,11 @@ def test_tasks_are_shared_out_and_failures_cost_only_themselves(tmp_path):
     errors = {what: error for (what, _), (_, error) in ended.items()}
     assert errors["square"] is None
     assert isinstance(errors["raise"], ValueError) and str(errors["raise"]) == "value: got 7"
-    assert "Unpicklable: so" in str(errors["raise what cannot be sent"])
-    assert "pickle" in str(errors["return what cannot be sent"])
-    assert ended[others[3]] == ("lived", None)
+    assert {what: str(errors[what]) for what in ODD} == ODD
+    assert str(errors["exit"]) == "SystemExit: 3"
+    assert str(errors[lock]) == "the task cannot be pickled (TypeError: cannot pickle '_thread.lock' object)"
+    assert isinstance(errors[unreadable], ValueError) and str(errors[unreadable]) == "not again"
+    assert ended[others[1]] == ("lived", None)
     assert isinstance(errors["die"], WorkerDied)
     assert str(errors["die"]) == "its process ended by SIGKILL, 2 times"
 

@@ -6,6 +6,7 @@ have passed it.
 
 import contextlib
 import copy
+import os
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -78,3 +79,26 @@ def is_view(array: wp.array) -> bool:
 def kernel_modules() -> dict[str, wp.Module]:
     """Warp's modules by the names of the Python modules whose kernels they hold."""
     return wp._src.context.user_modules
+
+
+_compile = wp.Module._compile
+
+
+def compile_in_turn() -> None:
+    """From now on, let one process compile what several need: others wait, and find it in Warp's cache.
+
+    Should it be killed, its lock ends with it, and the next compiles.
+    """
+    wp.Module._compile = _compile_in_turn
+
+
+def _compile_in_turn(module: wp.Module, device: Any, folder: str, *rest: Any, **options: Any) -> bool:
+    from filelock import FileLock
+
+    lock = FileLock(f"{folder}.lock")
+    with lock:
+        try:
+            return _compile(module, device, folder, *rest, **options)
+        finally:
+            with contextlib.suppress(OSError):  # of Windows, where filelock removes it
+                os.unlink(lock.lock_file)

@@ -12,17 +12,20 @@ import os
 import pickle
 import signal
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from multiprocessing.connection import Connection, wait
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.progress import show_bars
 from warpshadow.device.startup import start_quietly
+from warpshadow.device.warp_internals import compile_in_turn
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Dumps: TypeAlias = Callable[[Any], bytes]
 
 
 class WorkerDied(RuntimeError):
@@ -51,11 +54,11 @@ class _Worker(Generic[Task, Result]):
         self.has: tuple[Task, int] | None = None
         self.has_started = False
 
-    def begin(self, task: Task, attempt: int) -> None:
+    def begin(self, task: Task, packed: bytes, attempt: int) -> None:
         """Let it do a task; should it be dead, that is noticed as if it died of the task."""
         self.has = task, attempt
         with contextlib.suppress(OSError):
-            self.connection.send(task)
+            self.connection.send_bytes(packed)
 
     def end(self) -> int | None:
         """End the process, and return its exit status."""
@@ -76,7 +79,8 @@ def run_tasks(
     """Do tasks in worker processes, which end with this one, however it ends.
 
     Args:
-        function: What does a task; sent once to each process, so it can be pickled, as tasks and results can.
+        function: What does a task; sent once to each process, so it can be pickled. A task fails where it or its
+            result cannot be.
         tasks: Taken one by one as processes are free.
         workers: Number of processes.
         threads: Threads that kernels and NumPy have in each process; by default an even share of all.
@@ -95,8 +99,14 @@ def run_tasks(
     try:
         while True:
             while len(busy) < workers and (following := again.popleft() if again else next(untried, None)):
+                task, attempt = following
+                try:
+                    packed = pack(task)
+                except PackError as failure:
+                    yield Ended(task, None, failure)
+                    continue
                 worker = idle.pop() if idle else _Worker(function, threads)
-                worker.begin(*following)
+                worker.begin(task, packed, attempt)
                 busy[worker.connection] = worker
             if not busy:
                 return
@@ -105,12 +115,13 @@ def run_tasks(
                 assert worker.has is not None
                 task, attempt = worker.has
                 try:
-                    result, error = worker.connection.recv()
+                    packed = worker.connection.recv_bytes()
                     if not worker.has_started:  # the first that it says
                         worker.has_started = True
                         busy[connection] = worker
                         continue
                     idle.append(worker)
+                    result, error = unpack(packed)
                 except (EOFError, OSError):
                     status = worker.end()
                     if not worker.has_started and status is not None and status >= 0:
@@ -134,6 +145,60 @@ def _in_words(status: int | None) -> str:
     return f"with exit status {status}"
 
 
+# ------------------------------------------------------------------------------------------------ to and fro
+
+
+class PackError(RuntimeError):
+    """Something cannot be sent from one process to another."""
+
+
+def pack(task: object, dumps: Dumps = pickle.dumps) -> bytes:
+    """Pickle a task, or raise PackError."""
+    try:
+        return dumps(task)
+    except Exception as error:
+        raise PackError(f"the task cannot be pickled ({_said(error)})") from error
+
+
+def answer(
+    function: Callable[[Any], Any],
+    packed: bytes,
+    dumps: Dumps = pickle.dumps,
+    caught: type[BaseException] = BaseException,
+) -> bytes:
+    """Do a task that was packed, and pickle its result and its error; that of sys.exit(), too, is only the task's."""
+    try:
+        result = function(pickle.loads(packed))
+    except caught as error:
+        return pickle.dumps((None, _sendable(error)))
+    try:
+        return dumps((result, None))
+    except caught as error:
+        return pickle.dumps((None, PackError(f"the result cannot be pickled ({_said(error)})")))
+
+
+def unpack(answered: bytes) -> tuple[Any, Exception | None]:
+    """The result and the error of a task that was answered."""
+    try:
+        return pickle.loads(answered)
+    except Exception as error:
+        return None, PackError(f"the result cannot be unpickled ({_said(error)})")
+
+
+def _sendable(error: BaseException) -> Exception:
+    """An error, or what it says, where it cannot be pickled or would end the process that gets it."""
+    try:
+        str(pickle.loads(pickle.dumps(error)))
+    except Exception:
+        return RuntimeError(_said(error))
+    return error if isinstance(error, Exception) else RuntimeError(_said(error))
+
+
+def _said(error: BaseException) -> str:
+    """What an error is and says, on a line."""
+    return " ".join("".join(traceback.format_exception_only(error)).split())
+
+
 # ---------------------------------------------------------------------------------------------- in the process
 
 
@@ -142,16 +207,13 @@ def _serve(connection: Connection, function: Callable[[Task], Result], threads: 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is for the parent, which ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
     set_up(threads)
-    connection.send((None, None))
+    connection.send_bytes(b"")
     while True:
         try:
-            task = connection.recv()
+            packed = connection.recv_bytes()
         except EOFError:
             return
-        try:
-            connection.send((function(task), None))
-        except Exception as error:  # the function's, or of what cannot be pickled
-            connection.send((None, _sendable(error)))
+        connection.send_bytes(answer(function, packed))
 
 
 def set_up(threads: int) -> None:
@@ -161,18 +223,10 @@ def set_up(threads: int) -> None:
 
     tqdm.set_lock(threading.RLock())  # in place of a semaphore, which outlives a process that is killed
     start_quietly()
+    compile_in_turn()
     show_bars(False)
     set_thread_count(threads)
     threadpool_limits(limits=threads)
-
-
-def _sendable(error: Exception) -> Exception:
-    """An error, or what it says, where it cannot be pickled."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
 
 
 def _end_with_parent() -> None:
