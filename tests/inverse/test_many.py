@@ -1,11 +1,17 @@
 """Many fits: each ends as it would alone, and what is wrong with one costs only that one."""
 
+import contextlib
 import csv
+import dataclasses
 import functools
+import importlib.util
+import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 
 import numpy as np
@@ -15,6 +21,7 @@ from typer.testing import CliRunner
 import warpshadow as ws
 from warpshadow import inverse
 from warpshadow.cli import app
+from warpshadow.device.cluster import run_on_ray
 from warpshadow.inverse import checkpoint, many
 
 ITERATIONS = 6
@@ -186,26 +193,6 @@ def test_a_damaged_record_is_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_on_a_ray_cluster_fits_end_as_they_would_alone(photos, alone, tmp_path, monkeypatch):
-    """A real one, of this machine, with two workers, one of which is killed."""
-    ray = pytest.importorskip("ray", reason="Ray is not installed (the extra 'ray')")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # where workers find this file
-    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
-    try:
-        files = [photos / name / "fit.toml" for name in ("a", "b", "NaN")]
-        fits = (each for each in [*files, killed(photos, tmp_path / "mark")])
-        options = {"ray": "auto", "checkpoint_seconds": 0.0, "progress": False}
-        endings = inverse.fit_many(fits, tmp_path / "results", **options)
-    finally:
-        ray.shutdown()
-    expected = {"000000": "finished", "000001": "finished", "000002": "failed", "000003": "finished"}
-    assert {each.name: each.reason for each in endings} == expected
-    assert BROKEN["NaN"][1] in endings[2].error and (tmp_path / "mark").exists()
-    for number, name in ((0, "a"), (1, "b"), (3, "a")):
-        assert_same_values(tmp_path / "results" / f"{number:06}", alone[name])
-
-
-@pytest.mark.slow
 def test_the_command_goes_on_after_a_kill_and_says_how_many_ended_how(photos, alone, tmp_path):
     (photos / "some.txt").write_text("a/fit.toml\nsize/fit.toml\n")
     arguments = ["fit", str(photos / "some.txt"), "-o", str(tmp_path / "results"), "--checkpoint-seconds", "0"]
@@ -221,6 +208,103 @@ def test_the_command_goes_on_after_a_kill_and_says_how_many_ended_how(photos, al
     assert result.stdout.strip() == f"{tmp_path / 'results' / 'table.csv'}: 1 finished, 1 failed"
     assert f"error: size failed: {photos / BROKEN['size'][1]}" in result.stderr
     assert_same_values(tmp_path / "results" / "a", alone["a"])
+
+
+# ---------------------------------------------------------------------------------------------- on a Ray cluster
+
+
+class KillingItsNode(inverse.QuasiNewton):
+    """Kills a node of a cluster that is to die, at its fourth step there, and counts steps."""
+
+    def __init__(self, counts, parameters, lr):
+        super().__init__(parameters, lr=lr)
+        self.counts, self.steps = counts, 0
+
+    def step(self, closure=None):
+        self.steps += 1
+        with self.counts.open("a") as file:
+            file.write("x")
+        if self.steps == 4 and "TO_DIE" in os.environ:
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(TIME)  # until it is known that the node is no more
+        return super().step(closure)
+
+
+def start_node(*arguments, **environment):
+    """Start a node of one core."""
+    command = [sys.executable, "-c", "from ray.scripts.scripts import main; main()", "start", "--block", "--num-cpus=1"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    node = subprocess.Popen([*command, "--disable-usage-stats", *arguments], env=os.environ | environment, **pipes)
+    lines = [*itertools.takewhile(lambda line: "Ray runtime started" not in line, node.stdout)]
+    assert node.poll() is None, lines
+    return node
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a real one, on this machine, and its head; it has two nodes, and asks for a token."""
+    if importlib.util.find_spec("ray") is None:
+        pytest.skip("Ray is not installed (the extra 'ray')")
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as nodes:
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # where workers find this file
+        patch.setenv("RAY_AUTH_MODE", "token")
+        patch.setenv("RAY_AUTH_TOKEN", "of-tests-alone")
+        folder = nodes.enter_context(tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True))
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        head = start_node("--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={folder}")
+        nodes.callback(head.wait)
+        nodes.callback(head.terminate)
+        other = start_node(f"--address=127.0.0.1:{port}", TO_DIE="yes")
+        nodes.callback(other.wait)
+        nodes.callback(other.terminate)
+        yield f"127.0.0.1:{port}", head
+
+
+@pytest.mark.slow
+def test_on_a_ray_cluster_fits_end_as_they_would_alone_though_a_worker_and_a_node_die(cluster, photos, alone, tmp_path):
+    counts = tmp_path / "counts"
+    fit = killed(photos, tmp_path / "mark")
+    dying = dataclasses.replace(fit, optimizer=functools.partial(KillingItsNode, counts))
+    fits = {"0": dying, "1": dying, "worker": fit, "b": photos / "b" / "fit.toml", "NaN": photos / "NaN" / "fit.toml"}
+    options = {"ray": cluster[0], "checkpoint_seconds": 0.0, "progress": False}
+    endings = inverse.fit_many(fits, tmp_path / "results", **options)
+    assert {each.name: each.reason for each in endings} == dict.fromkeys(fits, "finished") | {"NaN": "failed"}
+    assert BROKEN["NaN"][1] in endings[-1].error and (tmp_path / "mark").exists()
+    assert counts.stat().st_size == 2 * ITERATIONS + 1  # nothing was done twice but the step that was cut off
+    for folder, name in (("0", "a"), ("1", "a"), ("worker", "a"), ("b", "b")):
+        assert_same_values(tmp_path / "results" / folder, alone[name])
+
+
+@pytest.mark.slow
+def test_who_has_no_token_for_a_ray_cluster_is_told_so(cluster, photos, tmp_path):
+    program = [sys.executable, "-c", "from warpshadow.cli import app; app()"]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    environment["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # in place of 20, a second each
+    command = [*program, "fit", photos, "-o", tmp_path / "results", "--ray", cluster[0]]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIME)
+    assert result.returncode == 1
+    said = result.stderr.strip().splitlines()[-1]
+    assert said.startswith(f"error: ray: got '{cluster[0]}'") and "set RAY_AUTH_MODE=token" in said
+
+
+@pytest.mark.slow
+def test_the_death_of_the_head_of_a_ray_cluster_is_an_error(cluster, monkeypatch):
+    """It comes last, as the cluster dies."""
+    monkeypatch.setattr("warpshadow.device.cluster._PATIENCE", 1.0)
+    ended = run_on_ray(time.sleep, [0.0, TIME], cluster[0])
+    assert next(ended).task == 0.0
+    cluster[1].kill()
+    host, port = cluster[0].split(":")
+    with contextlib.suppress(OSError):
+        while True:
+            socket.create_connection((host, int(port)), timeout=TIME).close()
+            time.sleep(0.1)
+    with pytest.raises(ConnectionError, match="ray: the head of the cluster at .* has died"):
+        next(ended)
+
+
+# ---------------------------------------------------------------------------------------------- of the folder
 
 
 def test_others_do_not_write_into_the_folder_meanwhile(photos, tmp_path):

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import itertools
 import logging
+import socket
+import time
 from collections.abc import Callable, Generator, Iterable
 from typing import Any, TypeVar
 
 from warpshadow import check
-from warpshadow.device.workers import Ended, WorkerDied, set_up
+from warpshadow.device.workers import Ended, PackError, WorkerDied, answer, pack, set_up, unpack
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+_NO_TOKEN = "it asks for a token: set RAY_AUTH_MODE=token here, too, and have the same ~/.ray/auth_token as there"
+_PATIENCE = 20.0
+"""How long the head of a cluster may be away [s]; after 60 Ray ends this process, at once."""
 
 
 def run_on_ray(
@@ -38,7 +44,8 @@ def run_on_ray(
 
     Raises:
         ImportError: where Ray is not installed.
-        ConnectionError: where there is no such cluster, or this machine's part of it dies.
+        ConnectionError: where there is no such cluster, where it wants a token that this process does not give, or once
+            its head or this machine's part of it has died.
     """
     try:
         import ray
@@ -48,26 +55,32 @@ def run_on_ray(
     if is_ours:
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise ConnectionError(f"ray: got {address!r}, where no cluster is reached ({error})") from error
+        except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+            reason = _NO_TOKEN if "InvalidAuthToken" in str(error.__cause__) else error
+            raise ConnectionError(f"ray: got {address!r}, where no cluster is reached ({reason})") from error
+    head = ray.get_runtime_context().gcs_address
     remote: Any = ray.remote(num_cpus=1, num_gpus=int(is_on_gpu), max_retries=attempts - 1)(_alone)
     remaining, pending = iter(tasks), dict[Any, Task]()
     try:
         while True:
+            _await(head)
             # some more than there are cores for, so that none waits for us
             most = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
             for task in itertools.islice(remaining, max(0, most - len(pending))):
-                pending[remote.remote(function, task)] = task
+                try:
+                    pending[remote.remote(function, pack(task, ray.cloudpickle.dumps))] = task
+                except PackError as error:
+                    yield Ended(task, None, error)
             if not pending:
                 return
-            for reference in ray.wait([*pending])[0]:
+            for reference in ray.wait([*pending], timeout=_PATIENCE / 2)[0]:
                 task = pending.pop(reference)
                 try:
-                    ended = Ended(task, ray.get(reference), None)
+                    ended = Ended(task, *unpack(ray.get(reference)))
                 except ray.exceptions.LocalRayletDiedError as error:
                     raise ConnectionError("ray: this machine's node has died") from error
                 except ray.exceptions.RayTaskError as error:
-                    ended = Ended(task, None, error)
+                    ended = Ended(task, None, RuntimeError(str(error).splitlines()[-1]))
                 except ray.exceptions.RayError as error:
                     ended = Ended(task, None, WorkerDied(f"{str(error).splitlines()[0]} ({attempts} times)"))
                 yield ended
@@ -76,7 +89,23 @@ def run_on_ray(
             ray.shutdown()
 
 
-def _alone(function: Callable[[Task], Result], task: Task) -> Result:
+def _await(head: str) -> None:
+    """Return once a cluster's head, "HOST:PORT", can be reached."""
+    host, _, port = head.rpartition(":")
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE).close()
+            return
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise ConnectionError(f"ray: the head of the cluster at {head} has died") from error
+            time.sleep(1)
+
+
+def _alone(function: Callable[[Any], Any], packed: bytes) -> bytes:
     """Do a task on one core."""
+    import ray
+
     set_up(1)
-    return function(task)
+    return answer(function, packed, ray.cloudpickle.dumps, Exception)  # what else is raised ends tasks for Ray
