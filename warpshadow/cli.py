@@ -515,9 +515,6 @@ def _fit_many(where: Path, output: Path, view: bool, is_quiet: bool, **options: 
     with _clear_errors():
         if view:
             raise ValueError(f"--view: got many fits, {where}; expected one, which a page can show")
-        if output.exists() and not output.is_dir():
-            raise NotADirectoryError(f"{output}: got a file, expected a folder")
-        files.check_folder(output if output.is_dir() else output.parent)
         try:
             endings = fit_many(find_fits(where), output, **options)
         except KeyboardInterrupt as error:

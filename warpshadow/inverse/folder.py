@@ -8,11 +8,16 @@ CHECKPOINT = "checkpoint"
 PREVIEW = "preview.png"
 
 
-def check_folder(path: Path) -> None:
-    """Raise OSError unless a folder is new, or that of a fit."""
+def check_writable(path: Path) -> None:
+    """Raise OSError unless a folder can be written into, or made."""
     if path.exists() and not path.is_dir():
         raise NotADirectoryError(f"{path}: got a file, expected a folder")
     files.check_folder(path if path.is_dir() else path.parent)
+
+
+def check_folder(path: Path) -> None:
+    """Raise OSError unless a folder is new, or that of a fit."""
+    check_writable(path)
     if not path.is_dir() or has_checkpoint(path):
         return
     others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != PREVIEW)

@@ -36,7 +36,7 @@ from warpshadow.device.workers import run_tasks
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.descent import GOOD_ENDINGS, FitWarning, default_optimizer
 from warpshadow.inverse.fit_file import Fit, load_fit
-from warpshadow.inverse.folder import CHECKPOINT, check_folder
+from warpshadow.inverse.folder import CHECKPOINT, check_folder, check_writable
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import Report
 from warpshadow.inverse.schedule import Stage, stages_for
@@ -129,6 +129,7 @@ def fit_many(
     is_on_gpu = check.device("device", device).is_cuda
     check.nonnegative("checkpoint_seconds", checkpoint_seconds)
     folder = Path(folder).absolute()
+    check_writable(folder)
     if isinstance(fits, Mapping):
         _check_names(fits)
     named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", each) for k, each in enumerate(fits))
@@ -156,7 +157,11 @@ def fit_many(
                     each = Fit(each, stages_for(stages, each), optimizer, tolerance, seed)
                 elif not isinstance(each, Fit):
                     each = Path(each).absolute()
-                job = _Job(name, folder, each, _digest(each), device, checkpoint_seconds)
+                try:
+                    job = _Job(name, folder, each, _digest(each), device, checkpoint_seconds)
+                except Exception as error:  # such as that of an optimizer that cannot be pickled
+                    note(_failed(name, error))
+                    continue
                 ending = job.recorded()
                 if ending is None:
                     yield job
@@ -243,17 +248,22 @@ def _do(job: _Job) -> Ending:
         warnings.simplefilter("default")
         try:
             ending = _ended(job)
-        except (ValueError, OSError, ImportError) as error:  # mistakes in what was given
-            ending = Ending(job.name, "failed", str(error) if error.args else type(error).__name__)
         except Exception as error:
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            message = f"{type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
-            ending = Ending(job.name, "failed", message)
+            ending = _failed(job.name, error)
     said = dict.fromkeys(str(each.message) for each in caught if not issubclass(each.category, FitWarning))
     ending = replace(ending, seconds=round(time.perf_counter() - start, 3), warnings=[*said])
     if ending.reason != "failed":
         job.record(ending)
     return ending
+
+
+def _failed(name: str, error: Exception) -> Ending:
+    """An ending that says what went wrong, and where, unless it is a mistake in what was given."""
+    message = str(error) if error.args else type(error).__name__
+    if not isinstance(error, (ValueError, OSError, ImportError)):
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        message = f"{type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+    return Ending(name, "failed", message)
 
 
 def _ended(job: _Job) -> Ending:
