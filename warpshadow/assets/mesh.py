@@ -111,7 +111,12 @@ class Mesh:
 
     def world_points(self) -> np.ndarray:
         """The vertices that faces refer to [scene units], float32 of shape [point, 3]."""
-        return self.positions[np.unique(self.faces)]
+        return self.positions[self._used]
+
+    @functools.cached_property
+    def _used(self) -> np.ndarray:
+        """Vertices that faces refer to, rising."""
+        return np.unique(self.faces)
 
     @property
     def content_hash(self) -> str:

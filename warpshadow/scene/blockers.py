@@ -59,9 +59,9 @@ def _wanted(body: Body) -> int:
 def _ground_spheres(scene: Scene) -> list[Spheres | None]:
     """The sphere of each body that asks for some and is a ground."""
     meshes = [body.world_mesh() for body in scene.bodies]
-    points = [mesh.positions[np.unique(mesh.faces)] for mesh in meshes]
+    points = [mesh.world_points() for mesh in meshes]
     return [
-        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]]) if _wanted(body) else None
+        _ground_sphere(meshes[k], [*points[:k], *points[k + 1 :]]) if _wanted(body) and body.mesh.is_flat else None
         for k, body in enumerate(scene.bodies)
     ]
 

@@ -172,7 +172,7 @@ def find_flat_patches(
     areas = grid.covered.ravel() * texels.prod(axis=1)
     return Patches(
         *_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),
-        _sources_of([(*point, 1.0) for point in covered], grid.sides, len(areas)),
+        _sources_of([(*point, 1.0) for point in zip(*covered, strict=True)], grid.sides, len(areas)),
         cut.pieces,
         _of_sides(labels, grid.sides, len(areas)),
         grid,

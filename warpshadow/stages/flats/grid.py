@@ -89,17 +89,17 @@ def stretched(y: np.ndarray) -> np.ndarray:
     return np.sign(y) * np.expm1(np.abs(y))
 
 
-class CoveredPoint(NamedTuple):
-    """A point of the mesh in a texel of a grid, as near as may be to the texel's middle."""
+class CoveredPoints(NamedTuple):
+    """Points of the mesh, one in each texel of a grid that it covers, as near as may be to the texel's middle."""
 
-    face: int
-    barycentrics: np.ndarray
-    texel: int
+    faces: np.ndarray  # [point]
+    barycentrics: np.ndarray  # [point, 3]
+    texels: np.ndarray  # [point]
 
 
 def find_grid(
     positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, others: np.ndarray | None = None
-) -> tuple[Grid, list[CoveredPoint]]:
+) -> tuple[Grid, CoveredPoints]:
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
     Args:
@@ -155,8 +155,8 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.stack([edges[best] @ basis, across[best] @ basis, normal])
 
 
-def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[CoveredPoint]]:
-    """Find which share of each texel the faces [face, 3, 2] cover, and a source for each that is not empty."""
+def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, CoveredPoints]:
+    """Find which share of each texel the faces [face, 3, 2] cover, and a point in each that is not empty."""
     height, width = grid.covered.shape
     points = grid.points(_TESTED)
     shape = np.array([width, height]) * _TESTED
@@ -179,8 +179,8 @@ def _find_covered(grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, list[Cov
     from_middle = np.abs(np.arange(_TESTED**2) - _TESTED**2 // 2).argsort(kind="stable")
     best = (tested[:, from_middle] >= 0).argmax(axis=1)
     chosen = tested[np.arange(len(tested)), from_middle[best]]
-    inner = np.maximum(barycentrics, 0)
-    found = [CoveredPoint(faces[item], inner[item], texel) for texel, item in enumerate(chosen) if item >= 0]
+    texels = np.flatnonzero(chosen >= 0)
+    found = CoveredPoints(faces[chosen[texels]], np.maximum(barycentrics[chosen[texels]], 0), texels)
     return covered.reshape(height, width).astype(np.float32), found
 
 
