@@ -438,17 +438,17 @@ def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tm
     assert len(list((tmp_path / "spheres").iterdir())) == 2  # and no temporary files
 
 
-def test_the_fit_of_a_mesh_in_memory_is_not_read_again(tmp_path, monkeypatch, short_cover):
+def test_the_fit_of_a_mesh_in_memory_is_not_read_again(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     options, mesh = {**QUICK, "cache": True, "refine": False}, icosphere(1.0, 1)
-    made = fit_spheres(mesh, 6, **options)
+    made = fit_spheres(mesh, 0, **options)
     (file,) = (tmp_path / "spheres").iterdir()
     file.unlink()
-    kept = fit_spheres(mesh, 6, **options)
+    kept = fit_spheres(mesh, 0, **options)
     assert kept.spheres is made.spheres and kept.report.cached and not file.exists()
-    assert not fit_spheres(mesh, 6, **options, seed=1).report.cached
+    assert not fit_spheres(mesh, 0, **options, seed=1).report.cached
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "other"))
-    assert not fit_spheres(mesh, 6, **options).report.cached  # which is not there
+    assert not fit_spheres(mesh, 0, **options).report.cached  # which is not there
 
 
 @pytest.mark.slow
