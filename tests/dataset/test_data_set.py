@@ -11,7 +11,7 @@ from PIL import Image
 
 import warpshadow as ws
 from warpshadow.assets.image import exr_channels
-from warpshadow.dataset import DataSet, Recipe, RecipeError, load_recipe
+from warpshadow.dataset import DataSet, Recipe, RecipeError, Sample, load_recipe
 from warpshadow.dataset import data_set as data_sets
 from warpshadow.dataset.samples import render_sample
 from warpshadow.scene.random_scenes import Ranges
@@ -149,6 +149,9 @@ def test_only_the_layers_that_are_asked_for_are_written(recipe):
     assert set(files) == {"exr", "json"}
     assert set(exr_channels(files["exr"])) == {"Z", "body"}
     assert "sh" not in json.loads(files["json"])["light"]
+    sample = Sample("0", exr_channels(files["exr"]), None, {})
+    with pytest.raises(ValueError, match='channels: got Z, body, expected R, G, B, A, of the layer "color"'):
+        _ = sample.color
 
 
 def test_the_shadow_is_direct_light_over_that_which_nothing_blocks(recipe):

@@ -1,8 +1,11 @@
 """Shards: the same bits in any order, on any number of workers, and after an interruption; read by torch's loaders."""
 
+import contextlib
 import json
+import multiprocessing
 import os
 import re
+import signal
 import subprocess
 import sys
 import tarfile
@@ -121,8 +124,20 @@ def test_a_warning_is_said_once_with_the_number_of_the_first_image_and_creased_m
 
 
 @pytest.mark.slow
-def test_two_workers_write_the_same_bits_as_one(recipe, written, tmp_path):
+def test_two_workers_of_which_one_is_killed_write_the_same_bits_as_one(recipe, written, tmp_path, monkeypatch):
+    run_tasks, killed = shards.run_tasks, []
+
+    def run_and_kill(*args, **options):
+        with contextlib.closing(run_tasks(*args, **options)) as ended:
+            for count, each in enumerate(ended):
+                if count == 4:
+                    killed.append(multiprocessing.active_children()[0])
+                    os.kill(killed[0].pid, signal.SIGKILL)
+                yield each
+
+    monkeypatch.setattr(shards, "run_tasks", run_and_kill)
     write_shards(DataSet(load_recipe(recipe)), tmp_path / "shards", workers=2)
+    assert [process.exitcode for process in killed] == [-signal.SIGKILL]
     assert bits(tmp_path / "shards") == bits(written)
 
 

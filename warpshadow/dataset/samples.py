@@ -49,7 +49,15 @@ class Sample(NamedTuple):
 
     @property
     def color(self) -> np.ndarray:
-        """Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]."""
+        """Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; of the layer "color".
+
+        Raises:
+            ValueError: where that layer is not.
+        """
+        if "R" not in self.channels:
+            raise ValueError(
+                f'channels: got {", ".join(self.channels) or "none"}, expected R, G, B, A, of the layer "color"'
+            )
         return np.stack([self.channels[name] for name in "RGBA"], axis=-1)
 
 
