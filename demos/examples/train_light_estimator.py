@@ -13,7 +13,8 @@ Several processes share the scenes (DistributedDataParallel: gloo on a CPU, nccl
 the files. A run that was interrupted goes on with --resume, to the same numbers as if it had not been.
 
 The scenes may be those of the first split of a recipe (warpshadow/dataset/README.md). Their images may come from shards
-that ``warpshadow dataset`` wrote; if it ray traced them as this does, the losses are the same to the last bit.
+that ``warpshadow dataset`` wrote; if it ray traced them as this does, into OpenEXR, the losses are the same to the last
+bit.
 """
 
 import argparse

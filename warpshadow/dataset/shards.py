@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import io
 import json
 import re
@@ -109,6 +110,8 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         files = render_sample(data_set, number)
+    gc.collect()  # renderers refer to themselves: those of many images would wait to be collected, in 1 GB
+    gc.freeze()  # what is left stays, and is not looked through after the next image
     return _Rendered(files, [str(each.message) for each in caught])
 
 
@@ -125,7 +128,10 @@ def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Genera
     """Render images, in the order of the numbers."""
     render = functools.partial(_render, data_set)
     if workers == 1:
-        yield from map(render, numbers)
+        try:
+            yield from map(render, numbers)
+        finally:
+            gc.unfreeze()  # of a process that has other things to do
         return
     early: dict[int, _Rendered] = {}
     with contextlib.closing(run_tasks(render, numbers, workers=workers)) as ended:
