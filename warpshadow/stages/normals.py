@@ -5,14 +5,34 @@ from __future__ import annotations
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import differentiable, launch
 
 _THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
 _SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
 
 
-@wp.kernel
+_FACE_COST, _VERTEX_COST = 15.0, 6.0
+"""Nanoseconds that a face and a vertex take. Instances are shared by threads."""
+
+
+@wp.func
+def _edges(positions: wp.array(dtype=wp.vec3), corners: wp.vec3i):
+    """From the first corner of a face to the others."""
+    origin = wp.vec3d(positions[corners[0]])
+    return wp.vec3d(positions[corners[1]]) - origin, wp.vec3d(positions[corners[2]]) - origin
+
+
+@wp.func
+def _has_area(along_j: wp.vec3d, along_k: wp.vec3d, normal: wp.vec3d):
+    longest2 = wp.max(wp.dot(along_j, along_j), wp.dot(along_k, along_k))
+    is_long = longest2 > wp.float64(_SHORTEST * _SHORTEST)
+    return is_long and wp.length(normal) > wp.float64(_THINNEST) * longest2
+
+
+@wp.kernel(enable_backward=False)
 def _sum_face_normals(
+    first_row: int,
+    worker: int,
     # in
     positions: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
@@ -20,29 +40,77 @@ def _sum_face_normals(
     sums: wp.array2d(dtype=wp.vec3d),
 ):
     """A thread adds the normal of one face, as long as twice its area, to its three vertices."""
-    batch, face = wp.tid()
-    i, j, k = faces[face][0], faces[face][1], faces[face][2]
-    origin = wp.vec3d(positions[batch, i])
-    along_j = wp.vec3d(positions[batch, j]) - origin
-    along_k = wp.vec3d(positions[batch, k]) - origin
+    row, face = wp.tid()
+    batch = first_row + row
+    corners = faces[face]
+    along_j, along_k = _edges(positions[batch], corners)
     normal = wp.cross(along_j, along_k)
-    longest2 = wp.max(wp.dot(along_j, along_j), wp.dot(along_k, along_k))
-    if wp.length(normal) > wp.float64(_THINNEST) * longest2 and longest2 > wp.float64(_SHORTEST * _SHORTEST):
-        wp.atomic_add(sums, batch, i, normal)
-        wp.atomic_add(sums, batch, j, normal)
-        wp.atomic_add(sums, batch, k, normal)
+    if _has_area(along_j, along_k, normal):
+        for corner in range(3):
+            wp.atomic_add(sums, batch, corners[corner], normal)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
+def _sum_face_normals_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    positions: wp.array2d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    adj_sums: wp.array2d(dtype=wp.vec3d),
+    # out
+    adj_positions: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a face:  with n = u × v,  ū = v × n̄,  v̄ = n̄ × u."""
+    row, face = wp.tid()
+    batch = first_row + row
+    corners = faces[face]
+    along_j, along_k = _edges(positions[batch], corners)
+    if _has_area(along_j, along_k, wp.cross(along_j, along_k)):
+        adj = adj_sums[batch, corners[0]] + adj_sums[batch, corners[1]] + adj_sums[batch, corners[2]]
+        adj_j = wp.cross(along_k, adj)
+        adj_k = wp.cross(adj, along_j)
+        wp.atomic_sub(adj_positions, batch, corners[0], wp.vec3(adj_j + adj_k))
+        wp.atomic_add(adj_positions, batch, corners[1], wp.vec3(adj_j))
+        wp.atomic_add(adj_positions, batch, corners[2], wp.vec3(adj_k))
+
+
+@wp.kernel(enable_backward=False)
 def _normalize(
+    first_row: int,
+    worker: int,
     # in
     sums: wp.array2d(dtype=wp.vec3d),
     # out
     normals: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread normalizes one vertex; zero stays zero, with a zero gradient."""
-    batch, vertex = wp.tid()
+    """A thread normalizes one vertex; zero stays zero."""
+    row, vertex = wp.tid()
+    batch = first_row + row
     normals[batch, vertex] = wp.vec3(wp.normalize(sums[batch, vertex]))
+
+
+@wp.kernel(enable_backward=False)
+def _normalize_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    sums: wp.array2d(dtype=wp.vec3d),
+    adj_normals: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_sums: wp.array2d(dtype=wp.vec3d),
+):
+    """A thread owns a vertex:  s̄ = (n̄ − n n·n̄) / |s|, zero where s is."""
+    row, vertex = wp.tid()
+    batch = first_row + row
+    total = sums[batch, vertex]
+    adj = wp.vec3d()
+    length = wp.length(total)
+    if length > wp.float64(0.0):
+        normal = total / length
+        adj = wp.vec3d(adj_normals[batch, vertex])
+        adj = (adj - wp.dot(normal, adj) * normal) / length
+    adj_sums[batch, vertex] = adj
 
 
 def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
@@ -67,7 +135,17 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     """
     check.finite_arrays({"positions": positions})
     device, shape = positions.device, positions.shape
-    sums, normals = wp.zeros(shape, dtype=wp.vec3d, device=device), wp.empty(shape, dtype=wp.vec3, device=device)
-    launch(_sum_face_normals, (shape[0], faces.shape[0]), inputs=[positions, faces], outputs=[sums])
-    launch(_normalize, shape, inputs=[sums], outputs=[normals])
-    return normals
+    sums = wp.zeros(shape, dtype=wp.vec3d, device=device)
+    by_face, by_vertex = (shape[0], faces.shape[0]), shape
+
+    def forward(normals: wp.array) -> None:
+        launch(_sum_face_normals, by_face, inputs=[positions, faces], outputs=[sums], cost=_FACE_COST)
+        launch(_normalize, by_vertex, inputs=[sums], outputs=[normals], cost=_VERTEX_COST)
+
+    def adjoint(adj_normals: wp.array) -> None:
+        adj_sums = wp.empty(shape, dtype=wp.vec3d, device=device)
+        launch(_normalize_adjoint, by_vertex, inputs=[sums, adj_normals], outputs=[adj_sums], cost=_VERTEX_COST)
+        inputs = [positions, faces, adj_sums]
+        launch(_sum_face_normals_adjoint, by_face, inputs=inputs, outputs=[positions.grad], cost=2 * _FACE_COST)
+
+    return differentiable(forward, adjoint, wp.empty(shape, dtype=wp.vec3, device=device), variables=[positions])
