@@ -1,12 +1,15 @@
 """Images a second of small images in batches, in one process and in two, as a network that trains takes them.
 
-    python demos/benchmarks/throughput.py [--sizes 64 256] [--instances 1 8 64] [--seconds 2]
+    python demos/benchmarks/throughput.py [--sizes 64 256] [--instances 1 8 64] [--seconds 2] [--settings]
 
 The scene is that of benchmark.py. Of "light" each instance has light of its own, five bands, and what is seen is kept;
 of "pose" each has a bunny that moved, so all is computed; of "mixed" one after another shows the bunny and six other
 shapes, each moved. A process has all threads; two have half of them each, and
 work at the same time. An image is forward alone, or forward and backward to what varies. Figures are whole rates, host
 work included, after a warm-up.
+
+With --settings it prints instead what settings that are faster than the defaults cost: of "pose" in one process, time
+and processor time, and the error of the image where the bunny stands, against 2048 rays.
 """
 
 import argparse
@@ -16,14 +19,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.benchmarks.lane_choice import cpu_text
-from demos.scenes import bunny_scene, on_ground
+from demos.scenes import bunny_scene, image_error, on_ground
 from warpshadow.device.workers import run_tasks
 from warpshadow.scene.random_scenes import primitives
 from warpshadow.torch import MixedRenderer, TorchRenderer
@@ -38,6 +42,38 @@ class Case(NamedTuple):
     size: int  # of images [pixels]
     instances: int  # of a call
     has_gradient: bool
+
+
+class Setting(NamedTuple):
+    """Other settings than the defaults."""
+
+    visibility: dict[str, Any] = {}
+    blockers: int = 64
+    receivers: str = "vertex"  # of the bunny
+
+    def __str__(self) -> str:
+        changed = [f"{key} {value}" for key, value in self.visibility.items()]
+        changed += [f"{self.blockers} spheres"] * (self.blockers != 64)
+        changed += ["bunny by pixel"] * (self.receivers == "pixel")
+        return ", ".join(changed) or "defaults"
+
+    def scene(self, size: int) -> ws.Scene:
+        """The scene of "pose" with these."""
+        scene = bunny_scene()
+        bunny = dataclasses.replace(scene.bodies[0], blockers=self.blockers, receivers=self.receivers)
+        camera = scene.camera.resized(size / scene.camera.width)
+        given = {"bodies": (bunny, scene.bodies[1]), "camera": camera}
+        return dataclasses.replace(scene, **given, visibility=ws.Visibility.of(self.visibility))
+
+
+SETTINGS = (
+    Setting(),
+    Setting(receivers="pixel"),
+    *(Setting({"directions": count}, receivers="pixel") for count in (64, 32, 16)),
+    Setting({"directions": 32}, 16, "pixel"),
+    Setting({"method": "log-sh", "order": 4}, receivers="pixel"),
+    Setting({"method": "none"}, receivers="pixel"),
+)
 
 
 class Run(NamedTuple):
@@ -114,6 +150,38 @@ def all_rates(cases: tuple[Case, ...], processes: int, seconds: float) -> Iterat
     return map(sum, zip(*found, strict=True))
 
 
+def processor_time(step: Callable[[], None], seconds: float) -> float:
+    """Processor seconds of a step on all threads, the least of those that end within some seconds."""
+    end, least = time.perf_counter() + seconds, np.inf
+    while time.perf_counter() < end:
+        start = time.process_time()
+        step()
+        least = min(least, time.process_time() - start)
+    return least
+
+
+def print_settings(sizes: list[int], instances: int, seconds: float) -> None:
+    """What settings cost."""
+    ws.quiet()
+    torch.set_num_threads(1)
+    print(cpu_text())
+    for size in sizes:
+        print(f"\n{instances} instances of {size} × {size}, ms an image; processor time; error against rays")
+        print(f"{'settings':44} {'forward':>9} {'processor':>10} {'and back':>9} {'processor':>10} {'error':>7}")
+        rays = Setting({"method": "ray-traced", "samples": 2048}).scene(size)
+        truth = ws.Renderer(rays).render()
+        for setting in SETTINGS:
+            scene = setting.scene(size)
+            figures = []
+            for has_gradient in (False, True):
+                step = step_of(Case("pose", size, instances, has_gradient), MixedRenderer([TorchRenderer(scene)]))
+                figures += [1 / rate(step, instances, seconds), processor_time(step, seconds) / instances]
+            forward, of_forward, both, of_both = (1e3 * each for each in figures)
+            error = image_error(ws.Renderer(scene).render(), truth)
+            times = f"{forward:6.2f} ms {of_forward:7.2f} ms {both:6.2f} ms {of_both:7.2f} ms"
+            print(f"{str(setting):44} {times} {error:7.1%}", flush=True)
+
+
 def main(sizes: list[int], instances: list[int], seconds: float) -> None:
     print(cpu_text())
     cases = tuple(
@@ -133,5 +201,9 @@ if __name__ == "__main__":
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256], help="of images [pixels]")
     parser.add_argument("--instances", type=int, nargs="+", default=[1, 8, 64], help="of a call")
     parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
+    parser.add_argument("--settings", action="store_true", help="time faster settings, and print their errors")
     arguments = parser.parse_args()
+    if arguments.settings:
+        print_settings(arguments.sizes, max(arguments.instances), arguments.seconds)
+        sys.exit()
     main(arguments.sizes, arguments.instances, arguments.seconds)

@@ -27,6 +27,9 @@ _LEAST_REACH = 2.2
 _MOST_RAYS = 32
 """Rays that a cell looks up on average at most; a wider one looks up coarse cells."""
 
+_CELL_COST = 1000.0
+"""Nanoseconds that a cell takes. Instances are shared by threads."""
+
 
 class Supports(NamedTuple):
     """Where each cell of directions looks.
@@ -106,6 +109,8 @@ def _height(cosine: float, reach: float):
 
 @wp.kernel(enable_backward=False)
 def _find_lookups(
+    first_row: int,
+    worker: int,
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
@@ -120,7 +125,8 @@ def _find_lookups(
     weights: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a cell of directions of an instance."""
-    batch, direction = wp.tid()
+    row, direction = wp.tid()
+    batch = first_row + row
     toward = wp.normalize(_body_direction(rotations[batch, body], directions[direction]))
     reach = reaches[direction]
     candidates = cells
@@ -204,7 +210,9 @@ def find_lookups(rotations: wp.array, body: int, supports: Supports) -> Lookup:
     indices = wp.empty((*shape, supports.most), dtype=wp.int32, device=device)
     inputs = [rotations, body, *supports[:5]]
     weights = differentiable(
-        lambda weights: launch(_find_lookups, shape, inputs=inputs, outputs=[counts, indices, weights]),
+        lambda weights: launch(
+            _find_lookups, shape, inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
+        ),
         lambda adj_weights: launch(
             _find_lookups_adjoint,
             shape,
