@@ -9,6 +9,7 @@ samples from one row (or column) to the next.
 
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -39,6 +40,9 @@ LEAST_OPENING = 1e-4
 
 # Rasterization moves vertices by up to 1/8192 sample: an edge may be this far on the wrong side of a center [samples].
 _SNAP = 1.0 / 2048.0
+
+_FACE_COST = 40.0
+"""Nanoseconds that a face takes, if it is small."""
 
 # In place of the silhouette between two samples, which may be none (−1).
 _UNKNOWN = -2
@@ -79,9 +83,10 @@ _Crossing = wp.types.vector(length=6, dtype=wp.int32)
 
 @wp.struct
 class _Crossings:
-    """What lies between neighboring samples, a list in no order."""
+    """What lies between neighboring samples, a list for each image, in no order: threads share images, not lists."""
 
-    count: wp.array(dtype=wp.int32)
+    counts: wp.array(dtype=wp.int32)  # of each image
+    room: int  # for each image
     items: wp.array(dtype=_Crossing)  # sample, way to its neighbor, and vertices of the edge as each of them has it
     claims: wp.array(dtype=wp.int32)  # one item that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
 
@@ -233,7 +238,8 @@ def _add_crossing(seen: Seen, sample: int, way: int, edge: wp.vec2i, its_edge: w
 
     Of the crossings beside a sample one claims it, any.
     """
-    crossing = wp.atomic_add(crossings.count, 0, 1)
+    image = image_of(seen, sample)
+    crossing = image * crossings.room + wp.atomic_add(crossings.counts, image, 1)
     crossings.items[crossing] = _Crossing(sample, way, edge[0], edge[1], its_edge[0], its_edge[1])
     crossings.claims[sample] = 2 * crossing
     crossings.claims[neighbor(sample, way, seen.width)] = 2 * crossing + 1
@@ -257,6 +263,8 @@ def _centers_before(coordinate: float, count: int):
 
 @wp.kernel(enable_backward=False)
 def _find_edges(
+    first_row: int,
+    worker: int,
     # in
     seen: Seen,
     neighbors: wp.array(dtype=wp.vec3i),
@@ -271,7 +279,8 @@ def _find_edges(
     Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings. Several edges
     pass between two samples, so which of them the samples see is kept, in ``between``.
     """
-    batch, face, strip = wp.tid()
+    image, face, strip = wp.tid()
+    batch = first_row + image
     clip = seen.clip_positions[batch]
     corners = seen.faces[face]
     around = neighbors[face]
@@ -381,6 +390,7 @@ def _find_intersections(
 def _make_entries(
     # in
     crossings: _Crossings,
+    gaps: wp.array(dtype=wp.int32),
     width: int,
     has_all: bool,
     # out
@@ -390,16 +400,16 @@ def _make_entries(
 ):
     """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
 
-    If there is an entry for all samples, it is the sample's own.
+    Gaps are what room the lists of the images before an image have left. If there is an entry for all samples, it is the sample's own.
     """
-    thread = wp.tid()
-    if thread < crossings.count[0]:
-        crossing = crossings.items[thread]
+    image, number = wp.tid()
+    if number < crossings.counts[image]:
+        crossing = crossings.items[image * crossings.room + number]
         for end in range(2):
             sample = crossing[0]
             if end == 1:
                 sample = neighbor(sample, crossing[1], width)
-            entry = wp.where(has_all, sample, crossings.claims[sample])
+            entry = wp.where(has_all, sample, crossings.claims[sample] - 2 * gaps[image])
             samples[entry] = sample
             entries[sample] = entry
             edges[entry, crossing[1] + end] = wp.vec2i(crossing[2 + 2 * end], crossing[3 + 2 * end])
@@ -435,7 +445,9 @@ def find_silhouettes(
     check.shape("clip_positions", clip_positions.shape, (fragments.face_ids.shape[0], "vertex"))
     device, sample_count = faces.device, fragments.face_ids.size
     seen, crossings, strips = make_seen(fragments, faces, clip_positions), _Crossings(), strip_count(device)
-    crossings.count = wp.zeros(1, dtype=wp.int32, device=device)
+    image_count = len(clip_positions)
+    crossings.counts = wp.zeros(image_count, dtype=wp.int32, device=device)
+    crossings.room = 2 * sample_count // image_count
     crossings.items = wp.empty(2 * sample_count, dtype=_Crossing, device=device)
     crossings.claims = wp.empty(sample_count, dtype=wp.int32, device=device)
     between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
@@ -443,7 +455,8 @@ def find_silhouettes(
         check.shape("creases", creases.shape, faces.shape)
     launch(
         _find_edges,
-        (clip_positions.shape[0], faces.shape[0], strips),
+        (image_count, faces.shape[0], strips),
+        cost=_FACE_COST,
         inputs=[seen, neighbors, creases, strips],
         outputs=[between, crossings],
     )
@@ -453,10 +466,16 @@ def find_silhouettes(
         dim = -(-sample_count // run)
         launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, creases, run], outputs=[crossings])
     has_all = bool(device.is_capturing)
-    most = crossings.items.size if has_all else int(crossings.count.numpy()[0])
-    entry_count = sample_count if has_all else 2 * most
+    if has_all:
+        most, entry_count, gaps = crossings.room, sample_count, crossings.counts  # gaps do not matter
+    else:
+        counts = crossings.counts.numpy()
+        most, entry_count = int(counts.max()), 2 * int(counts.sum())
+        ends = np.cumsum(crossings.room - counts)
+        gaps = wp.array(np.concatenate([[0], ends[:-1]]), dtype=wp.int32, device=device)
     samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
     entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
-    launch(_make_entries, most, inputs=[crossings, seen.width, has_all], outputs=[samples, edges, entries])
+    inputs = [crossings, gaps, seen.width, has_all]
+    launch(_make_entries, (image_count, most), inputs=inputs, outputs=[samples, edges, entries])
     return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)
