@@ -400,7 +400,8 @@ def _make_entries(
 ):
     """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
 
-    Gaps are what room the lists of the images before an image have left. If there is an entry for all samples, it is the sample's own.
+    Gaps are what room the lists of the images before an image have left. If there is an entry for all samples, it is
+    the sample's own.
     """
     image, number = wp.tid()
     if number < crossings.counts[image]:
