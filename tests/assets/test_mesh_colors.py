@@ -1,5 +1,6 @@
 """Colors that meshes have are a body's, unless an albedo is given; what cannot be taken is named in one warning."""
 
+import json
 import warnings
 
 import numpy as np
@@ -89,6 +90,30 @@ def test_the_color_of_a_gltf_material_is_that_of_its_part(tmp_path):
     for source in (scene, tmp_path / "a.glb"):
         found = {tuple(map(tuple, np.unique(part, axis=0))) for part in ws.Body(source).albedo.reshape(2, 8, 3)}
         assert found == {(tuple(np.float32((1, 0.2, 0))),), (tuple(np.float32((0.8, 0.8, 0.8))),)}
+
+
+@pytest.mark.parametrize("material", [False, True])
+def test_colors_of_16_bits_are_read_or_said_to_be_dropped(tmp_path, material):
+    codes = np.uint16([(65535, 32768, 0), (0, 257, 1), (1, 2, 3)])
+    columns = {"POSITION": (np.eye(3, dtype=np.float32), 5126), "COLOR_0": (np.pad(codes, ((0, 0), (0, 1))), 5123)}
+    data, views, accessors = b"", [], []
+    for number, (column, kind) in enumerate(columns.values()):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": column.nbytes})
+        shape = {"count": 3, "type": f"VEC{column.shape[1]}"}
+        accessors.append({"bufferView": number, "componentType": kind, "normalized": kind == 5123, **shape})
+        data += column.tobytes()
+    primitive = {"attributes": {name: number for number, name in enumerate(columns)}} | (
+        {"material": 0} if material else {}
+    )
+    (tmp_path / "a.bin").write_bytes(data)
+    tree = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "scene": 0, "nodes": [{"mesh": 0}]}
+    tree |= {"meshes": [{"primitives": [primitive]}], "materials": [{}], "accessors": accessors, "bufferViews": views}
+    (tmp_path / "a.gltf").write_text(json.dumps(tree | {"buffers": [{"byteLength": len(data), "uri": "a.bin"}]}))
+    if material:
+        np.testing.assert_array_equal(ws.Body(tmp_path / "a.gltf").albedo, np.float32(codes / 65535))
+    else:
+        with pytest.warns(UserWarning, match="colors of 16 bits without a material dropped"):
+            assert ws.load_mesh(tmp_path / "a.gltf").colors is None
 
 
 @pytest.mark.parametrize(

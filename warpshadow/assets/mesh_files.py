@@ -323,10 +323,26 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
     import trimesh
 
-    if path.suffix.lower() == ".gltf":
-        json.loads(path.read_bytes())  # on bad JSON trimesh would read a model.gltf beside the file instead
+    cuts_colors = path.suffix.lower() in (".gltf", ".glb") and _cuts_colors(path)
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    return _trimesh_parts(loaded, of_file=True)
+    parts = _trimesh_parts(loaded, of_file=True)
+    if cuts_colors:
+        parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
+    return parts
+
+
+def _cuts_colors(path: Path) -> bool:
+    """Whether trimesh would take the lower half of 16-bit colors: those in a glTF file that are not behind a material.
+
+    On bad JSON it would even read a model.gltf beside the file instead; here, that raises.
+    """
+    content = path.read_bytes()
+    if content[:4] == b"glTF":
+        content = content[20:][: int.from_bytes(content[12:16], "little")]
+    tree = json.loads(content)
+    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    colors = [each["attributes"].get("COLOR_0") for each in primitives if "material" not in each]
+    return any(color is not None and tree["accessors"][color]["componentType"] == 5123 for color in colors)
 
 
 def _trimesh_parts(given: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False) -> list[MeshPart]:
