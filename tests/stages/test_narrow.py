@@ -55,7 +55,7 @@ def test_two_suns_have_a_place_each():
 
 
 def test_in_many_cells_a_sun_is_as_any_light():
-    assert narrow_of(map_with_discs((SUN, 2000.0)), 4096)[1] is None
+    assert narrow_of(map_with_discs((SUN, 2000.0)), 2048)[1] is None
 
 
 def test_narrow_cells_take_the_place_of_what_they_had(device, verified_tape):
