@@ -12,7 +12,7 @@ import warpshadow as ws
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import by_spheres, groups
+from warpshadow.pipeline import directional, groups
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.renderer import Renderer
@@ -652,14 +652,14 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
 
 
 def test_parts_of_receivers_need_little_memory(monkeypatch):
-    """What is shaded at once is seen by its largest transfer vectors."""
+    """What is shaded at once is told by the largest array of what is seen."""
     monkeypatch.setattr(groups, "PART", 64)
     sizes = []
-    shade = by_spheres.shade
+    shade = directional.shade_cells
     monkeypatch.setattr(
-        by_spheres,
-        "shade",
-        lambda transfer, *rest, **most: sizes.append(transfer.shape[1]) or shade(transfer, *rest, **most),
+        directional,
+        "shade_cells",
+        lambda seen, *rest, **most: sizes.append(seen.shape[1]) or shade(seen, *rest, **most),
     )
     scene = ws.Scene((ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE),), dome(), CAMERA)
     Renderer(scene).render()
