@@ -4,19 +4,25 @@
 
 Fits are poses of meshes in turn, by default the bunny's, the bear's and the rocks' that ship with Warp, 10° to 40° and
 5% to 25% of the diagonal off, on a ground. `warpshadow fit FOLDER` does them with one worker of one thread, then with
-two of one thread each. With --kills, another folder gets them while workers and the command are killed by turns, at
-random moments, with SIGKILL; the command is given again whenever it has ended. In the end the tables are compared, but
-for seconds; and it is checked that no fit was done again whose end was on record.
+two of one thread each.
+
+With --kills, two workers do them undisturbed. Then a Ray cluster of two nodes of one core does them (without the extra
+`ray`, two workers) while a worker, the command and a node are killed by turns, at random moments, with SIGKILL. A node
+is started again, and the command is given again whenever it has ended. In the end the tables are compared, but for
+seconds; and it is checked that no fit was done again whose end was on record.
 """
 
 import argparse
 import contextlib
 import csv
+import importlib.util
 import os
 import platform
 import random
 import resource
+import secrets
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -50,11 +56,12 @@ def write_fits(folder: Path, meshes: list[ws.Mesh], count: int, size: int) -> No
         (own / "fit.toml").write_text(FIT)
 
 
-def command(fits: Path, results: Path, workers: int) -> subprocess.Popen:
+def command(fits: Path, results: Path, *where: str, threads: int = 1) -> subprocess.Popen:
     """Begin to do the fits."""
-    line = [sys.executable, "-m", "warpshadow", "fit", fits, "-o", results, "--workers", str(workers)]
-    environment = os.environ | {"WARPSHADOW_NUM_THREADS": str(workers), "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen([*line, "--checkpoint-seconds", "1", "--quiet"], env=environment)
+    line = [sys.executable, "-m", "warpshadow", "fit", fits, "-o", results, *where]
+    environment = os.environ | {"WARPSHADOW_NUM_THREADS": str(threads), "PYTHONPATH": str(ROOT)}
+    quiet = [*line, "--checkpoint-seconds", "1", "--quiet"]
+    return subprocess.Popen(quiet, env=environment, stdout=subprocess.DEVNULL)  # where Ray tells of deaths
 
 
 def processor_seconds() -> float:
@@ -81,39 +88,116 @@ def descendants(process: int) -> Iterator[tuple[int, str]]:
         yield from descendants(int(child))
 
 
-def kill_one(head: int, victim: str) -> bool:
-    """Kill a process by what it is; whether there was one."""
-    workers = [child for child, line in descendants(head) if "spawn_main" in line]
-    found = [head] if victim == "command" else workers
-    if found:
+def kill(victims: list[int]) -> bool:
+    """Kill one of some processes; whether there was one."""
+    if victims:
         with contextlib.suppress(ProcessLookupError):
-            os.kill(random.choice(found), signal.SIGKILL)
-    return bool(found)
+            os.kill(random.choice(victims), signal.SIGKILL)
+    return bool(victims)
+
+
+class Workers:
+    """Two worker processes of the command."""
+
+    kinds = ("worker", "command")
+    where = ("--workers", "2")
+
+    def kill(self, kind: str, process: subprocess.Popen) -> bool:
+        """Kill one of a kind, of which there is maybe none now."""
+        workers = [child for child, line in descendants(process.pid) if "spawn_main" in line]
+        return kill([process.pid] if kind == "command" else workers)
+
+    def mend(self) -> None:
+        """Workers are replaced by the command."""
+
+    end = mend
+
+
+class Cluster:
+    """Two nodes of Ray on this machine, each of one core."""
+
+    kinds = ("worker", "command", "other node", "worker", "command", "head node")
+
+    def __init__(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+        self.where = ("--ray", self.address)
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(), "PYTHONPATH": str(ROOT)}
+        self.nodes: dict[str, subprocess.Popen] = {}
+        self.mend()
+
+    def kill(self, kind: str, process: subprocess.Popen) -> bool:
+        """Kill one of a kind, of which there is maybe none now."""
+        if kind == "command":
+            return kill([process.pid])
+        own = [self.nodes[kind]] if kind in self.nodes else self.nodes.values()
+        name = "ray::_alone" if kind == "worker" else "raylet/raylet"
+        was = kill([child for node in own for child, line in descendants(node.pid) if name in line])
+        if kind == "head node":  # the command has an error to tell
+            process.wait(180)
+        return was
+
+    def mend(self) -> None:
+        """Start the nodes that are not running; without a head none is any use."""
+        has_head = "head node" in self.nodes and not self._has_died("head node")
+        if not has_head:
+            self.end()
+            port = self.address.rpartition(":")[2]
+            self.nodes["head node"] = self._start("--head", "--port", port, "--include-dashboard=false")
+        if "other node" not in self.nodes or self._has_died("other node"):
+            self.nodes["other node"] = self._start("--address", self.address)
+
+    def end(self) -> None:
+        """End all."""
+        for node in self.nodes.values():
+            node.terminate()
+            node.wait()
+        self.nodes.clear()
+
+    def _has_died(self, name: str) -> bool:
+        node = self.nodes[name]
+        return node.poll() is not None or not any("raylet/raylet" in line for _, line in descendants(node.pid))
+
+    @staticmethod
+    def _start(*arguments: str) -> subprocess.Popen:
+        line = [sys.executable, "-c", "from ray.scripts.scripts import main; main()", "start", "--block", *arguments]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        node = subprocess.Popen([*line, "--num-cpus=1", "--disable-usage-stats"], **pipes)
+        if not any("Ray runtime started" in each for each in node.stdout):
+            raise ChildProcessError("a node of Ray did not start")
+        return node
 
 
 def do_with_kills(fits: Path, results: Path, kills: int) -> list[str]:
     """Do the fits while processes are killed; the victims."""
-    victims, kinds, again = [], ["worker", "command"], False
-    head = command(fits, results, 2)
+    has_ray = importlib.util.find_spec("ray") is not None
+    if not has_ray:
+        print("no node is killed: Ray is not installed (the extra 'ray')")
+    place = Cluster() if has_ray else Workers()
+    victims, again = [], False
+    process = command(fits, results, *place.where)
     records: dict[Path, int] = {}
     try:
         while True:
+            kind = place.kinds[len(victims) % len(place.kinds)]
             wait = random.uniform(0, LONGEST) if len(victims) < kills else None
             with contextlib.suppress(subprocess.TimeoutExpired):
-                head.wait(wait)
-            if head.poll() is None and kill_one(head.pid, kinds[len(victims) % len(kinds)]):
-                victims.append(kinds[len(victims) % len(kinds)])
+                process.wait(wait)
+            if process.poll() is None and place.kill(kind, process):
+                victims.append(kind)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    head.wait(0.1 if victims[-1] == "worker" else 120)
+                    process.wait(1)
             for record in results.glob("*/ending.json"):
                 again = again or records.setdefault(record, record.stat().st_mtime_ns) != record.stat().st_mtime_ns
-            if head.poll() is not None:
-                if head.returncode == 0:
+            place.mend()
+            if process.poll() is not None:
+                if process.returncode == 0:
                     break
-                head = command(fits, results, 2)
+                process = command(fits, results, *place.where)
     finally:
-        head.kill()
-        head.wait()
+        process.kill()
+        process.wait()
+        place.end()
     if again:
         raise AssertionError("a fit was done again whose end was on record")
     return victims
@@ -130,20 +214,22 @@ def main(arguments: argparse.Namespace) -> None:
         write_fits(fits, meshes, arguments.count, arguments.size)
         print(f"{arguments.count} fits, {platform.machine()}, {os.cpu_count()} cores")
         for repeat in range(arguments.repeats):
-            for workers in (1, 2):
+            for workers in (2,) if arguments.kills else (1, 2):
                 start, before = time.perf_counter(), processor_seconds()
-                assert command(fits, Path(folder, f"{workers}.{repeat}"), workers).wait() == 0
+                process = command(fits, Path(folder, f"{workers}.{repeat}"), "--workers", str(workers), threads=workers)
+                assert process.wait() == 0
                 times.setdefault(workers, []).append(time.perf_counter() - start)
                 used, load = processor_seconds() - before, os.getloadavg()[0]
                 times_of = f"{times[workers][-1]:6.1f} s, {used:6.1f} s of processors, load {load:.1f}"
                 print(f"{workers} worker{'s' * (workers > 1)}: {times_of}", flush=True)
-        print(f"two take {min(times[2]) / min(times[1]):.2f} of one's time")
-        expected = table(Path(folder, "1.0"))
-        print("tables are equal:", table(Path(folder, "2.0")) == expected)
+        expected = table(Path(folder, "2.0"))
         if arguments.kills:
             victims = do_with_kills(fits, Path(folder, "killed"), arguments.kills)
             equal = table(Path(folder, "killed")) == expected
             print(f"tables are equal after kills of {', '.join(victims)}: {equal}")
+        else:
+            print(f"two take {min(times[2]) / min(times[1]):.2f} of one's time")
+            print("tables are equal:", table(Path(folder, "1.0")) == expected)
 
 
 if __name__ == "__main__":
