@@ -95,6 +95,8 @@ def compile_in_turn() -> None:
 def _compile_in_turn(module: wp.Module, device: Any, folder: str, *rest: Any, **options: Any) -> bool:
     from filelock import FileLock
 
+    if os.path.exists(folder):  # compiled before, maybe where nothing can be written
+        return _compile(module, device, folder, *rest, **options)
     lock = FileLock(f"{folder}.lock")
     with lock:
         try:
