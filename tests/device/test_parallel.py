@@ -11,13 +11,16 @@ import twins
 import warp as wp
 
 from warpshadow.assets.primitives import icosphere
+from warpshadow.assets.topology import edge_neighbors
 from warpshadow.device import parallel
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.rasterize import rasterize
 from warpshadow.stages.shading import shade
+from warpshadow.stages.silhouettes.find import find_silhouettes
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility import directional, log_sh
 from warpshadow.stages.visibility.exponential import exponentiate
@@ -210,6 +213,32 @@ def test_kernels_that_warp_differentiates_are_divided_both_ways(monkeypatch):
     for divided, expected in zip(results[0][1:], whole[1:], strict=True):
         np.testing.assert_allclose(divided, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
         assert not np.array_equal(divided, expected)  # or nothing was divided
+
+
+def moved_balls():
+    """Normals, fragments and silhouettes of a batch of balls, and a gradient to their positions, as bytes."""
+    ball = icosphere(subdivisions=2)
+    positions = 0.6 * ball.positions + np.linspace(-0.2, 0.2, 6)[:, None, None]
+    positions[..., 2] = 0.5 + 0.4 * positions[..., 2]
+    faces, edges = (wp.array(each, dtype=wp.vec3i, device="cpu") for each in (ball.faces, edge_neighbors(ball.faces)))
+    moved = wp.array(positions, dtype=wp.vec3, device="cpu", requires_grad=True)
+    clip = wp.array(np.insert(positions, 3, 1, axis=2), wp.vec4, device="cpu")
+    with wp.Tape() as tape:
+        normals = vertex_normals(moved, faces)
+    normals.grad.assign(np.random.default_rng(0).normal(size=(*normals.shape, 3)).astype(np.float32))
+    tape.backward()
+    fragments = rasterize(clip, faces, 32, 32)
+    silhouettes = find_silhouettes(fragments, faces, edges, clip)
+    found = normals, moved.grad, *fragments.rows, silhouettes.samples, silhouettes.edges, silhouettes.shares
+    return [array.numpy().tobytes() for array in found]
+
+
+def test_images_of_a_batch_that_threads_share_are_the_same(monkeypatch):
+    whole = moved_balls()
+    monkeypatch.setattr(parallel, "_LEAST_WORK", 1e3)
+    for count in (2, 5):
+        parallel.set_thread_count(count)
+        assert moved_balls() == whole
 
 
 def test_more_threads_may_go_back_than_went_forward():
