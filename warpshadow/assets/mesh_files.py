@@ -60,8 +60,9 @@ def load_mesh(path: MeshSource) -> Mesh:
     uvs are kept only when every face has them. Textures are not read: they are a body's, and ``Body(path)`` takes them.
 
     Colors are, where each vertex has one: those of vertices; of faces, where no vertex has faces of two colors; and the
-    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and USD
-    (``displayColor``) have linear values. Transparency does not count, nor the ``Kd`` of .mtl files.
+    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF, also
+    as trimesh has loaded it, and USD (``displayColor``) have linear values. Transparency does not count, nor the ``Kd``
+    of .mtl files.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the

@@ -124,7 +124,7 @@ def rounds_edges(surface: Surface, positions: np.ndarray) -> bool:
 
 
 def creases(surface: Surface, positions: np.ndarray) -> np.ndarray:
-    """Find the edges across which color jumps: their faces bend by more than a degree, and share no vertices there.
+    """Find the edges across which color jumps: their faces bend by more than a degree, and do not share both ends.
 
     A jump of the normal by a degree changes what a face receives by up to 1.7% of the light.
 

@@ -29,7 +29,7 @@ def run_on_ray(
     attempts: int = 2,
     is_on_gpu: bool = False,
 ) -> Generator[Ended[Task, Result], None, None]:
-    """Do tasks on a Ray cluster, each on one core.
+    """Do tasks on a Ray cluster, each on one core, and one GPU if it needs it.
 
     Args:
         function: What does a task.

@@ -28,7 +28,8 @@ def launch(
 ) -> None:
     """Launch a kernel on the device of its arrays.
 
-    Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded.
+    Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded. One
+    that has a cost has no adjoint of Warp's: :func:`differentiable` pairs it with another.
 
     Args:
         kernel: Its arguments are inputs, scratch memory, outputs and sums; before them ``first_row`` and ``worker`` if
@@ -43,6 +44,7 @@ def launch(
     """
     device = next(value.device for value in (*outputs, *sums, *inputs) if isinstance(value, wp.array))
     if cost is not None:
+        assert kernel.options.get("enable_backward") is False, f"{kernel.key}: slices are not recorded"
         launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
         return
     is_wanted = kernel.options.get("enable_backward") is not False and varies(inputs)
@@ -65,8 +67,8 @@ def differentiable(
         forward: Launches that write the result, which they get.
         adjoint: Launches that add to the gradients of the variables, those that have one; they get the result's. It is
             called whenever the tape plays back, and not at all where no variable requires a gradient.
-        result: Memory for the result, which nobody has written to if it is large. It requires a gradient if a variable
-            does.
+        result: Memory for the result: ``wp.empty`` if it is large, since memory that was written to stays in small
+            pages. It requires a gradient if a variable does.
         variables: What the result depends on differentiably; None is passed over.
 
     Returns:

@@ -110,7 +110,7 @@ def fit_many(
         stages, optimizer, tolerance, seed: Of problems, as :func:`warpshadow.inverse.fit` takes them. Fits and fit
             files have their own.
         workers: How many fits at a time; on this machine by default one for each of ``ws.thread_count()`` threads,
-            which they share, or on a GPU one; with ``ray`` as many as the cluster has cores.
+            which they share, or on a GPU one; with ``ray`` as many as the cluster has cores or, on GPUs, those.
         ray: Address of a Ray cluster, "HOST:PORT" or "auto", whose machines see the same files under the same paths.
         device: Where to compute.
         checkpoint_seconds: Time between checkpoints [s].

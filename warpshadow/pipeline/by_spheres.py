@@ -154,7 +154,7 @@ class SphereMethod(Method):
 class InParts(Node):
     """Shading or transfer vectors of receivers, found group by group and part by part.
 
-    So without a gradient transfer vectors of all receivers are never in memory at once.
+    So without a gradient transfer vectors of all receivers are in memory at once only where light is free.
 
     Args:
         method: The method.

@@ -22,7 +22,7 @@ from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.receivers import Receivers
 
 PART = 1 << 13
-"""Receivers that are lit at once where no gradient is asked for."""
+"""Receivers of each instance that are lit at once where no gradient is asked for."""
 
 
 def solid_bodies(assembly: Assembly, *, but: int | None = None) -> list[int]:

@@ -10,7 +10,6 @@ from warpshadow.device.launch import differentiable, launch
 _THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
 _SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
 
-
 _FACE_COST, _VERTEX_COST = 15.0, 6.0
 """Nanoseconds that a face and a vertex take. Instances are shared by threads."""
 

@@ -5,7 +5,7 @@ the face at the sample's point. But where they are as small as samples, it is on
 shading changes faster and faster, it is far from the mean. So the mean over the sample is taken. Its right half gives
 
     ½ (c_right − c)                 if the neighbor's center is on the surface,
-    min(t, ½) / t · (c_edge − c)    if the surface ends before, at an edge of color c_edge at distance t [samples],
+    min(t, ½) / t · (c_edge − c)    if the surface has an edge before, of color c_edge at distance t [samples],
 
 and likewise the other halves. Where something else comes in front before the neighbor's center, or the image ends,
 there is nothing to be known, and the opposite half counts alone. Where all neighbors see the same face, the slope is

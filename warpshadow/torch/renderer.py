@@ -201,7 +201,7 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None,
         geometry: Geometry[torch.Tensor] | None,
         clip_matrices: torch.Tensor | None,
-    ) -> "Arguments":
+    ) -> Arguments:
         """The tensors among the arguments of a call, checked."""
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         given = Arguments(self.device, cameras=self.cameras if has_cameras else None)
@@ -233,7 +233,7 @@ class TorchRenderer(torch.nn.Module):
 
     def _inputs(
         self,
-        given: "Arguments",
+        given: Arguments,
         arrays: Mapping[str, wp.array],
         light: torch.Tensor | EnvironmentMap | None,
     ) -> dict[str, Any]:

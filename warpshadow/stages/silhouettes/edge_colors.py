@@ -1,4 +1,4 @@
-"""Edge colors: the colors that surfaces have where they end, by which moving edges change an image."""
+"""Edge colors: the colors that surfaces have where they end or have a crease, by which moving edges change an image."""
 
 import warp as wp
 
@@ -83,8 +83,9 @@ def find_edge_colors(
     """Find the colors that surfaces have at the edges themselves.
 
     Shading changes fastest where a surface turns away from the eye: over the last half sample of a ball, by a tenth. So
-    the color of the near surface, which ends at the edge, is interpolated between the edge's vertices. The far surface
-    has no vertices there: its color is extrapolated linearly from the two nearest samples that see it.
+    the color of the near surface, which ends at the edge, is interpolated between the edge's vertices. Where these are
+    no receivers, as at a body that is shaded by pixel and so at creases, and on the far surface, which has no vertices
+    there, color is extrapolated linearly from the two nearest samples that see the surface.
 
     Args:
         image: Color and coverage before smoothing, vec4 of shape [batch, height, width].

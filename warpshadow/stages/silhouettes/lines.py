@@ -1,4 +1,4 @@
-"""Lines: what separates neighboring samples that see different surfaces, an edge or where two faces intersect."""
+"""Lines: what separates neighboring samples: the edge of a surface, a crease, or where two faces intersect."""
 
 import warp as wp
 
