@@ -410,8 +410,8 @@ def fit(
     file: Annotated[
         list[Path],
         typer.Argument(
-            help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern in quotes, a folder "
-            "with files called fit.toml, or a .txt file with a path on each line.",
+            help="Fit file, TOML; warpshadow/inverse/README.md lists its keys. Or many: a pattern, a folder with "
+            "files called fit.toml, or a .txt file with a path on each line.",
         ),
     ],
     output: Annotated[
@@ -453,11 +453,8 @@ def fit(
     from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report
 
-    if len(file) > 1:
-        with _clear_errors():
-            raise ValueError(f"FILE: got {len(file)}, expected one, or a pattern in quotes, such as 'fits/*/fit.toml'")
-    (where,) = file
-    if is_of_many(where):
+    where = file[0] if len(file) == 1 else file
+    if isinstance(where, list) or is_of_many(where):
         options = {"workers": workers, "ray": ray, "device": device, "checkpoint_seconds": checkpoint_seconds}
         _fit_many(where, output, view, is_quiet, **options)
         return
@@ -508,13 +505,13 @@ def fit(
         raise typer.Exit(DIVERGED)
 
 
-def _fit_many(where: Path, output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
+def _fit_many(where: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
     """Do many fits, and name those that have no good end."""
     from warpshadow.inverse.many import TABLE, find_fits, fit_many
 
     with _clear_errors():
         if view:
-            raise ValueError(f"--view: got many fits, {where}; expected one, which a page can show")
+            raise ValueError("--view: got many fits, expected one, which a page can show")
         try:
             endings = fit_many(find_fits(where), output, **options)
         except KeyboardInterrupt as error:
@@ -568,14 +565,15 @@ def dataset(
     with _clear_errors():
         loaded = load_recipe(recipe)
         data_set = DataSet(loaded, device=_device(device))
-        start = time.perf_counter()
+        start, before = time.perf_counter(), {*output.glob("*.tar")}
         try:
             shards = write_shards(data_set, output, workers=workers)
         except KeyboardInterrupt as error:
             raise _interrupted(f"; the same command goes on in {output}") from error
         size = sum(shard.stat().st_size for shard in shards)
         seconds = time.perf_counter() - start
-        _note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {seconds:.0f} s", is_quiet)
+        made = f"{seconds:.0f} s" if {*shards} - before else f"all there before; to make them anew, remove {output}"
+        _note(f"{output}: {len(shards)} shards, {loaded.images} images, {size / 1e6:.3g} MB, {made}", is_quiet)
 
 
 @app.command()

@@ -132,6 +132,25 @@ def test_weights_of_an_obj_are_not_colors(tmp_path):
     assert read(tmp_path / "a.obj", TRIANGLE.format(" 1", " 0.5")).colors is None
 
 
+def test_a_number_before_the_color_of_an_obj_is_a_weight(tmp_path):
+    colors = read(tmp_path / "a.obj", TRIANGLE.format(" 0.5 1 0 0", " 1 0 0 1")).colors
+    np.testing.assert_array_equal(colors, [(1, 0, 0), (0, 0, 1), (0, 0, 1)])
+
+
+@pytest.mark.parametrize(("kind", "most"), [("ushort", 65535), ("uchar", 255), ("int", 255), ("uint", 255)])
+@pytest.mark.parametrize("has_uvs", [False, True])
+def test_whole_numbers_of_a_ply_are_codes_of_8_bits_or_of_16(tmp_path, kind, most, has_uvs):
+    codes = [(0, most, 77), (most // 3, 1, 200), (most, 5, 0)]
+    text = "ply\nformat ascii 1.0\nelement vertex 3\n"
+    text += "".join(f"property float {name}\n" for name in ("xyzst" if has_uvs else "xyz"))
+    text += "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    for point, color in zip(np.eye(3, 5 if has_uvs else 3), codes, strict=True):
+        text += " ".join(map(str, (*point, *color))) + "\n"
+    found = read(tmp_path / "a.ply", text + "3 0 1 2\n").colors
+    np.testing.assert_allclose(found, ws.srgb_to_linear(np.array(codes) / most), atol=1e-6)
+
+
 def test_of_a_texture_and_colors_the_texture_counts(tmp_path):
     text = "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\n"
     text += "".join(f"property float {name}\n" for name in "xyzst")

@@ -173,10 +173,10 @@ def test_what_has_ended_is_not_done_again(results, photos, monkeypatch):
 
 
 def test_a_fit_is_another_once_a_file_that_it_or_its_scene_names_has_changed(tmp_path):
-    (tmp_path / "fit.toml").write_text("scene = \"scene.toml\"\nphoto = 'photo.exr'\n")
+    (tmp_path / "fit.toml").write_text('scene = "scene.toml"\nphoto = "bob\'s.exr"\n')
     (tmp_path / "scene.toml").write_text('mesh = "ball.obj"\n')
     digests = {many._digest(tmp_path / "fit.toml")}
-    for count, name in enumerate(("photo.exr", "ball.obj", "scene.toml", "fit.toml"), start=2):
+    for count, name in enumerate(("bob's.exr", "ball.obj", "scene.toml", "fit.toml"), start=2):
         with (tmp_path / name).open("a") as file:
             file.write("# more\n")
         digests.add(many._digest(tmp_path / "fit.toml"))
@@ -344,6 +344,19 @@ def test_fits_are_named_by_their_paths(tree, where, names):
     assert [*found] == names and all(file.is_file() for file in found.values())
 
 
+def test_several_files_are_named_from_the_folder_that_all_are_in(tree):
+    assert [*inverse.find_fits([tree / "x" / "fit.toml", tree / "y" / "pose.toml"])] == ["x", "y/pose"]
+    with pytest.raises(FileNotFoundError, match="none.toml"):
+        inverse.find_fits([tree / "x" / "fit.toml", tree / "none.toml"])
+
+
+def test_the_folder_of_one_fit_does_not_take_many(tree, tmp_path):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "checkpoint").touch()
+    with pytest.raises(FileExistsError, match="got the folder of one fit"):
+        inverse.fit_many(inverse.find_fits(tree), tmp_path / "one")
+
+
 def test_a_fit_file_is_one(tree):
     assert not many.is_of_many(tree / "y.toml")
     (tree / "[1].toml").touch()
@@ -355,7 +368,9 @@ def test_names_of_one_folder_are_refused(tree):
         inverse.find_fits(tree / "**" / "*.toml")
     with pytest.raises(FileNotFoundError, match=r"no\*: no fit file"):
         inverse.find_fits(tree / "no*")
-    for name in ("../a", "/a", "", many.TABLE):
+    for name in ("../a", "/a", "", ".", many.TABLE):
         with pytest.raises(ValueError, match="expected that of a folder"):
             inverse.fit_many({name: tree / "y.toml"}, tree / "out")
+    with pytest.raises(ValueError, match=r"the names 'a' and './a' of one folder"):
+        inverse.fit_many({"a": tree / "y.toml", "./a": tree / "y.toml"}, tree / "out")
     assert not (tree / "out").exists()

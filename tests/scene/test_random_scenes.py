@@ -124,6 +124,13 @@ def test_bodies_keep_colors_of_their_vertices():
         np.testing.assert_array_equal(body.albedo, own.albedo)
 
 
+def test_bodies_keep_the_one_color_of_their_mesh():
+    flat = ws.plane(1.0, 1)
+    red = ws.Mesh(flat.positions, flat.faces, colors=np.tile((1.0, 0, 0), (4, 1)))
+    for body in RandomScenes(0, bodies=[ws.Body(red, blockers=0)])[0].bodies[:-1]:
+        np.testing.assert_array_equal(body.albedo, (1, 0, 0))
+
+
 def test_primitives_are_closed_face_outward_and_are_made_once():
     assert primitives() is primitives()
     for body in primitives():

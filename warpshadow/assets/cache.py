@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -24,6 +25,10 @@ KINDS: Mapping[Kind, str] = {
 """What is kept, by the folder that it is in."""
 
 
+_OWN_NAME = re.compile(r"[0-9a-f]{32,}\.npz|\.[0-9a-f]{12}\.unfinished\.npz")
+"""Names of what is kept, and of what a killed process left: nothing else in the folders is ours."""
+
+
 def cache_folder() -> Path:
     """Where all is kept: WARPSHADOW_CACHE_DIR, or the platform's folder for caches."""
     from platformdirs import user_cache_path
@@ -39,7 +44,8 @@ def cache_path(kind: Kind, key: str) -> Path:
 
 def cached_files(kind: Kind) -> list[Path]:
     """What is kept of a kind, and what a killed process left half written."""
-    return sorted((cache_folder() / kind).glob("*.npz"))
+    found = (cache_folder() / kind).glob("*.npz")
+    return sorted(path for path in found if _OWN_NAME.fullmatch(path.name) and path.is_file())
 
 
 def remembered(

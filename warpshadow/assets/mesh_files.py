@@ -60,9 +60,9 @@ def load_mesh(path: MeshSource) -> Mesh:
     uvs are kept only when every face has them. Textures are not read: they are a body's, and ``Body(path)`` takes them.
 
     Colors are, where each vertex has one: those of vertices; of faces, where no vertex has faces of two colors; and the
-    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF, also
-    as trimesh has loaded it, and USD (``displayColor``) have linear values. Transparency does not count, nor the ``Kd``
-    of .mtl files.
+    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and USD
+    (``displayColor``) have linear values; so have meshes of trimesh whose ``source`` is glTF, but not copies of them.
+    Transparency does not count, nor the ``Kd`` of .mtl files.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the
@@ -235,11 +235,12 @@ def _colored(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> Mes
 
     Args:
         part: Their mesh.
-        values: Unsigned codes of a picture, or floats from 0 to 1, of shape [vertex, 3 or 4] or [face, 3, 3 or 4].
+        values: Codes, up to 65535 in unsigned numbers of 16 bits, up to 255 in other whole ones; or floats from 0 to 1;
+            of shape [vertex, 3 or 4] or [face, 3, 3 or 4].
         linear: Whether they are; else they are sRGB.
     """
     values = values[..., :3]
-    values = values / np.iinfo(values.dtype).max if values.dtype.kind == "u" else values.astype(np.float64)
+    values = values / (65535 if values.dtype == np.uint16 else 255 if values.dtype.kind in "ui" else 1.0)
     if not ((values >= 0) & (values <= 1)).all():
         why = f"got values from {values.min():g} to {values.max():g}, expected 0 to 1"
         return part._replace(colorless=f"colors dropped ({why})")
@@ -264,8 +265,9 @@ def _read_obj(path: Path) -> list[MeshPart]:
             match line.partition("#")[0].split():
                 case ["v", x, y, z, *rest]:
                     positions.append((float(x), float(y), float(z)))
-                    if len(rest) >= 3:  # one number is a weight
-                        colors.append((float(rest[0]), float(rest[1]), float(rest[2])))
+                    if len(rest) >= 3:  # a number before the color, or one alone, is a weight
+                        r, g, b = rest[len(rest) > 3 :][:3]
+                        colors.append((float(r), float(g), float(b)))
                 case ["vt", u, *rest]:
                     uvs.append((float(u), float(rest[0]) if rest else 0.0))
                 case ["mtllib", *words]:
@@ -384,12 +386,20 @@ def _trimesh_part(shape, of_file: bool) -> MeshPart:
 
 def _trimesh_colored(part: MeshPart, shape) -> MeshPart:
     """Give a part the colors that a mesh of trimesh has: of vertices, of faces, or of its material."""
+    from trimesh.visual import to_rgba
+
     visual, linear = shape.visual, shape.source.file_type in ("glb", "gltf")
     if visual.kind == "face":
         return _colored(part, visual.face_colors[:, None].repeat(3, axis=1), linear=linear)
+    of_ply = _ply_colors(shape)
+    if visual.kind == "vertex":
+        colors = visual.vertex_colors
+        if of_ply is not None and np.array_equal(to_rgba(of_ply)[:, :3], colors[:, :3]):
+            colors = of_ply  # which trimesh cut to 8 bits
+        return _colored(part, colors, linear=linear)
     if visual.kind != "texture":
-        return part if visual.kind is None else _colored(part, visual.vertex_colors, linear=linear)
-    colors = visual.vertex_attributes["color"] if "color" in visual.vertex_attributes else _ply_colors(shape)
+        return part
+    colors = visual.vertex_attributes.get("color", of_ply)
     if colors is not None:
         part = _colored(part, colors, linear=linear)
     factor = getattr(visual.material, "baseColorFactor", None)  # in steps of 1/255, and linear

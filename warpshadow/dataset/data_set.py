@@ -69,6 +69,9 @@ class DataSet:
         check.instance("recipe", recipe, Recipe, "a Recipe; load_recipe(path) reads one")
         where = check.device("device", device)
         self.recipe, self.device = recipe, str(where)
+        for split in recipe.splits:
+            if not self.numbers(split):
+                raise RecipeError(f"[splits]: {split} got none of the {recipe.images} images, expected one or more")
         for kept in (_read_body, _read_map):
             kept.cache_clear()  # of files as they were
         fits = recipe.visibility.method in (*SPHERE_METHODS, AUTO) or "spheres" in recipe.layers
@@ -98,7 +101,7 @@ class DataSet:
         for kind, hashes in self.hashes.items():
             owners = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
             names[kind] = tuple(name for name, owner in owners.items() if owner == split)
-            if not names[kind] and self.numbers(split):
+            if not names[kind]:
                 counts = ", ".join(f"{each} {list(owners.values()).count(each)}" for each in self.recipe.splits)
                 raise RecipeError(
                     f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
@@ -178,7 +181,7 @@ def _read_body(path: Path, blockers: int, creased: float | None, fits: bool, dev
     body = Body(path, blockers=blockers)
     content_hash = body.mesh.content_hash
     colors = body.albedo if body.texture is None else body.texture
-    if colors.ndim > 1:
+    if body.texture is not None or body.mesh.colors is not None:
         content_hash = hashlib.sha256(content_hash.encode() + colors.tobytes()).hexdigest()
     body = body if creased is None else body.creased(creased)
     return _Read(_fitted(body, device) if fits else body, content_hash)

@@ -16,7 +16,6 @@ import json
 import math
 import os
 import pickle
-import re
 import time
 import traceback
 import warnings
@@ -36,10 +35,11 @@ from warpshadow.device.workers import run_tasks
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.descent import GOOD_ENDINGS, FitWarning, default_optimizer
 from warpshadow.inverse.fit_file import Fit, load_fit
-from warpshadow.inverse.folder import CHECKPOINT, check_folder, check_writable
+from warpshadow.inverse.folder import CHECKPOINT, check_folder, check_writable, has_checkpoint
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import Report
 from warpshadow.inverse.schedule import Stage, stages_for
+from warpshadow.scene import toml_tables
 
 TABLE = "table.csv"
 """The file, in the folder of all results, that says how each fit ended."""
@@ -47,7 +47,6 @@ TABLE = "table.csv"
 _FIT_FILE = "fit.toml"  # what a folder is searched for
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
-_QUOTED = re.compile(r"""["']([^"'\n]+)["']""")
 _PATIENCE = 60.0
 """How long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]."""
 
@@ -122,6 +121,7 @@ def fit_many(
 
     Raises:
         CheckpointError: while other fits are written into the folder.
+        FileExistsError: for the folder of a single fit.
         ConnectionError: where the Ray cluster cannot be reached.
     """
     if workers is not None:
@@ -130,6 +130,8 @@ def fit_many(
     check.nonnegative("checkpoint_seconds", checkpoint_seconds)
     folder = Path(folder).absolute()
     check_writable(folder)
+    if has_checkpoint(folder):
+        raise FileExistsError(f"{folder}: got the folder of one fit, expected a new one or that of many")
     if isinstance(fits, Mapping):
         _check_names(fits)
     named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", each) for k, each in enumerate(fits))
@@ -231,7 +233,11 @@ def _marks(file: Path) -> Iterator[str]:
     """The text of a TOML file, and size and time of all files that it names; of TOML files among them the same."""
     text = file.read_text(encoding="utf-8", errors="replace")
     yield text
-    for name in sorted(set(_QUOTED.findall(text))):
+    try:
+        table = toml_tables.read(file, "file")
+    except ValueError:  # which the fit says, too
+        return
+    for name in sorted(set(_texts(table))):
         named = file.parent / name
         with contextlib.suppress(OSError, ValueError):  # a text that is no name of a file
             if named.is_file():
@@ -239,6 +245,15 @@ def _marks(file: Path) -> Iterator[str]:
                 yield f"{name} {status.st_size} {status.st_mtime_ns}"
                 if named.suffix == ".toml" and named != file:
                     yield from _marks(named)
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All texts in what a TOML file holds."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (dict, list)):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
 
 
 def _do(job: _Job) -> Ending:
@@ -326,16 +341,16 @@ def is_of_many(where: AnyPath) -> bool:
     return path.is_dir() or path.suffix == ".txt" or (glob.has_magic(os.fspath(where)) and not path.is_file())
 
 
-def find_fits(where: AnyPath) -> dict[str, Path]:
+def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
     """Find fit files and name them, whatever others there are.
 
     A name is the file's path without its suffix: from the first folder of the pattern that has a wildcard; from the
-    searched folder; from the list's folder. Where the pattern says what the last part is, and for files called
-    fit.toml, that part is left out.
+    searched folder; from the list's folder; from the folder that all of several files are in. Where the pattern says
+    what the last part is, and for files called fit.toml, that part is left out.
 
     Args:
         where: A pattern, such as "photos/*/fit.toml" or "fits/**/*.toml"; a folder, which is searched for files called
-            fit.toml; or a list, a .txt file with a path on each line, relative to it.
+            fit.toml; a list, a .txt file with a path on each line, relative to it; or several files.
 
     Returns:
         Files by name, in the order of names; those of a list in its own.
@@ -344,6 +359,9 @@ def find_fits(where: AnyPath) -> dict[str, Path]:
         FileNotFoundError: where there are none.
         ValueError: where the results of two would be in one folder.
     """
+    if not isinstance(where, (str, os.PathLike)):
+        found = [check.file("file", each).absolute() for each in where]
+        return _named(found, Path(os.path.commonpath([file.parent for file in found])), _FIT_FILE)
     path, text = Path(where), os.fspath(where)
     if path.is_dir():
         start, found, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
@@ -356,13 +374,18 @@ def find_fits(where: AnyPath) -> dict[str, Path]:
         last = path.name
     if not found:
         raise FileNotFoundError(f"{where}: no fit file, expected some")
+    return _named(found, start, last)
+
+
+def _named(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:
+    """Files by their paths from a folder, but for a last part."""
     named: dict[str, Path] = {}
-    for file in found:
+    for file in files:
         relative = PurePath(os.path.relpath(file, start))
         inner = relative.parent if file.name == last else relative.with_suffix("")
         name = "/".join(part for part in inner.parts if part != "..") or start.resolve().name
         if name in named:
-            raise ValueError(f"{where}: got {named[name]} and {file}, whose results would both be called {name!r}")
+            raise ValueError(f"got {named[name]} and {file}, whose results would both be called {name!r}")
         named[name] = file
     _check_names(named)
     return named
@@ -370,10 +393,15 @@ def find_fits(where: AnyPath) -> dict[str, Path]:
 
 def _check_names(names: Collection[str]) -> None:
     """Raise ValueError unless each name is that of a folder of its own."""
+    named: dict[PurePath, str] = {}
     for name in names:
         path = PurePath(name)
-        if not name or path.is_absolute() or ".." in path.parts or path == PurePath(TABLE):
+        if not path.parts or path.is_absolute() or ".." in path.parts or path == PurePath(TABLE):
             raise ValueError(f"fits: got the name {name!r}, expected that of a folder in the folder of results")
+        if path in named:
+            raise ValueError(f"fits: got the names {named[path]!r} and {name!r} of one folder")
+        named[path] = name
+    for path, name in named.items():
         for outer in path.parents:
-            if str(outer) in names:
-                raise ValueError(f"fits: got the names {str(outer)!r} and {name!r}, of which one is in the other")
+            if outer in named:
+                raise ValueError(f"fits: got the names {named[outer]!r} and {name!r}, of which one is in the other")

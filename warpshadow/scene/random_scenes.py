@@ -259,7 +259,7 @@ def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: R
     color = rng.uniform(*ranges.albedo, 3)
     body = replace(
         prototype,
-        albedo=color if prototype.albedo.ndim == 1 else prototype.albedo,
+        albedo=color if prototype.mesh.colors is None and prototype.albedo.ndim == 1 else prototype.albedo,
         rotation=rng.uniform(0, 360) * axis,
         translation=np.zeros(3),
         scale=_drawn(rng, ranges.size) / (high - low).max(),

@@ -214,6 +214,8 @@ def tune(
     if wanted is None or None not in given.values():
         raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
     check.positive("error" if milliseconds is None else "milliseconds", wanted)
+    if error is not None and error > 1:
+        raise ValueError(f"error: got {error:g}, expected up to 1: 0.03 is 3%")
     if bounces is not None:
         check_bounces(bounces)
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
