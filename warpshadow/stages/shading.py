@@ -13,6 +13,7 @@ from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, check_count
+from warpshadow.stages.transfer import are_up, cosines
 
 _SLAB = 256
 """Receivers whose gradients to light a thread sums before it adds them to the others'."""
@@ -228,12 +229,6 @@ def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -
 # ---------------------------------------------------------------------------------------------------- known light
 
 
-@wp.func(inline=True)
-def _cosines(normal: wp.vec3, directions: wp.array2d(dtype=Chunk), chunk: int):
-    """Cosines of a chunk of directions."""
-    return normal[0] * directions[0, chunk] + normal[1] * directions[1, chunk] + normal[2] * directions[2, chunk]
-
-
 @wp.kernel(enable_backward=False)
 def _shade_cells(
     first_row: int,
@@ -255,7 +250,7 @@ def _shade_cells(
     green = Chunk(0.0)
     blue = Chunk(0.0)
     for chunk in range(directions.shape[1]):
-        cosine = wp.max(_cosines(normal, directions, chunk), Chunk(0.0))
+        cosine = wp.max(cosines(normal, directions, chunk), Chunk(0.0))
         transfer = wp.cw_mul(cosine, transmittance[batch, receiver, chunk])
         red += wp.cw_mul(transfer, light[lit, 0, chunk])
         green += wp.cw_mul(transfer, light[lit, 1, chunk])
@@ -287,14 +282,13 @@ def _shade_cells_adjoint(
     y = Chunk(0.0)
     z = Chunk(0.0)
     for chunk in range(directions.shape[1]):
-        cosine = _cosines(normal, directions, chunk)
+        cosine = cosines(normal, directions, chunk)
         pull = adj[0] * light[lit, 0, chunk] + adj[1] * light[lit, 1, chunk] + adj[2] * light[lit, 2, chunk]
         if adj_transmittance:
             adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + wp.cw_mul(
                 pull, wp.max(cosine, Chunk(0.0))
             )
-        is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
-        pull = wp.cw_mul(wp.cw_mul(pull, transmittance[batch, receiver, chunk]), is_up)
+        pull = wp.cw_mul(wp.cw_mul(pull, transmittance[batch, receiver, chunk]), are_up(cosine))
         x += wp.cw_mul(pull, directions[0, chunk])
         y += wp.cw_mul(pull, directions[1, chunk])
         z += wp.cw_mul(pull, directions[2, chunk])

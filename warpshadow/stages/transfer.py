@@ -284,6 +284,18 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     )
 
 
+@wp.func(inline=True)
+def cosines(normal: wp.vec3, directions: wp.array2d(dtype=Chunk), chunk: int):
+    """Cosines of a chunk of directions."""
+    return normal[0] * directions[0, chunk] + normal[1] * directions[1, chunk] + normal[2] * directions[2, chunk]
+
+
+@wp.func(inline=True)
+def are_up(cosine: Chunk):
+    """1 where a cosine is above 0, else 0."""
+    return wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+
+
 @wp.kernel(enable_backward=False)
 def _transfer_directions(
     first_row: int,
@@ -300,7 +312,7 @@ def _transfer_directions(
     batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
     n = normals[batch, vertex]
     for chunk in range(directions.shape[1]):
-        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
+        cosine = cosines(n, directions, chunk)
         cosine = weight * wp.max(cosine, Chunk(0.0))
         transfer[batch, vertex, chunk] = wp.cw_mul(cosine, transmittance[batch, vertex, chunk])
 
@@ -324,14 +336,13 @@ def _transfer_directions_adjoint(
     n = normals[batch, vertex]
     total = wp.vec3()
     for chunk in range(directions.shape[1]):
-        cosine = n[0] * directions[0, chunk] + n[1] * directions[1, chunk] + n[2] * directions[2, chunk]
+        cosine = cosines(n, directions, chunk)
         adj = weight * adj_transfer[batch, vertex, chunk]
         if adj_transmittance:
             adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
                 adj, wp.max(cosine, Chunk(0.0))
             )
-        is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
-        adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), is_up)
+        adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), are_up(cosine))
         total += wp.vec3(
             wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
         )

@@ -71,7 +71,11 @@ def _make_site_functions(lanes: int) -> _SiteFunctions:
     Rows = wp.types.vector(length=lanes, dtype=wp.int32)
 
     @wp.func
-    def load_sites(rows: wp.array(dtype=wp.vec3i), weights: wp.array(dtype=wp.vec3), group: int):
+    def load_sites(
+        all_rows: wp.array2d(dtype=wp.vec3i), all_weights: wp.array2d(dtype=wp.vec3), batch: int, group: int
+    ):
+        rows = all_rows[instance_in(batch, all_rows.shape[0])]
+        weights = all_weights[instance_in(batch, all_weights.shape[0])]
         sites = Sites()
         sites.corner_count = 1
         for lane in range(lanes):
@@ -153,8 +157,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         batch, group = find_group(item, own.shape[1])
         normal = load(normals[instance_in(batch, normals.shape[0])], group)
-        weights_of_places = place_weights[instance_in(batch, place_weights.shape[0])]
-        sites = load_sites(rows[instance_in(batch, rows.shape[0])], weights_of_places, group)
+        sites = load_sites(rows, place_weights, batch, group)
         turn = instance_in(batch, all_counts.shape[0])
         shares = scratch[scratch_place(worker, item), 0]
         columns = scratch[scratch_place(worker, item), 1]
@@ -226,8 +229,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         batch, group = find_group(item, adj_own.shape[1])
         normal = load(normals[instance_in(batch, normals.shape[0])], group)
-        weights_of_places = place_weights[instance_in(batch, place_weights.shape[0])]
-        sites = load_sites(rows[instance_in(batch, rows.shape[0])], weights_of_places, group)
+        sites = load_sites(rows, place_weights, batch, group)
         turn = instance_in(batch, all_counts.shape[0])
         place = scratch_place(worker, item)
         shares = scratch[place, 0]
