@@ -261,12 +261,47 @@ def test_gradients_of_two_images_in_any_order_do_not_mix(renderer):
     torch.testing.assert_close(of_second, 3 * alone)
 
 
-def test_a_second_derivative_is_refused_instead_of_being_wrong(renderer):
-    light = random(renderer.basis.size, 3)
-    loss = renderer(light).square().sum()
-    (gradient,) = torch.autograd.grad(loss, light, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.square().sum().backward()
+def test_a_gradient_of_what_is_linear_can_be_differentiated_again(renderer):
+    """Against differences of gradients, which have no truncation error here: light and texture are linear each."""
+    values = random(renderer.basis.size, 3), random(8, 8, 3, seed=1)
+    steps = random(renderer.basis.size, 3, seed=2).detach(), random(8, 8, 3, seed=3).detach()
+
+    def loss(light: torch.Tensor, texture: torch.Tensor) -> torch.Tensor:
+        return renderer(light, textures=[None, texture]).double().square().sum()
+
+    def gradients(factor: float, *, of: int) -> tuple[torch.Tensor, ...]:
+        moved = [value + factor * step * (n == of) for n, (value, step) in enumerate(zip(values, steps, strict=True))]
+        return torch.autograd.grad(loss(*moved), moved)
+
+    found = torch.autograd.grad(loss(*values), values, create_graph=True)
+    for changed, step in enumerate(steps):
+        ends = zip(gradients(1.0, of=changed), gradients(-1.0, of=changed), strict=True)
+        expected = [0.5 * (one - other) for one, other in ends]
+        along = (found[changed] * step).sum()
+        for got, wanted in zip(torch.autograd.grad(along, values, retain_graph=True), expected, strict=True):
+            torch.testing.assert_close(got, wanted, rtol=DIFFERENCE, atol=DIFFERENCE * float(wanted.abs().max()))
+    shown, along = torch.autograd.functional.jvp(renderer, values[0].detach(), steps[0])
+    torch.testing.assert_close(shown[..., :3] + along[..., :3], renderer(values[0] + steps[0])[..., :3])
+
+
+def test_other_second_derivatives_are_refused_instead_of_being_0(renderer):
+    with pytest.raises(NotImplementedError, match=r"^parameters: got asked for a second derivative"):
+        torch.autograd.functional.hessian(lambda turns: rotation_matrices(turns).sum(), torch.ones(3))
+    light, poses = random(renderer.basis.size, 3), renderer.scene_poses()
+    geometry = renderer.placed(*poses)
+    centers = geometry.centers.clone().requires_grad_()
+
+    def loss() -> torch.Tensor:
+        return renderer(light, geometry=(geometry.positions, centers, geometry.radii)).square().sum()
+
+    (gradient,) = torch.autograd.grad(loss(), centers, create_graph=True)
+    total = loss() + gradient.square().sum()  # a penalty that torch would leave out without a word
+    with pytest.raises(
+        NotImplementedError, match=r"^geometry.centers: got .* of second order there are those of light"
+    ):
+        torch.autograd.grad(total, centers)
+    with pytest.raises(NotImplementedError, match="forward mode AD"), torch.autograd.forward_ad.dual_level():
+        renderer(torch.autograd.forward_ad.make_dual(light.detach(), light.detach()))
 
 
 def test_without_gradients_nothing_is_recorded(renderer):

@@ -1,6 +1,6 @@
 """Arguments: tensors that become those of a function of Warp arrays, checked."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,14 +79,19 @@ class Arguments:
             found[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
         return found
 
-    def apply(self, function: Callable[[Mapping[str, wp.array]], Any]) -> Any:
-        """Apply a function of arrays by their names; results lose a batch dimension that no tensor had."""
+    def apply(self, function: Callable[[Mapping[str, wp.array]], Any], *, affine: Collection[str] = ()) -> Any:
+        """Apply a function of arrays by their names, as :func:`~warpshadow.torch.apply` does.
+
+        Results lose a batch dimension that no tensor had.
+        """
         self._common_batch()
         results = apply(
             lambda *arrays: function(dict(zip(self.names, arrays, strict=True))),
             *self.tensors,
             dtypes=self.dtypes,
             device=self.device,
+            names=self.names,
+            affine=affine,
         )
         if self._has_batch:
             return results

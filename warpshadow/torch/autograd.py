@@ -4,7 +4,8 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from typing import overload
 
 import torch
@@ -20,6 +21,8 @@ def apply(
     *tensors: torch.Tensor,
     dtypes: Sequence[type],
     device: torch.device | None = None,
+    names: Sequence[str] | None = None,
+    affine: Collection[str] = (),
 ) -> tuple[torch.Tensor, ...]: ...
 
 
@@ -29,6 +32,8 @@ def apply(
     *tensors: torch.Tensor,
     dtypes: Sequence[type],
     device: torch.device | None = None,
+    names: Sequence[str] | None = None,
+    affine: Collection[str] = (),
 ) -> torch.Tensor: ...
 
 
@@ -37,6 +42,8 @@ def apply(
     *tensors: torch.Tensor,
     dtypes: Sequence[type],
     device: torch.device | None = None,
+    names: Sequence[str] | None = None,
+    affine: Collection[str] = (),
 ) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """Apply a differentiable function of Warp arrays to tensors.
 
@@ -47,19 +54,26 @@ def apply(
             is an array of vec3 of shape [batch, vertex].
         dtypes: Warp's dtype of each.
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
+        names: What messages call the tensors, by default ``tensors[0]`` and so on.
+        affine: Names of tensors in each of which alone the function is affine.
 
     Returns:
         The array as a tensor, or a tuple of tensors for a tuple of arrays.
 
-    Differentiable: as the function is, once.
+    Raises:
+        NotImplementedError: where a gradient to a tensor that is not among the affine ones is differentiated again.
+
+    Differentiable: as the function is, once; gradients to affine tensors again, in all tensors.
     """
-    for number, tensor in enumerate(tensors):
-        check_float32(f"tensors[{number}]", tensor)
+    names = names or [f"tensors[{number}]" for number in range(len(tensors))]
+    for name, tensor in zip(names, tensors, strict=True):
+        check_float32(name, tensor)
     wp.init()
     if torch.get_num_threads() > 1:
         _let_waiting_threads_sleep()
     wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
-    results = _WarpFunction.apply(function, tuple(dtypes), wants, device or tensors[0].device, *tensors)
+    call = _Call(function, tuple(dtypes), device or tensors[0].device, tuple(names), frozenset(affine))
+    results = _WarpFunction.apply(call, wants, *tensors)
     return results if len(results) > 1 else results[0]
 
 
@@ -98,51 +112,119 @@ def as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
     return array
 
 
+@dataclass(frozen=True)
+class _Call:
+    """A function that is applied to tensors, and the arguments of :func:`apply`."""
+
+    function: Callable[..., wp.array | tuple[wp.array, ...]]
+    dtypes: tuple[type, ...]
+    device: torch.device
+    names: tuple[str, ...]
+    affine: frozenset[str]
+
+    def moved(self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+        """How the results change as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
+
+        Differentiable: tensors, directions.
+        """
+        total: list[torch.Tensor] = []
+        for number, (name, direction) in enumerate(zip(self.names, directions, strict=True)):
+            if direction is None:
+                continue
+            if name not in self.affine:
+                known = ", ".join(each for each in self.names if each in self.affine)
+                raise NotImplementedError(
+                    f"{name}: got asked for a second derivative (create_graph=True, hessian or functional.jvp), "
+                    f"expected one of first order{f'; of second order there are those of {known}' if known else ''}"
+                )
+            ends = (self._at(tensors, number, end) for end in (direction, torch.zeros_like(direction)))
+            change = [one - other for one, other in zip(*ends, strict=True)]
+            total = [one + other for one, other in zip(total, change, strict=True)] if total else change
+        return total
+
+    def _at(self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The results where one tensor has another value."""
+        given = [*tensors[:number], value, *tensors[number + 1 :]]
+        wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in given)
+        return _WarpFunction.apply(self, wants, *given)
+
+
+class _Playback:
+    """A recorded call, to be played back as often as asked."""
+
+    def __init__(self, tape: wp.Tape, arguments: list[wp.array], results: tuple[wp.array, ...]):
+        self._tape, self._arguments, self._results, self._is_played = tape, arguments, results, False
+
+    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each argument, given those of the results; None where it requires none."""
+        with one_call, _current_stream(adjoints[0].device), unrecorded():
+            if self._is_played:  # before, gradients are zero
+                self._tape.zero()
+            self._is_played = True
+            # copies, since memory shared with torch is reused behind the tape's back
+            for result, adjoint in zip(self._results, adjoints, strict=True):
+                if result.requires_grad:
+                    wp.copy(result.grad, wp.from_torch(adjoint.detach().contiguous(), dtype=result.dtype))
+            self._tape.backward()
+            return tuple(
+                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
+                for argument in self._arguments
+            )
+
+
 class _WarpFunction(torch.autograd.Function):
-    """Records Warp launches on a tape in forward and plays it back in backward, as often as asked."""
+    """Records Warp launches on a tape in forward and plays it back in backward."""
 
     @staticmethod
-    def forward(
-        ctx,
-        function: Callable,
-        dtypes: tuple[type, ...],
-        wants: tuple[bool, ...],
-        device: torch.device,
-        *tensors: torch.Tensor,
-    ):
-        arguments = [as_array(*pair) for pair in zip(tensors, dtypes, strict=True)]
+    def forward(ctx, call: _Call, wants: tuple[bool, ...], *tensors: torch.Tensor):
+        arguments = [as_array(*pair) for pair in zip(tensors, call.dtypes, strict=True)]
         # streams are the device's, as Warp has it, not a thread's
-        with one_call, _current_stream(device), recorded() if any(wants) else unrecorded() as tape:
+        with one_call, _current_stream(call.device), recorded() if any(wants) else unrecorded() as tape:
             for argument, is_wanted in zip(arguments, wants, strict=True):
                 argument.requires_grad = is_wanted  # here, so that a graph that is captured zeroes the gradient
-            results = function(*arguments)
+            results = call.function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
         outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
         if any(wants):
             ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
-            ctx.tape, ctx.arguments, ctx.results, ctx.is_played = tape, arguments, results, False
+            ctx.call, ctx.playback = call, _Playback(tape, arguments, results)
             pairs = zip(outputs, results, strict=True)
             ctx.mark_non_differentiable(*(output for output, result in pairs if not result.requires_grad))
         return outputs
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients: torch.Tensor):
-        ctx.saved_tensors  # noqa: B018
-        with one_call, _current_stream(gradients[0].device), unrecorded():
-            if ctx.is_played:  # before, gradients are zero
-                ctx.tape.zero()
-            ctx.is_played = True
-            # copies, since memory shared with torch is reused behind the tape's back
-            for result, gradient in zip(ctx.results, gradients, strict=True):
-                if result.requires_grad:
-                    wp.copy(result.grad, wp.from_torch(gradient.detach().contiguous(), dtype=result.dtype))
-            ctx.tape.backward()
-            found = [
-                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
-                for argument in ctx.arguments
-            ]
-        return None, None, None, None, *found
+    def backward(ctx, *adjoints: torch.Tensor):
+        tensors = ctx.saved_tensors
+        if torch.is_grad_enabled():  # create_graph=True
+            return None, None, *_WarpAdjoint.apply(ctx.call, ctx.playback, len(tensors), *tensors, *adjoints)
+        return None, None, *ctx.playback.gradients(adjoints)
+
+
+class _WarpAdjoint(torch.autograd.Function):
+    """Gradients that may be differentiated again: d⟨v, Jᵀa⟩ = d⟨a, J v⟩, and J v of an affine function is one call."""
+
+    @staticmethod
+    def forward(ctx, call: _Call, playback: _Playback, count: int, *given: torch.Tensor):
+        ctx.call, ctx.count = call, count
+        ctx.save_for_backward(*given)
+        ctx.set_materialize_grads(False)
+        return playback.gradients(given[count:])
+
+    @staticmethod
+    def backward(ctx, *directions: torch.Tensor | None):
+        creates_graph = torch.is_grad_enabled()
+        with torch.enable_grad():
+            # seen anew, so that a path from one of them to another is not followed here
+            given = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
+            changes = ctx.call.moved(given[: ctx.count], directions)
+            pairs = zip(given[ctx.count :], changes, strict=True)
+            total = torch.stack([(adjoint * change).sum() for adjoint, change in pairs]).sum()
+            wanted = [tensor for tensor in given if tensor.requires_grad] if total.requires_grad else []
+            found = iter(
+                torch.autograd.grad(total, wanted, create_graph=creates_graph, allow_unused=True) if wanted else ()
+            )
+        gradients = [next(found, None) if tensor.requires_grad else None for tensor in given]
+        return None, None, None, *gradients
 
 
 def _current_stream(device: torch.device) -> wp.ScopedStream:

@@ -136,7 +136,9 @@ class TorchRenderer(torch.nn.Module):
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
 
-        Differentiable: light, albedo, textures, geometry, clip_matrices; stages/README.md says how exactly.
+        Differentiable: light, albedo, textures, geometry, clip_matrices; stages/README.md says how exactly. Gradients
+            to light, and where no light bounces to albedo and textures, may be differentiated again, in all of these;
+            others raise NotImplementedError then.
         """
         given = self._given(light, albedo, textures, geometry, clip_matrices)
 
@@ -145,7 +147,8 @@ class TorchRenderer(torch.nn.Module):
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
             return self.warp.draw(**inputs, view=self.warp.view(*seen))
 
-        return given.apply(draw)
+        is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
+        return given.apply(draw, affine=[name for name in given.names if is_affine.get(name.partition("[")[0])])
 
     @one_at_a_time
     def insert(

@@ -33,5 +33,5 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
     rows = parameters.reshape(1, -1, *item_shape(dtype))
-    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device)
+    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device, names=["parameters"])
     return matrices.reshape(*parameters.shape[:-1], 3, 3)
