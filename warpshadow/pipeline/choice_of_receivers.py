@@ -1,4 +1,4 @@
-"""The choice of receivers: bodies whose faces are large in the image are shaded by pixel, others at vertices.
+"""The choice of receivers: bodies whose faces are large or long in the image are shaded by pixel, others at vertices.
 
 Between vertices light is interpolated, which shows where a face is large. Measured on a ground of 6 × 6 units under a
 sky with a sun, 256 × 256 pixels with 4 samples each, error of the image against rays, two cores:
@@ -6,6 +6,17 @@ sky with a sun, 256 × 256 pixels with 4 samples each, error of the image agains
     quads    pixels a face    at vertices    by pixel
     32²      34               5.8%           2.9%, in 3.5 times the time
     64²      9                4.0%           2.9%, in 4 times the time
+
+Faces may be small and long: spokes, rails, sides of cylinders of two rings. So their longest edges count, too. Measured
+at 256 × 256 pixels, bodies of 2 units from 5.5 units away:
+
+    body                            pixels a face    length beyond which faces show 5% of the body's pixels
+    bunny, bear, spot, rocks        2.9–5.3          7.7–10.3 pixels
+    torus of 48 × 24 quads          14               12
+    ground of 64², of 32² quads     9, 34            13, 25
+    cylinder of 32, of 128 sides    120, 30          78, 75
+    capsule; wheel of 12 spokes     3.1; 6.4         56; 72
+    picket fence                    75               145
 
 A picture that is made once can afford that on its grounds and walls, where shadows' edges show most: a bunny of 64
 spheres on a ground of 6 × 6 units and 64² quads, and what a whole ``ws.render`` took, of a busy machine:
@@ -39,14 +50,36 @@ LARGE_SHARE = 2.0**-12
 COARSE_FACE = 400.0
 """… up to so many pixels: then interpolation shows whatever it costs, and draws a warning where it was asked for."""
 
+_LONG_SHARE = 0.05
+"""Share of a body's pixels that its longest faces show …"""
+
+_LENGTHS = 4.0
+"""… and how often such a face may be as long as the side of a square of as many pixels as an average face may have."""
+
+
+class FaceSize(NamedTuple):
+    """How large the faces of a body are in images."""
+
+    area: float
+    """Pixels of an average face that is seen [pixels²]."""
+    length: float
+    """Longest edge beyond which faces show 5% of the body's pixels [pixels]."""
+
+    def exceeds(self, area: float) -> bool:
+        """Whether an average face has more pixels, or long faces are longer than four times the side of so many."""
+        return max(self.area, (self.length / _LENGTHS) ** 2) > area
+
+    def __str__(self) -> str:
+        return f"its faces have {self.area:.2g} pixels each, and the long ones are {self.length:.2g} pixels long"
+
 
 class Choice(NamedTuple):
     """Where light is evaluated on a body."""
 
     receivers: str
     """At every "vertex", or at every "pixel" that shows the body."""
-    pixels_per_face: float | None
-    """Pixels of an average face that is seen; None where nobody had to know."""
+    size: FaceSize | None
+    """Of its faces; None where nobody had to know."""
 
 
 def choose_receivers(assembly: Assembly, cameras: Sequence[Camera]) -> list[Choice]:
@@ -57,13 +90,12 @@ def choose_receivers(assembly: Assembly, cameras: Sequence[Camera]) -> list[Choi
     wanted = [body.receivers for body in assembly.scene.bodies]
     if AUTO not in wanted:
         return [Choice(receivers, None) for receivers in wanted]
-    sizes = pixels_per_face((_seen_faces(assembly, camera) for camera in cameras), assembly)
+    sizes = face_sizes((_seen_faces(assembly, camera) for camera in cameras), assembly, cameras[0])
     share = LARGE_SHARE * cameras[0].width * cameras[0].height
     largest = min(max(LARGE_FACE, share), COARSE_FACE)
-    chosen = np.where(sizes > largest, "pixel", "vertex").tolist()
     return [
-        Choice(own if receivers == AUTO else receivers, float(size))
-        for own, receivers, size in zip(chosen, wanted, sizes, strict=True)
+        Choice(("pixel" if size.exceeds(largest) else "vertex") if receivers == AUTO else receivers, size)
+        for receivers, size in zip(wanted, sizes, strict=True)
     ]
 
 
@@ -97,27 +129,64 @@ def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:
     """Say what was chosen for each body that leaves it open, a line each."""
     return [
         f"Body {number} ({body.called!r}) has receivers at {'pixels' if choice.receivers == 'pixel' else 'vertices'}: "
-        f"its faces have {choice.pixels_per_face:.2g} pixels each."
+        f"{choice.size}."
         for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True))
-        if body.receivers == AUTO and choice.pixels_per_face is not None
+        if body.receivers == AUTO and choice.size is not None
     ]
 
 
-def pixels_per_face(images: Iterable[np.ndarray], assembly: Assembly) -> np.ndarray:
-    """Pixels over the number of faces that are seen, of each body, over images of face ids, −1 for none."""
-    count = len(assembly.scene.bodies)
-    pixel_counts, face_counts = np.zeros((2, count))
-    for face_ids in images:
-        seen = face_ids[face_ids >= 0]
-        pixel_counts += np.bincount(assembly.body_of_face[seen], minlength=count)
-        face_counts += np.bincount(assembly.body_of_face[np.unique(seen)], minlength=count)
-    return pixel_counts / np.maximum(face_counts, 1)
+def face_sizes(images: Iterable[tuple[np.ndarray, np.ndarray]], assembly: Assembly, camera: Camera) -> list[FaceSize]:
+    """How large the faces of each body are in images; 0 for bodies that none shows.
+
+    Args:
+        images: Of each the face that every sample sees, −1 for none, shape [height, width], and the vertices in clip
+            space, shape [vertex, 4].
+        assembly: The bodies.
+        camera: Has the images' size in pixels and their near plane.
+    """
+    bodies, counts, lengths = np.empty(0, int), np.empty(0), np.empty(0)
+    faces = assembly.faces.numpy()
+    for face_ids, clip_positions in images:
+        seen, sample_counts = np.unique(face_ids[face_ids >= 0], return_counts=True)
+        bodies = np.concatenate([bodies, assembly.body_of_face[seen]])
+        counts = np.concatenate([counts, sample_counts * (camera.width * camera.height / face_ids.size)])
+        lengths = np.concatenate([lengths, _longest_edges(clip_positions[faces[seen]], camera)])
+    return [_size_of(counts[bodies == body], lengths[bodies == body]) for body in range(len(assembly.scene.bodies))]
 
 
-def _seen_faces(assembly: Assembly, camera: Camera) -> np.ndarray:
-    """Face that each pixel sees of the scene, -1 for none; the bodies' spheres, which take long, need not be known."""
+def _size_of(pixel_counts: np.ndarray, lengths: np.ndarray) -> FaceSize:
+    if not len(lengths):
+        return FaceSize(0.0, 0.0)
+    falling = np.argsort(-lengths)
+    shares = np.cumsum(pixel_counts[falling]) / pixel_counts.sum()
+    return FaceSize(float(pixel_counts.mean()), float(lengths[falling][np.searchsorted(shares, _LONG_SHARE)]))
+
+
+def _longest_edges(corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """Longest edges of faces [pixels], given their corners in clip space [face, 3, 4].
+
+    Edges reach to the near plane, and into what is outside of the image: light is interpolated from there, too.
+    """
+    starts, ends = corners.astype(float), np.roll(corners, -1, axis=1).astype(float)
+    steps = ends - starts
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_near = np.nan_to_num((camera.near - starts[..., 3]) / steps[..., 3])
+    first = np.where(starts[..., 3] < camera.near, to_near, 0.0)
+    last = np.where(ends[..., 3] < camera.near, to_near, 1.0)
+    size = np.array([camera.width, camera.height])
+    points = (starts + np.clip(place, 0, 1)[..., None] * steps for place in (first, last))
+    start, end = (point[..., :2] / np.maximum(point[..., 3:], camera.near) * size / 2 for point in points)
+    return np.minimum(np.linalg.norm(end - start, axis=-1).max(axis=1), np.linalg.norm(size))
+
+
+def _seen_faces(assembly: Assembly, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Face that each pixel sees of the scene, −1 for none, and the vertices in clip space.
+
+    The bodies' spheres, which take long, need not be known.
+    """
     device = assembly.device
     positions = np.concatenate([body.world_mesh().positions for body in assembly.scene.bodies])
     clip_matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=device)
     clip_positions = to_clip(wp.array(positions[None], dtype=wp.vec3, device=device), clip_matrix)
-    return rasterize(clip_positions, assembly.faces, camera.width, camera.height).face_ids.numpy()
+    face_ids = rasterize(clip_positions, assembly.faces, camera.width, camera.height).face_ids
+    return face_ids.numpy()[0], clip_positions.numpy()[0]

@@ -25,7 +25,7 @@ from warpshadow.pipeline.choice_of_receivers import (
     COARSE_FACE,
     Choice,
     choose_receivers,
-    pixels_per_face,
+    face_sizes,
     receiver_notes,
     with_receivers,
 )
@@ -46,7 +46,6 @@ from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 
 METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
@@ -403,7 +402,7 @@ class Renderer:
     def _own_view(self) -> View:
         """What the cameras see of the scene; a warning tells of coarse faces."""
         view = self.view()
-        self._warn_of_coarse_faces(view.fragments)
+        self._warn_of_coarse_faces(view)
         return view
 
     @one_at_a_time
@@ -421,14 +420,19 @@ class Renderer:
             raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
         return view
 
-    def _warn_of_coarse_faces(self, fragments: Fragments) -> None:
+    def _warn_of_coarse_faces(self, view: View) -> None:
         """Say which bodies show faces so large that light at their corners alone misses shadows."""
-        sizes = pixels_per_face(fragments.face_ids.numpy(), self.assembly) / self.scene.supersampling**2
+        asked = [body.receivers == "vertex" for body in self._given_scene.bodies]
+        if self._method.lights_samples or not any(asked):
+            return
+        clip_positions = view.clip_positions.value(view.call).numpy()
+        images = zip(view.fragments.face_ids.numpy(), clip_positions, strict=True)
+        sizes = face_sizes(images, self.assembly, self.cameras[0])
         for number, (body, size) in enumerate(zip(self._given_scene.bodies, sizes, strict=True)):
-            if body.receivers == "vertex" and not self._method.lights_samples and size > COARSE_FACE:
+            if asked[number] and size.exceeds(COARSE_FACE):
                 check.warn(
-                    f"body {number} ({body.called!r}): a face covers {size:.0f} pixels on average, and light is "
-                    'evaluated at its corners alone; receivers = "auto" or "pixel" evaluates it at every pixel',
+                    f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
+                    'receivers = "auto" or "pixel" evaluates it at every pixel',
                 )
 
     # ------------------------------------------------------------------------------------------ light and reflectance

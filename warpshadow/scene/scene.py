@@ -168,8 +168,9 @@ class Body:
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow. "auto" leaves it to each renderer: by pixel where its cameras see
-            faces of more than 16 pixels on average (in images larger than 256 × 256, 1/4096 of the pixels, at most
-            400). Pictures that are made once, as by :func:`warpshadow.render`, show flat bodies by pixel.
+            faces of more than 16 pixels on average, or 5% of the body's pixels show faces longer than 16 pixels (in
+            images larger than 256 × 256, 1/4096 of the pixels, at most 400, and four times the root of that). Pictures
+            that are made once, as by :func:`warpshadow.render`, show flat bodies by pixel.
         self_shadows: What shadows it casts on itself, "traced" or of its "spheres", as for :class:`Visibility`; None
             for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
