@@ -79,7 +79,8 @@ def load(path: AnyPath) -> dict[str, Any] | None:
         one where it is missing because a process ended between two renames; None where there is neither.
 
     Raises:
-        CheckpointError: where files are there but none is whole.
+        CheckpointError: where files are there but none is whole; and for a whole one that holds more than data, of
+            which nothing is executed.
     """
     path = Path(path)
     faults: list[str] = []
@@ -90,7 +91,7 @@ def load(path: AnyPath) -> dict[str, Any] | None:
         if payload is not None:
             if faults:
                 check.warn(f"{faults[0]}; going on from {candidate.name}")
-            return torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+            return _state(candidate, payload)
         faults.append(f"{candidate}: not a whole checkpoint (truncated or damaged)")
     if faults:
         raise CheckpointError(f"{'; '.join(faults)}; remove what is damaged to start anew")
@@ -105,6 +106,21 @@ def _payload(path: Path) -> bytes | None:
     start = len(_MARK) + hashlib.sha256().digest_size
     payload = content[start:]
     return payload if content[:start] == _MARK + hashlib.sha256(payload).digest() else None
+
+
+def _state(path: Path, payload: bytes) -> dict[str, Any]:
+    """The state in a payload; CheckpointError where torch finds more than data in it, or no state."""
+    try:
+        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    except Exception as error:  # bytes with a right digest may still be anything, and unpicklers raise anything
+        reason = str(error).partition("\n")[0]
+        raise CheckpointError(
+            f"{path}: got more than data ({type(error).__name__}: {reason}), expected tensors, numbers, strings, and "
+            f"lists and dictionaries of them; remove it, or {OTHERWISE}"
+        ) from error
+    if not isinstance(state, dict):
+        raise CheckpointError(f"{path}: got {check.described(state)}, expected a dictionary; remove it, or {OTHERWISE}")
+    return state
 
 
 def previous_path(path: Path) -> Path:
