@@ -587,7 +587,7 @@ def cameras() -> list[ws.Camera]:
 
 def textured_scene(method: str, receivers: str) -> ws.Scene:
     texture = np.random.default_rng(4).uniform(0.1, 0.9, (8, 8, 3)).astype(np.float32)
-    bodies = ball(), ground(12, texture=texture, receivers=receivers)
+    bodies = ball(receivers="vertex"), ground(12, texture=texture, receivers=receivers, blockers=1)
     return scene_of(method, *bodies, samples=64, directions=32, order=4)
 
 

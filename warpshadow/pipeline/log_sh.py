@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.batch import expand_rows
 from warpshadow.maths import sh
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
@@ -82,6 +83,7 @@ class LogSH(SphereMethod):
             return sh_transfer(seen.past_all, group.normals, order=self._order, bands=taken.bands)
         if seen.past_all is None:
             return lobes
+        lobes = expand_rows(lobes, len(seen.past_all))  # where cameras share what turns, but not the receivers
         return sh_product(seen.past_all, lobes, order=self._order, bands=taken.bands)
 
     def _own_lobes(self, seen: Seen, group: Group, taken: Bands) -> wp.array | None:
