@@ -170,7 +170,7 @@ def test_a_page_that_leaves_is_forgotten(site):
     eventually(lambda: not site._pages)
 
 
-def test_pages_of_others_are_not_let_in(site):
+def test_pages_of_others_are_not_let_in_and_one_line_says_so(site, caplog):
     with pytest.raises((ConnectionClosed, AssertionError)):
         stranger = WirePage(site.url, origin="http://example.com")
         stranger.look_from()
@@ -178,6 +178,9 @@ def test_pages_of_others_are_not_let_in(site):
             stranger.listen(0.1)
         assert stranger.heard
     assert not site._pages
+    (record,) = [record for record in caplog.records if record.name == "websockets.server"]
+    assert record.getMessage().startswith("warpshadow: a page of http://example.com at 127.0.0.1:")
+    assert record.exc_info is None and record.exc_text is None
 
 
 @pytest.mark.parametrize(

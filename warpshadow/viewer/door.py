@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import socket
 import threading
 import warnings
@@ -42,6 +43,7 @@ class Server(viser.ViserServer):
             super().__init__(host=host, port=port, label="warpshadow", verbose=False)
         name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
         self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.get_port()}"
+        logging.getLogger("websockets.server").addFilter(_in_one_line)  # the same filter is added once
         is_local = host in OWN_NAMES
         self._websock_server.on_client_connect(_guard(self, is_local))
         self._refuse_uploads(self._websock_server)
@@ -67,16 +69,28 @@ class Server(viser.ViserServer):
             connection._incoming_handlers.pop(kind, None)
 
 
+class _NotLetIn(PermissionError):
+    """A connection of a page that our own server did not send."""
+
+
 def _guard(server: viser.ViserServer, is_local: bool) -> Callable[[Any], None]:
     def check_in(connection: Any) -> None:
-        """Close a connection by raising PermissionError."""
+        """Close a connection by raising an error."""
         request = server._websock_server._live_connections[connection.client_id].request
         assert request is not None
         origin, host = request.headers.get("Origin"), request.headers.get("Host", "")
         if not is_own(origin, host, is_local=is_local):
-            raise PermissionError(f"a page of {origin} at {host} was not let in")
+            raise _NotLetIn(f"warpshadow: a page of {origin} at {host} was not let in")
 
     return check_in
+
+
+def _in_one_line(record: logging.LogRecord) -> bool:
+    """Have the log say in one line that a page was not let in, where it would show a traceback."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, _NotLetIn):
+        record.msg, record.args, record.exc_info, record.exc_text = str(error), (), None, None
+    return True
 
 
 def is_own(origin: str | None, host: str, *, is_local: bool) -> bool:
