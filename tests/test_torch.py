@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.torch import TorchRenderer, rotation_matrices
+from warpshadow.torch import TorchRenderer, clip_matrices_from_opengl, rotation_matrices
 
 METHODS = ("directional", "log-sh", "none", "ray-traced")
 # The same float32 products in another order.
@@ -711,6 +711,25 @@ def test_a_camera_that_a_call_is_given_replaces_several():
     renderer = TorchRenderer(scene, cameras=[camera, camera])
     matrix = torch.tensor(camera.clip_matrix(), dtype=torch.float32)
     assert torch.equal(renderer(clip_matrices=matrix), renderer()[1])
+
+
+def test_matrices_of_opengl_are_refused_and_converted(renderer):
+    ours = torch.tensor(renderer.cameras[0].clip_matrix(), dtype=torch.float32)
+    near, far = float(ours[2, 3]), 50.0
+    theirs = ours * torch.tensor([1.0, -1.0, 1.0, 1.0])[:, None]  # y up; z/w from -1 at the near plane to 1 at the far
+    theirs[2] = (far + near) / (far - near) * ours[3]
+    theirs[2, 3] -= 2 * far * near / (far - near)
+    with pytest.raises(ValueError, match=r"clip_matrices: got one with rows z = .*clip_matrices_from_opengl"):
+        renderer(clip_matrices=theirs)
+    theirs.requires_grad_()
+    converted = clip_matrices_from_opengl(theirs)
+    torch.testing.assert_close(converted, ours)
+    weights = torch.rand(3, 4, 4)
+    (gradient,) = torch.autograd.grad((clip_matrices_from_opengl(theirs.expand(3, 4, 4)) * weights).sum(), theirs)
+    expected = weights.sum(0) * torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None]
+    torch.testing.assert_close(gradient, expected)
+    with pytest.raises(ValueError, match="matrices: got Tensor .* no perspective of OpenGL"):
+        clip_matrices_from_opengl(ours)
 
 
 SLEEPERS = """

@@ -46,6 +46,7 @@ from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
+from warpshadow.stages.project import check_clip_space
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 
 METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
@@ -329,6 +330,8 @@ class Renderer:
         for view in (self._scene_view, last):
             if view is not None and view.given == given:
                 return view
+        if clip_matrices is not None:
+            check_clip_space(clip_matrices)
         return View(
             self._method,
             self._materials,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from warpshadow import check
@@ -98,3 +99,24 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
     clip_positions = wp.empty((batch_count, positions.shape[1]), dtype=wp.vec4, device=positions.device)
     launch(_to_clip, clip_positions.shape, inputs=[positions, clip_matrices], outputs=[clip_positions])
     return clip_positions
+
+
+def check_clip_space(clip_matrices: wp.array) -> None:
+    """Raise ValueError for matrices whose z is not the near plane: those of others have a depth there, of slope 1.
+
+    A far plane or a step of an optimizer makes that row differ a little from ours, which changes nothing that is seen.
+    """
+    if clip_matrices.device.is_capturing:
+        return
+    check.finite_arrays({"clip_matrices": clip_matrices})
+    matrices = clip_matrices.numpy()
+    slopes, depths = (np.linalg.norm(matrices[:, row, :3], axis=1) for row in (2, 3))
+    other = np.flatnonzero((slopes > 0.5 * depths) | (matrices[:, 2, 3] <= 0.0) | (depths == 0.0))
+    if len(other):
+        z, w = matrices[other[0], 2:].tolist()
+        raise ValueError(
+            f"clip_matrices: got one with rows z = {z} and w = {w} (number {other[0]}), expected z = [0, 0, 0, near] "
+            "and w = depth, as Camera.clip_matrix() and TorchRenderer.clip_matrices(…) have them, y/w from -1 at the "
+            "top to 1 at the bottom: those of OpenGL and nvdiffrast are "
+            "warpshadow.torch.clip_matrices_from_opengl(matrices), or Camera.from_opengl(view, projection)"
+        )

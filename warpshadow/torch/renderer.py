@@ -130,7 +130,8 @@ class TorchRenderer(torch.nn.Module):
                 a list or a mapping likewise.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
                 still.
-            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices`; by default the renderer's own.
+            clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
+                :func:`~warpshadow.torch.clip_matrices_from_opengl`; by default the renderer's own.
 
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
