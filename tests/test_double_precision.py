@@ -135,6 +135,15 @@ def test_deformation_graphs(quantity, double, device, check):
     check(getattr(graph, quantity), *arguments)
 
 
+@pytest.mark.parametrize("quantity", [0, 1])
+def test_bound_spheres(quantity, double, device, check):
+    points, centers, radii = random(0, 30, 3), 0.2 * random(1, 4, 3), np.linspace(0.2, 0.5, 4)
+    binding = double("stages.bound_spheres").SphereBinding.bind(points, np.arange(30), centers, radii, device=device)
+    rest = (wp.vec3d, points[None]), (wp.vec3d, centers[None]), (wp.float64, radii[None])
+    moved = wp.vec3d, points + 0.3 * random(2, 2, 30, 3)
+    check(lambda *given: binding.moved(*given)[quantity], moved, *rest)
+
+
 # ---------------------------------------------------------------------------------------------- visibility
 
 

@@ -15,6 +15,7 @@ from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import SPHERE_METHODS, BodyLike, Scene
 from warpshadow.spheres import Spheres
+from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 
@@ -107,6 +108,7 @@ class Assembly:
         self.device = wp.get_device(device)
         self._progress = progress
         self._faces_of: dict[tuple[int, int], wp.array] = {}
+        self._bindings: dict[int, SphereBinding] = {}  # by bodies
         self._take_spheres: Callable[[], list[Spheres]] | None = None
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
@@ -338,6 +340,12 @@ class Assembly:
         number = self.scene.body_number(body)
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
+        if positions is not None and centers is None and len(self._spheres[number]):
+            own_vertices, own_spheres = slice(*first_vertex.tolist()), slice(*first_sphere.tolist())
+            check.shape("positions", positions.shape, ("batch", own_vertices.stop - own_vertices.start))
+            own = rest.positions[:, own_vertices], rest.centers[:, own_spheres], rest.radii[:, own_spheres]
+            centers, moved_radii = self._sphere_binding(number).moved(positions, *own)
+            radii = moved_radii if radii is None else radii
         return Geometry(
             _spliced("positions", rest.positions, positions, first_vertex),
             _spliced("centers", rest.centers, centers, first_sphere),
@@ -346,6 +354,14 @@ class Assembly:
             rotations=None if rest.rotations is None else exchanged(rest.rotations, [], lambda *_: rest.rotations),
             deformed=(*rest.deformed, number),
         )
+
+    def _sphere_binding(self, number: int) -> SphereBinding:
+        """The spheres of a body, bound to the vertices of its faces."""
+        if number not in self._bindings:
+            mesh, spheres = self.scene.bodies[number].mesh, self._spheres[number]
+            given = mesh.positions, np.unique(mesh.faces), spheres.centers, spheres.radii
+            self._bindings[number] = SphereBinding.bind(*given, device=self.device)
+        return self._bindings[number]
 
     @property
     def casting(self) -> list[int]:

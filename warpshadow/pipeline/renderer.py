@@ -227,7 +227,8 @@ class Renderer:
             positions: Its vertices in its own space, vec3 of shape [batch, vertex].
             centers: Its spheres' centers, vec3 of shape [batch, sphere].
             radii: Its spheres' radii, float32 of shape [batch, sphere].
-                What is None stays as it is in ``rest``.
+                What is None stays as it is in ``rest``; but its spheres follow its vertices, both centers and radii,
+                unless ``centers`` are given (:mod:`warpshadow.stages.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
 
         Returns:

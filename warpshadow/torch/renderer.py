@@ -343,7 +343,8 @@ class TorchRenderer(torch.nn.Module):
             positions: Its vertices in its own space, [vertex, 3] or [batch, vertex, 3].
             centers: Its spheres' centers, [sphere, 3] or [batch, sphere, 3].
             radii: Its spheres' radii, [sphere] or [batch, sphere].
-                What is None stays as it is in ``rest``.
+                What is None stays as it is in ``rest``; but its spheres follow its vertices, both centers and radii,
+                unless ``centers`` are given (:mod:`warpshadow.stages.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are.
 
         Returns:

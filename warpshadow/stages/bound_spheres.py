@@ -1,0 +1,182 @@
+"""Bound spheres: they follow the vertices around them, as points in a lattice do.
+
+A center moves by the weighted mean of how its vertices move, and a radius grows as their distances from the center do:
+
+    c' = c + Σ w_v (x'_v − x_v)        r' = r (Σ a_v |x'_v − c'|² / Σ a_v |x_v − c|²)^½
+
+where a_v falls off with the distance, and w are the moving least squares weights of it (Σ w_v = 1, Σ w_v x_v = c;
+Schaefer et al. 2006): so spheres follow any affine map, rotations and stretches among them, as if they were its points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+
+_REACH = 2.0  # a sphere follows vertices within so many radii, or distances of the nearest one if that is more
+_LEAST = 12  # and this many at least, or all
+_RIDGE = 1e-3  # of the spread of its vertices: where they lie in a plane, weights stay small
+_SOFT = 1e-6  # squares of radii by which spreads differ from 0, where a root has no derivative
+
+
+@wp.kernel
+def _move_centers(
+    # in
+    first: wp.array(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.vec3),
+    rest_positions: wp.array2d(dtype=wp.vec3),
+    rest_centers: wp.array2d(dtype=wp.vec3),
+    # out
+    centers: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a sphere of an instance."""
+    instance, sphere = wp.tid()
+    moved = instance_in(instance, positions.shape[0])
+    still = instance_in(instance, rest_positions.shape[0])
+    shift = wp.vec3()
+    for item in range(first[sphere], first[sphere + 1]):
+        vertex = vertices[item]
+        shift += weights[item] * (positions[moved, vertex] - rest_positions[still, vertex])
+    centers[instance, sphere] = rest_centers[instance_in(instance, rest_centers.shape[0]), sphere] + shift
+
+
+@wp.kernel
+def _sum_spreads(
+    # in
+    first: wp.array(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.int32),
+    shares: wp.array(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.vec3),
+    centers: wp.array2d(dtype=wp.vec3),
+    # out
+    spreads: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a sphere of an instance: the mean square distance of its vertices."""
+    instance, sphere = wp.tid()
+    row = instance_in(instance, positions.shape[0])
+    center = centers[instance_in(instance, centers.shape[0]), sphere]
+    total = float(0.0)
+    for item in range(first[sphere], first[sphere + 1]):
+        total += shares[item] * wp.length_sq(positions[row, vertices[item]] - center)
+    spreads[instance, sphere] = total
+
+
+@wp.kernel
+def _grow_radii(
+    # in
+    rest_radii: wp.array2d(dtype=wp.float32),
+    rest_spreads: wp.array2d(dtype=wp.float32),
+    spreads: wp.array2d(dtype=wp.float32),
+    softening: float,
+    # out
+    radii: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a sphere of an instance."""
+    instance, sphere = wp.tid()
+    radius = rest_radii[instance_in(instance, rest_radii.shape[0]), sphere]
+    least = softening * radius * radius
+    before = rest_spreads[instance_in(instance, rest_spreads.shape[0]), sphere]
+    radii[instance, sphere] = radius * wp.sqrt((spreads[instance, sphere] + least) / (before + least))
+
+
+@dataclass(frozen=True)
+class SphereBinding:
+    """Spheres bound to the vertices around them.
+
+    Args:
+        first: Where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1].
+        vertices: Of each item, int32 of shape [item].
+        weights: w, by which centers follow, float32 of shape [item].
+        shares: a, whose sum is 1 for each sphere, float32 of shape [item].
+    """
+
+    first: wp.array
+    vertices: wp.array
+    weights: wp.array
+    shares: wp.array
+
+    @staticmethod
+    def bind(
+        points: np.ndarray, vertices: np.ndarray, centers: np.ndarray, radii: np.ndarray, *, device: wp.DeviceLike
+    ) -> SphereBinding:
+        """Bind spheres to vertices at rest.
+
+        Args:
+            points: Vertices [scene units], shape [vertex, 3].
+            vertices: Those that spheres may follow, shape [candidate].
+            centers: Of the spheres [scene units], shape [sphere, 3].
+            radii: Of the spheres [scene units], shape [sphere].
+            device: Where the binding lives.
+        """
+        from scipy.spatial import cKDTree
+
+        places = points[vertices].astype(np.float64)
+        tree = cKDTree(places)
+        distances = tree.query(centers, k=min(_LEAST, len(places)))[0].reshape(len(centers), -1)
+        reaches = np.maximum(_REACH * np.maximum(distances[:, 0], radii), 1.1 * distances[:, -1])
+        near = tree.query_ball_point(centers, reaches, return_sorted=True)
+        rows = [_weights(places[own], *sphere) for own, *sphere in zip(near, centers, reaches, strict=True)]
+        weights, shares = (np.concatenate(column) for column in zip(*rows, strict=True))
+        return SphereBinding(
+            wp.array(np.cumsum([0, *map(len, near)]), dtype=wp.int32, device=device),
+            wp.array(vertices[np.concatenate(near)], dtype=wp.int32, device=device),
+            wp.array(weights, dtype=wp.float32, device=device),
+            wp.array(shares, dtype=wp.float32, device=device),
+        )
+
+    def moved(
+        self, positions: wp.array, rest_positions: wp.array, rest_centers: wp.array, rest_radii: wp.array
+    ) -> tuple[wp.array, wp.array]:
+        """Spheres that follow vertices from one place to another.
+
+        Args:
+            positions: Where the vertices go [scene units], vec3 of shape [batch, vertex].
+            rest_positions: Where they come from, vec3 of shape [batch, vertex].
+            rest_centers: The spheres there [scene units], vec3 of shape [batch, sphere].
+            rest_radii: Their radii [scene units], float32 of shape [batch, sphere].
+                Batches of 1 serve every instance of the others.
+
+        Returns:
+            Centers, vec3 of shape [batch, sphere], and radii, float32 of shape [batch, sphere].
+
+        Differentiable: all.
+        """
+        given = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}
+        check.finite_arrays(given)
+        shape, device = (common_batch(given), len(self.first) - 1), positions.device
+        bound = [self.first, self.vertices]
+        centers = wp.empty(shape, dtype=wp.vec3, device=device)
+        inputs = [*bound, self.weights, positions, rest_positions, rest_centers]
+        launch(_move_centers, shape, inputs=inputs, outputs=[centers])
+        rest_spreads = self._spreads(rest_positions, rest_centers)
+        radii = wp.empty(shape, dtype=wp.float32, device=device)
+        inputs = [rest_radii, rest_spreads, self._spreads(positions, centers), _SOFT]
+        launch(_grow_radii, shape, inputs=inputs, outputs=[radii])
+        return centers, radii
+
+    def _spreads(self, positions: wp.array, centers: wp.array) -> wp.array:
+        """Mean square distances of vertices from centers, float32 of shape [batch, sphere]."""
+        shape = max(len(positions), len(centers)), centers.shape[1]
+        spreads = wp.empty(shape, dtype=wp.float32, device=positions.device)
+        inputs = [self.first, self.vertices, self.shares, positions, centers]
+        launch(_sum_spreads, shape, inputs=inputs, outputs=[spreads])
+        return spreads
+
+
+def _weights(places: np.ndarray, center: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weights and shares of vertices [vertex, 3] around a center."""
+    shares = (1.0 - ((places - center) ** 2).sum(axis=1) / reach**2).clip(0.0) ** 2
+    shares /= shares.sum()
+    mean = shares @ places
+    offsets = places - mean
+    spread = (shares[:, None] * offsets).T @ offsets
+    slopes = np.linalg.solve(spread + (_RIDGE * np.trace(spread) + 1e-30) * np.eye(3), center - mean)
+    return shares * (1.0 + offsets @ slopes), shares
