@@ -13,7 +13,7 @@ from warpshadow.spheres import Spheres, fit_spheres
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
     """Find the spheres of each body, in its own space, fitting those that are wanted.
 
-    A flat body with the middles of all others on its front side is a ground (or a wall): one sphere that touches it
+    A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it
     from behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets
     none.
     """
@@ -80,9 +80,9 @@ def _body_spheres(body: Body, ground: Spheres | None, device: wp.DeviceLike, pro
 
 
 def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
-    """The sphere that stands in for a flat mesh seen from its front, None if that is not how it is seen.
+    """The sphere that stands in for a flat mesh that has all others on one side, None if it has not.
 
-    It touches the plane below the other bodies, and its radius is such that from their mean position it blocks the
+    It touches the plane from the other side, and its radius is such that from their mean position it blocks the
     solid angle that the mesh does.
     """
     corners = mesh.positions[mesh.faces].astype(np.float64)
@@ -91,7 +91,10 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
         return None
     middle = corners.reshape(-1, 3).mean(axis=0)
     # a body may stand in the ground, and a fit may start with one deep in it
-    if not all(np.mean((other - middle) @ normal) > 0 for other in others):
+    heights = [np.mean((other - middle) @ normal) for other in others]
+    if max(heights) < 0:
+        normal = -normal
+    elif min(heights) <= 0:
         return None
     seen_from = np.concatenate(others)
     height = np.mean((seen_from - middle) @ normal)

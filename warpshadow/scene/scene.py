@@ -158,7 +158,7 @@ class Body:
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
             casts no shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane
-            that it is, whatever the number; by others a flat body with all else on its front side is a ground, for
+            that it is, whatever the number; by others a flat body with all else on one side is a ground, for
             which any number means one sphere touching it from behind. Where light bounces, a body of 0 or none is lit
             and reflects all the same, and takes its light from nobody. If it is not flat, other bodies get that light
             by rays only: a sphere sends light in place of what it blocks.
