@@ -287,8 +287,8 @@ def test_what_patches_show(double, flats, check, device):
     openness, sparse = double("stages.bounces.openness"), double("stages.sparse").SparseMatrix
     points, normals = flat_receivers()
     spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
-    given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii)
-    check(lambda p, n, r, f: openness.turn_from_flats(p, n, r, spheres, f, flats), *given, (wp.vec3d, FRAMES))
+    given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii), (wp.float64, random(1, 1, 3, 2) ** 2)
+    check(lambda p, n, r, *f: openness.turn_from_flats(p, n, r, spheres, *f, flats), *given, (wp.vec3d, FRAMES))
     mean = sparse.of(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
     rest = (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2)
     check(lambda n, t: openness.shown_areas(n, t, mean, directions), *rest)

@@ -74,6 +74,10 @@ def fetched(image, grid, y, cosine, t, radius):
     return values[0] if part == 0 else (1 - part) * values[0] + part * values[1]
 
 
+def margin_of(grid):
+    return 0.001 * grid.texel_sizes().min()
+
+
 def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None):
     """Coverage, distance, its width, light and flat of each side that a cell meets."""
     sides = []
@@ -85,7 +89,7 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
         place = axes @ (point - origin) / scales
         height = normal @ (point - origin) / scales[0]
         edges = [np.sign(e) * np.expm1(np.abs(e)) * grid.spread for e in (grid.low, grid.high)]
-        margin = 0.1 * grid.texel_sizes().min()
+        margin = margin_of(grid)
         front = ramp(1 + 2 * height / margin) if fronts is None else fronts[f]
         for side, presence in ((1, front), (-1, 1 - front)):
             cosine = -side * (normal @ omega)
@@ -93,9 +97,10 @@ def met_sides(point, omega, radius, frames, grids, radiosity, skip, fronts=None)
                 continue
             ratio = cosine / radius
             mean = cosine if ratio >= 1 else radius * (1 / 3 + 2 / 3 * ((ratio + 1) / 2) ** 3)
-            t = max(side * height, 0) / mean
+            rise = np.clip(side * height / margin, 0, 2)
+            t = (margin * (1 + rise**2 / 4) + max(side * height - 2 * margin, 0)) / mean
             y = place + t * (axes @ omega)
-            extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2) + margin
+            extents = t * radius * np.sqrt(1 + (axes @ omega / mean) ** 2)
             inside = ramp((edges[1] - y) / extents) - ramp((edges[0] - y) / extents)
             share = presence * ramp(ratio) * inside.prod()
             covered = fetched(grid.covered[..., None].astype(float), grid, y, mean, t, radius)[0]
@@ -180,7 +185,7 @@ class Setting:
         self.vertices = np.repeat(np.concatenate(posed)[None], batch, axis=0)
         points = rng.uniform([-1.2, 0.05, -1], [1.2, 1.6, 1.2], size=(7, 3))
         points[5] = [0.4, -0.2, 0.3]  # below the ground
-        points[6] = [-0.5, -0.3 * 0.1 * self.grids[0].texel_sizes().min(), 0.2]  # in its margin
+        points[6] = [-0.5, -0.3 * margin_of(self.grids[0]), 0.2]  # in its margin
         normals = rng.normal(size=(7, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         self.points, self.normals = (np.repeat(values[None], batch, axis=0) for values in (points, normals))
@@ -455,7 +460,11 @@ def bends(values):
 
 @pytest.mark.parametrize(
     ("start", "end"),
-    [([0.3, 0.4, 0.2], [0.3, -0.3, 0.2]), ([0.5, 0.3, 0], [3.5, 0.3, 0.1]), ([2.1, -0.1, 0.3], [1.9, 0.15, 0.2])],
+    [
+        ([0.3, 2e-3, 0.2], [0.3, -2e-3, 0.2]),
+        ([0.5, 0.3, 0], [3.5, 0.3, 0.1]),
+        ([2.06, -0.05, 0.28], [1.96, 0.075, 0.23]),
+    ],
     ids=["through the plane", "past the border", "around the edge"],
 )
 def test_what_passes_has_no_step_and_no_kink_along_a_path(start, end, device):

@@ -17,7 +17,7 @@ DIRECTIONS = fibonacci(32)
 SPHERES = np.int32([0, 1, 1, 0, -1, 1, 0])
 
 
-def twin_turned(points, normals, radii, frames, grids, blocks):
+def twin_turned(points, normals, radii, fronts, frames, grids, blocks):
     """Normals [source, 3] without what points into flats."""
     turned = normals.copy()
     for s, sphere in enumerate(SPHERES):
@@ -32,7 +32,8 @@ def twin_turned(points, normals, radii, frames, grids, blocks):
                 scale = np.linalg.norm(axis)
                 y, least, most = (points[s] - origin) @ axis / scale, scale * ends[0][k], scale * ends[1][k]
                 part *= ramp((most - y) / radii[sphere]) - ramp((least - y) / radii[sphere])
-            turned[s] += part * max(-normals[s] @ up, 0) * up
+            along_up, front = normals[s] @ up, fronts[s, f]
+            turned[s] += part * (front * max(-along_up, 0) - (1 - front) * max(along_up, 0)) * up
     return turned
 
 
@@ -72,12 +73,13 @@ def compare(run, twin, values, dtypes, device):
 def test_normals_turned_from_flats_are_those_of_the_twin(device):
     setting = Setting(device, blocks=(True, True, False))
     frames = setting.frames(setting.vertices[0])
-    values = [setting.points[0], setting.normals[0], np.array([0.3, 0.5]), np.asarray(frames, float)]
+    fronts = np.random.default_rng(2).uniform(size=(7, 3))
+    values = [setting.points[0], setting.normals[0], np.array([0.3, 0.5]), fronts, np.asarray(frames, float)]
     compare(
-        lambda p, n, r, f: turn_from_flats(p, n, r, SPHERES, f, setting.flats),
+        lambda p, n, r, *f: turn_from_flats(p, n, r, SPHERES, *f, setting.flats),
         lambda *scene: twin_turned(*scene, setting.grids, setting.blocks),
         values,
-        (wp.vec3, wp.vec3, wp.float32, wp.vec3),
+        (wp.vec3, wp.vec3, wp.float32, wp.float32, wp.vec3),
         device,
     )
 
@@ -98,14 +100,15 @@ def test_what_is_shown_is_that_of_the_twin(device):
     )
 
 
-def turned(height, normal, device, **options):
+def turned(height, normal, device, front=1.0, **options):
     """Normal at a height above the middle of a ground, with a sphere of radius 0.2."""
     setting = Setting(device, names=("ground",), **options)
     given = [[[0.1, height, 0.1]]], [[normal]]
     points, normals = (wp.array(each, dtype=wp.vec3, device=device).reshape((1, 1)) for each in given)
     radii = wp.full((1, 1), 0.2, dtype=wp.float32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
-    return turn_from_flats(points, normals, radii, np.zeros(1, int), frames, setting.flats).numpy()[0, 0]
+    fronts = wp.full((1, 1, 1), front, dtype=wp.float32, device=device)
+    return turn_from_flats(points, normals, radii, np.zeros(1, int), fronts, frames, setting.flats).numpy()[0, 0]
 
 
 def test_a_bottom_that_lies_on_a_ground_shows_nothing_and_one_above_it_does(device):
@@ -115,6 +118,7 @@ def test_a_bottom_that_lies_on_a_ground_shows_nothing_and_one_above_it_does(devi
     for normal in ((0, 1, 0), (0.6, 0, 0.8)):
         np.testing.assert_allclose(turned(0.0, normal, device), normal, atol=1e-6)
     np.testing.assert_allclose(turned(0.0, (0, -1, 0), device, blocks=(False,)), (0, -1, 0), atol=1e-6)
+    np.testing.assert_allclose(turned(-0.2, (0, 1, 0), device, front=0.0), (0, 0.5, 0), atol=1e-6)
 
 
 @pytest.mark.parametrize("counts", [(2, 1), (1, 2)])
@@ -136,6 +140,6 @@ def test_what_does_not_fit_is_refused(device):
         shown_areas(normals, wp.zeros((1, 2, 8), dtype=wp.float32, device=device), mean, DIRECTIONS)
     setting = Setting(device, names=("ground",))
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
-    radii = wp.ones((1, 1), dtype=wp.float32, device=device)
+    radii, fronts = (wp.ones(shape, dtype=wp.float32, device=device) for shape in ((1, 1), (1, 2, 1)))
     with pytest.raises(ValueError, match="spheres: got 1, expected −1 to 0"):
-        turn_from_flats(normals, normals, radii, np.array([0, 1]), frames, setting.flats)
+        turn_from_flats(normals, normals, radii, np.array([0, 1]), fronts, frames, setting.flats)

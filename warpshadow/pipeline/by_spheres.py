@@ -199,6 +199,7 @@ class InParts(Node):
         flats = points.blocking.flats
         place = functools.partial(method.flats.frames, flats) if flats else lambda _: None
         frames = Node("", place, points.vertices)
+        corners = Node("", method.flats.corners if method.flats.numbers else lambda _: None, points.vertices)
         self._passing = Node(
             f"flats{where}",
             method.past_flats,
@@ -229,7 +230,7 @@ class InParts(Node):
         shadows = _static_shadows(method, points, light)
         kept_rows = shadows if shadows.function else None
         looked_up: Node | dict = own_shadows if own_shadows.function else {}
-        before = receivers, spheres, taken, kept_rows, looked_up, frames
+        before = receivers, spheres, taken, kept_rows, looked_up, frames, corners
         super().__init__("", None, *before, beside=(own_shadows, shadows, result, *beside), keeps=keeps)
 
     def compute(self, call: Call) -> Any:
@@ -238,8 +239,8 @@ class InParts(Node):
 
     def parts(self, call: Call) -> Iterator[Any]:
         """Find it for one part after another."""
-        receivers, spheres, taken, kept_rows, looked_up, frames = self.values(call)
-        groups = self._grouping.groups(call, receivers, spheres, kept_rows, looked_up, frames)
+        receivers, spheres, taken, kept_rows, looked_up, *planes = self.values(call)
+        groups = self._grouping.groups(call, receivers, spheres, kept_rows, looked_up, *planes)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", wanted=self._progress) as bar:
             for group in groups:

@@ -99,11 +99,11 @@ class Directional(SphereMethod):
 
     def past_flats(self, group: Group, seen: Seen, taken: Cells) -> Seen:
         """Transmittance past the flat bodies around a group, too."""
-        points, flats, past_solid = group.points, group.flats, seen.past_all
-        if flats is None or past_solid is None or not points.size:
+        flats, past_solid = group.flats, seen.past_all
+        if flats is None or past_solid is None or not group.points.size:
             return seen
         facing = group.normals if group.kept_rows is None else None
-        fronts = group.fronts(flats.frames, flats.flats)
+        points, fronts = group.among(flats.frames, flats.flats, flats.skip)
         cover = functools.partial(
             flat_coverage, points, flats.frames, flats.flats, facing=facing, fronts=fronts, skip=flats.skip
         )

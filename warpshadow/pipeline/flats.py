@@ -12,9 +12,14 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.stages.flats.grid import find_grid
 from warpshadow.stages.flats.prepared import FlatBody, Flats
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_CORNERS = 64
+"""Directions in which the vertices of a body are sought that are farthest out."""
 
 
 class FlatsAround(NamedTuple):
@@ -47,7 +52,7 @@ class SceneFlats:
         bodies = self._assembly.scene.bodies
         own = bodies[number]
         return [
-            (body.world_mesh().positions - own.translation) @ own.rotation_matrix() / own.scale
+            (body.world_points() - own.translation) @ own.rotation_matrix() / own.scale
             for other, body in enumerate(bodies)
             if other != number
         ]
@@ -64,6 +69,35 @@ class SceneFlats:
     def frames(self, bodies: tuple[int, ...], positions: wp.array) -> wp.array:
         """Where some flat bodies are, of vertices [batch, vertex]; see :meth:`Flats.frames`. Differentiable in them."""
         return self.among(bodies, bodies).frames(positions)
+
+    @functools.cached_property
+    def first_corner(self) -> np.ndarray:
+        """Where each body's corners begin, and the end of the last, shape [body + 1]."""
+        return np.cumsum([0, *map(len, self._corners)])
+
+    def corners(self, positions: wp.array) -> wp.array:
+        """Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]. Differentiable in vertices."""
+        return multiply(self._corners_of_vertices, positions)
+
+    @functools.cached_property
+    def _corners(self) -> list[np.ndarray]:
+        """Of each body the vertices that are farthest out in some direction."""
+        directions = np.concatenate([fibonacci(_CORNERS), np.eye(3), -np.eye(3)])
+        found = []
+        for body in self._assembly.scene.bodies:
+            used = np.unique(body.mesh.faces)
+            found.append(np.unique(used[(body.mesh.positions[used] @ directions.T).argmax(axis=0)]))
+        return found
+
+    @functools.cached_property
+    def _corners_of_vertices(self) -> SparseMatrix:
+        from scipy.sparse import csr_matrix
+
+        starts = self._assembly.first_vertex
+        columns = np.concatenate([first + own for first, own in zip(starts[:-1], self._corners, strict=True)])
+        entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
+        matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
+        return SparseMatrix.of(matrix, device=self._assembly.device)
 
     def _body(self, number: int) -> FlatBody:
         if number not in self._bodies:

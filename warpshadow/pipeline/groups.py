@@ -15,7 +15,7 @@ from warpshadow.pipeline.flats import FlatsAround, SceneFlats
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.own_shadows import OwnLobes, OwnLookup
-from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
+from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts, lifted_points
 from warpshadow.stages.flats.prepared import Flats
 from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.own_shadows.sites import Places
@@ -43,25 +43,28 @@ class Group(NamedTuple):
     own_shadow: OwnLookup | OwnLobes | None = None  # by rays; None where there is none, or its spheres block
     flats: FlatsAround | None = None  # bodies that block as planes; None without any
     as_spheres: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
+    corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
 
-    def fronts(self, frames: wp.array, flats: Flats) -> wp.array | None:
-        """Part of the front of each flat that they see; None where their heights decide."""
-        return None if self.as_spheres is None else find_fronts(self.points, self.as_spheres, frames, flats)
+    def among(self, frames: wp.array, flats: Flats, skip: int | None) -> tuple[wp.array, wp.array]:
+        """Where they are lit among flats, off the planes they lie in, and the part of each front that they see."""
+        fronts = find_fronts(self.points, self.normals, self.corners, self.as_spheres, frames, flats)
+        return lifted_points(self.points, fronts, frames, flats, skip), fronts
 
     def parts(self) -> Iterator[Group]:
         """Parts of at most PART receivers, with as many instances in all arrays where there are spheres.
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres = self
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners = self
         size = points.shape[1]
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
         if radii.shape[1] or turns is not None or frames is not None:
             given = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "flats": frames}
+            given["corners"] = corners
             count = common_batch(given)
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
-        varying = [*self[:4], turns, frames]
+        varying = [*self[:4], turns, frames, corners]
         if kept_rows is not None or size <= PART or varies(varying):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
             return
@@ -105,6 +108,7 @@ class Grouping:
         kept_rows: KeptRows | None,
         own_shadows: dict[int, Any],
         frames: wp.array | None,
+        corners: wp.array | None,
     ) -> list[Group]:
         """Put receivers into groups.
 
@@ -115,8 +119,9 @@ class Grouping:
             kept_rows: What static bodies block of the light of those on them.
             own_shadows: What receivers of bodies see past these, by body.
             frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · flat]; None without any.
+            corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]; None without flats.
         """
-        groups = list(self._that_move(receivers, spheres, own_shadows, frames))
+        groups = list(self._that_move(receivers, spheres, own_shadows, frames, corners))
         if self._static is None or not len(receivers.on_static):
             return groups
         on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
@@ -130,6 +135,7 @@ class Grouping:
         spheres: tuple[wp.array, wp.array],
         own_shadows: dict[int, Any],
         frames: wp.array | None,
+        corners: wp.array | None,
     ) -> Iterator[Group]:
         """Those that may move."""
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
@@ -146,6 +152,9 @@ class Grouping:
             if span.body >= 0:
                 places = self._points.method.own_shadows.places(receivers, span)
                 group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))
+                if corners is not None:
+                    bounds = self._flats.first_corner[span.body : span.body + 2].tolist()
+                    group = group._replace(corners=cut(corners, *bounds))
             if as_spheres is not None:
                 group = group._replace(as_spheres=as_spheres.part(slice(span.first, span.end)))
             yield group

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand, expand_rows
+from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bounces.own_factors import OwnFactors
 from warpshadow.pipeline.bounces.patches import Senders
@@ -28,6 +29,7 @@ from warpshadow.stages.bounces.flat_light import flat_light
 from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
 from warpshadow.stages.flats.prepared import FlatBody, Flats
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
@@ -170,8 +172,11 @@ class StandIns:
         """
         normals, flats, senders = sources.normals, self.flats, self.senders
         if flats is not None:
-            _, radii = self.assembly.spheres_of(solid_bodies(self.assembly), spheres)
-            normals = turn_from_flats(sources.points, normals, radii, self.spheres_of_sources, frames, flats.all)
+            centers, radii = self.assembly.spheres_of(solid_bodies(self.assembly), spheres)
+            numbers, points, device = self.spheres_of_sources, sources.points, normals.device
+            of_sources = SpheresOfPoints(centers, radii, constant(numbers, wp.int32, device))
+            fronts = find_fronts(points, normals, None, of_sources, frames, flats.all)
+            normals = turn_from_flats(points, normals, radii, numbers, fronts, frames, flats.all)
         rows = [
             wp.full_like(part.past_solid, 1.0, requires_grad=False) if part.past_own is None else part.past_own
             for part in cells
@@ -278,9 +283,10 @@ class Gathering:
     def _from_flats(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array:
         flats = outgoing.stand_ins.flats
         assert flats is not None
-        given = group.points, group.normals, cells.past_solid, outgoing.frames, outgoing.radiosity, flats.all
-        fronts = group.fronts(outgoing.frames, flats.all)
-        return flat_light(*given, cells.directions, fronts=fronts, skip=flats.number.get(group.body))
+        skip = flats.number.get(group.body)
+        points, fronts = group.among(outgoing.frames, flats.all, skip)
+        given = points, group.normals, cells.past_solid, outgoing.frames, outgoing.radiosity, flats.all
+        return flat_light(*given, cells.directions, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
         centers, radii, exitance = outgoing.of_spheres(group.body)

@@ -167,7 +167,7 @@ def _meet_sides(
         own[cells + 4 * i] = wp.vec3()
         if toward[2] > -scene.radius:
             grid = scene.grids[f]
-            footprint = find_footprint(grid, scene, on_side(place, is_back), toward, side[2])
+            footprint = find_footprint(grid, scene, on_side(grid, place, is_back), toward, side[2])
             if footprint.share > 0.0:
                 covered = float(1.0)
                 radiosity = wp.vec3()
@@ -256,7 +256,7 @@ def _meet_sides_adjoint(
                 wp.vec2(adj_spot[0], adj_spot[1]),
             )
             before = _kept_place(adj_own, f)
-            adj_place = side_adjoint(place, is_back, direction, adj_at, adj_toward, before)
+            adj_place = side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, before)
             adj_own[sides + i] = adj_own[sides + i] + wp.vec3(0.0, 0.0, adj_presence)
             adj_own[4 * f] = adj_place.at
             adj_own[4 * f + 1] = adj_place.along_u

@@ -12,10 +12,11 @@ who is above a ground hardly sees what is turned to it and near it. The bottom o
 height d, is seen from the ground not at the slope at which its middle is seen, but at d / (d + r) of that: so the part
 of a normal that points into a flat with normal N fades,
 
-    n′ = n + c max(−n·N, 0) N,  c = r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
+    n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
 
 which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep of
-:mod:`warpshadow.stages.bounces.flat_light`, and y where the source is along the flat.
+:mod:`warpshadow.stages.flats.cells`, y where the source is along the flat, and f the part of the front that it sees; so
+it is for the back, with −N.
 
 Measured with a ground and two bounces, images against all bounces by a path tracer, relative RMSE: a machine part that
 lies on the ground 7.8% by normals alone, 7.6% with T, 5.5% with T and n′; a cow 2.1%, 2.0% and 1.8%; a man of thin
@@ -48,6 +49,7 @@ def _turn_from_flats(
     normals: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     spheres: wp.array(dtype=wp.int32),
+    fronts: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=FlatGrid),
     # out
@@ -66,7 +68,9 @@ def _turn_from_flats(
             u = frames[of_flats, 3 * f + 1]
             v = frames[of_flats, 3 * f + 2]
             up = wp.normalize(wp.cross(u, v))
-            into = wp.max(-wp.dot(normal, up), 0.0)
+            along_up = wp.dot(normal, up)
+            front = fronts[instance_in(batch, fronts.shape[0]), source, f]
+            away = front * wp.max(-along_up, 0.0) - (1.0 - front) * wp.max(along_up, 0.0)
             if grid.blocks != 0 and radius > 0.0:
                 offset = point - frames[of_flats, 3 * f]
                 height = wp.dot(offset, up) / radius
@@ -75,12 +79,18 @@ def _turn_from_flats(
                 # the flat's units are its scale in the scene's
                 within = _part_within(x, grid.least[0] * wp.length(u), grid.most[0] * wp.length(u), radius)
                 within *= _part_within(y, grid.least[1] * wp.length(v), grid.most[1] * wp.length(v), radius)
-                result += within / (1.0 + height * height) * into * up
+                result += within / (1.0 + height * height) * away * up
     turned[batch, source] = result
 
 
 def turn_from_flats(
-    points: wp.array, normals: wp.array, radii: wp.array, spheres: np.ndarray, frames: wp.array, flats: Flats
+    points: wp.array,
+    normals: wp.array,
+    radii: wp.array,
+    spheres: np.ndarray,
+    fronts: wp.array,
+    frames: wp.array,
+    flats: Flats,
 ) -> wp.array:
     """Normals of sources without the part that points into a flat on which they lie.
 
@@ -90,26 +100,30 @@ def turn_from_flats(
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
         spheres: The sphere that stands in for each source, −1 for none, which keeps its normal: NumPy of shape
             [source].
+        fronts: Part of the front of each flat that sources see, float32 of shape [batch, source, flat], from
+            :func:`.fronts.find_fronts`.
         frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`.Flats.frames`.
         flats: The flats. Those that cast no shadow do not count.
 
     Returns:
         n′, vec3 of shape [batch, source]. Any batch may be 1.
 
-    Differentiable: points, normals, radii, frames.
+    Differentiable: points, normals, radii, fronts, frames.
     """
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("spheres", spheres.shape, (points.shape[1],))
     check.shape("frames", frames.shape, ("batch", 3 * flats.count))
     if len(spheres) and spheres.max() >= radii.shape[1]:
         raise ValueError(f"spheres: got {spheres.max()}, expected −1 to {radii.shape[1] - 1}")
-    count = common_batch({"points": points, "normals": normals, "radii": radii, "frames": frames})
+    check.shape("fronts", fronts.shape, ("batch", points.shape[1], flats.count))
+    given = {"points": points, "normals": normals, "radii": radii, "fronts": fronts, "frames": frames}
+    count = common_batch(given)
     turned = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
     numbers = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
     launch(
         _turn_from_flats,
         turned.shape,
-        inputs=[points, normals, radii, numbers, frames, flats.grids],
+        inputs=[points, normals, radii, numbers, fronts, frames, flats.grids],
         outputs=[turned],
     )
     return turned

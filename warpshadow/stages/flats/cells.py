@@ -8,15 +8,15 @@ distance d below the receiver:
                                               mean cosine of the part of the cell that is below the plane's horizon
     t = d / c′                                distance
     y = x + t ω                               where, in the plane
-    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²) + a margin
+    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²)
                                               coverage: part of the cell that the rectangle takes
 
 S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Where the mesh has
 holes, h is multiplied with what it covers of the footprint. Radiosity is bilinear in two mip levels of the grid, which
 are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′.
 
-From the plane to a margin below it a receiver sees the front fade away and the back appear, so that one that lies on
-the ground is as if it were above. Of points that send light their spheres decide (:mod:`.fronts`).
+No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
+alone the front fades away and the back appears from the plane to a margin below it.
 """
 
 import numpy as np
@@ -185,9 +185,13 @@ def front_presence_slope(grid: FlatGrid, height: float):
 
 
 @wp.func
-def on_side(place: OverFlat, is_back: bool):
-    """Where a receiver is above a side."""
-    return wp.vec3(place.at[0], place.at[1], wp.max(wp.where(is_back, -place.at[2], place.at[2]), 0.0))
+def on_side(grid: FlatGrid, place: OverFlat, is_back: bool):
+    """Where a receiver is above a side: a margin where it is not, and smoothly its height from two of them on."""
+    height = wp.where(is_back, -place.at[2], place.at[2])
+    rise = wp.clamp(height / grid.margin, 0.0, 2.0)
+    return wp.vec3(
+        place.at[0], place.at[1], grid.margin * (1.0 + 0.25 * rise * rise) + wp.max(height - 2.0 * grid.margin, 0.0)
+    )
 
 
 @wp.func
@@ -203,6 +207,7 @@ def toward_side(place: OverFlat, is_back: bool, direction: wp.vec3):
 
 @wp.func
 def side_adjoint(
+    grid: FlatGrid,
     place: OverFlat,
     is_back: bool,
     direction: wp.vec3,
@@ -212,7 +217,7 @@ def side_adjoint(
 ):
     """Add to the gradient of a receiver over a flat, by those of :func:`on_side` and :func:`toward_side`."""
     sign = wp.where(is_back, -1.0, 1.0)
-    adj_height = wp.where(sign * place.at[2] > 0.0, sign * adj_at[2], 0.0)
+    adj_height = sign * wp.clamp(0.5 * sign * place.at[2] / grid.margin, 0.0, 1.0) * adj_at[2]
     adj = OverFlat()
     adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
     adj.along_u = adj_place.along_u + adj_toward[0] * direction
@@ -237,7 +242,7 @@ class Footprint:
 @wp.func
 def _is_amid(grid: FlatGrid, footprint: Footprint, radius: float):
     """Whether a footprint is so far from the border that it does not matter."""
-    reach = footprint.distance * radius * footprint.per_cosine + grid.margin
+    reach = footprint.distance * radius * footprint.per_cosine
     nearest = wp.min(footprint.center - grid.least)
     return wp.min(nearest, wp.min(grid.most - footprint.center)) > reach
 
@@ -267,7 +272,7 @@ def find_footprint(grid: FlatGrid, scene: FlatScene, at: wp.vec3, toward: wp.vec
     if not _is_amid(grid, footprint, scene.radius):
         for axis in range(2):
             slope = toward[axis] * footprint.per_cosine
-            extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope) + grid.margin
+            extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
             beyond = (grid.most[axis] - footprint.center[axis]) / extent
             before = (grid.least[axis] - footprint.center[axis]) / extent
             footprint.share = footprint.share * (step(beyond) - step(before))
@@ -299,7 +304,7 @@ def find_footprint_adjoint(
     if not _is_amid(grid, footprint, radius):
         slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
         stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
-        extent = footprint.distance * radius * stretch + wp.vec2(grid.margin, grid.margin)
+        extent = footprint.distance * radius * stretch
         beyond = wp.cw_div(grid.most - footprint.center, extent)
         before = wp.cw_div(grid.least - footprint.center, extent)
         inside_x = step(beyond[0]) - step(before[0])

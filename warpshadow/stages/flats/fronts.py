@@ -1,16 +1,30 @@
-"""Fronts: which side of a flat sources of bounced light are on.
+"""Fronts: which side of a flat receivers are on.
 
-A body that touches a ground, or has sunk into it a little, has sources on its surface at the ground and below. What
-lies below gets the light of the ground's back: that of the sky there. But receivers do not see the sources, they see
-the spheres that stand in for them. So a source is on the side of a flat on which its sphere is:
+Where bodies touch, as two walls at their seam or a box and the ground that it stands on, points lie in the plane of
+another body, or within float32 of it. They are on the side on which their own body lies. Of a receiver at height h and
+of normal n, on a body that reaches from height l to height u over a flat with normal N,
+
+    front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
+
+S is the smoothstep of :mod:`.cells`, and m its margin. So a body that is wholly in front has all its receivers in
+front, and one through which the flat passes has them where they are. Of a body in the same plane their normals decide.
+
+Where two or three planes meet, a receiver on the seam must see each of them as one before it does: at its own place it
+is at the border of both, and half of each would cover nothing. So receivers within 2 k of planes are lit where they are
+lifted to, off all of them, k = 5 m:
+
+    x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
+
+A body that has sunk into a ground a little has sources of bounced light on its surface below. What lies there gets the
+light of the ground's back: that of the sky there. But receivers do not see the sources, they see the spheres that stand
+in for them. So a source is on the side of a flat on which its sphere is:
 
     front = S(1.25 (h + c) / r)
 
-h and c are the heights of the source and of its sphere's center, r is the sphere's radius, and S is the smoothstep of
-:mod:`.cells`. A sphere that touches a flat from above has all its sources in front, and one that touches it from below,
-behind; 1.25 leaves room for spheres that bulge out of their mesh. So what a source gets changes over the depth of a
-sphere. With the margin of other receivers, a tenth of a texel, it jumped: the gradient of a ball that touches a ground
-held for steps of 1/5000 of its radius.
+c is the height of its sphere's center, and r the sphere's radius. A sphere that touches a flat from above has all its
+sources in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
+So what a source gets changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the gradient of
+a ball that touches a ground held for steps of 1/5000 of its radius.
 """
 
 from __future__ import annotations
@@ -22,11 +36,14 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.stages.flats.cells import front_presence, step
+from warpshadow.stages.flats.cells import step
 from warpshadow.stages.flats.prepared import FlatGrid, Flats
 
 _ROOM = wp.constant(1.25)
 """A source is wholly in front of a flat where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
+
+_LIFT = wp.constant(5.0)
+"""How far receivers in a plane are lifted off it, in its margins."""
 
 _TINY = wp.constant(1.0e-18)
 """Radius up to which a sphere stands in for nothing."""
@@ -44,10 +61,67 @@ class SpheresOfPoints(NamedTuple):
         return self._replace(numbers=self.numbers[part])
 
 
+@wp.func
+def _height(point: wp.vec3, frames: wp.array2d(dtype=wp.vec3), instance: int, f: int):
+    """Height of a point over a flat that has an area [units of the body]."""
+    along = frames[instance, 3 * f + 1]
+    up = wp.normalize(wp.cross(along, frames[instance, 3 * f + 2]))
+    return wp.dot(point - frames[instance, 3 * f], up) / wp.length(along)
+
+
+@wp.kernel(enable_backward=False)
+def _find_extremes(
+    # in
+    corners: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    # out
+    extremes: wp.array2d(dtype=wp.vec2i),
+):
+    """A thread owns an instance and a flat."""
+    batch, f = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    up = wp.cross(frames[instance, 3 * f + 1], frames[instance, 3 * f + 2])
+    lowest, highest = int(0), int(0)
+    of_corners = instance_in(batch, corners.shape[0])
+    first = corners[of_corners, 0]
+    least, most = float(0.0), float(0.0)
+    for corner in range(1, corners.shape[1]):
+        height = wp.dot(corners[of_corners, corner] - first, up)
+        if height < least:
+            lowest, least = corner, height
+        if height > most:
+            highest, most = corner, height
+    extremes[batch, f] = wp.vec2i(lowest, highest)
+
+
+@wp.kernel
+def _find_leanings(
+    # in
+    corners: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=FlatGrid),
+    extremes: wp.array2d(dtype=wp.vec2i),
+    # out
+    leanings: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns an instance and a flat."""
+    batch, f = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    leaning = float(0.0)
+    if wp.length_sq(frames[instance, 3 * f + 1]) > 0.0:
+        of_corners = instance_in(batch, corners.shape[0])
+        low = _height(corners[of_corners, extremes[batch, f][0]], frames, instance, f)
+        high = _height(corners[of_corners, extremes[batch, f][1]], frames, instance, f)
+        leaning = wp.clamp((high + low) / wp.max(high - low, grids[f].margin), -1.0, 1.0)
+    leanings[batch, f] = leaning
+
+
 @wp.kernel
 def _find_fronts(
     # in
     points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    leanings: wp.array2d(dtype=wp.float32),
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     numbers: wp.array(dtype=wp.int32),
@@ -58,46 +132,126 @@ def _find_fronts(
 ):
     """A thread owns a point of an instance and a flat."""
     batch, receiver, f = wp.tid()
-    of_flats = instance_in(batch, frames.shape[0])
-    origin = frames[of_flats, 3 * f]
-    along = frames[of_flats, 3 * f + 1]
-    up = wp.normalize(wp.cross(along, frames[of_flats, 3 * f + 2]))
-    height = wp.dot(points[instance_in(batch, points.shape[0]), receiver] - origin, up)
-    number = numbers[receiver]
-    radius = float(0.0)
-    middle = float(0.0)
-    if number >= 0:
-        radius = radii[instance_in(batch, radii.shape[0]), number]
-        middle = wp.dot(centers[instance_in(batch, centers.shape[0]), number] - origin, up)
+    instance = instance_in(batch, frames.shape[0])
+    along = frames[instance, 3 * f + 1]
     front = float(0.0)
-    if radius > _TINY:
-        if _ROOM * wp.abs(height + middle) < radius:
-            front = step(_ROOM * (height + middle) / radius)
+    if wp.length_sq(along) > 0.0:
+        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, instance, f)
+        number = int(-1)
+        if numbers:
+            number = numbers[receiver]
+        radius = float(0.0)
+        if number >= 0:
+            radius = radii[instance_in(batch, radii.shape[0]), number] / wp.length(along)
+        if radius > _TINY:
+            middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, instance, f)
+            if _ROOM * wp.abs(height + middle) < radius:
+                front = step(_ROOM * (height + middle) / radius)
+            else:
+                front = wp.where(height + middle > 0.0, 1.0, 0.0)
+        elif wp.abs(height) < 2.0 * grids[f].margin:
+            leaning = float(1.0)
+            if leanings:
+                leaning = leanings[instance_in(batch, leanings.shape[0]), f]
+            up = wp.normalize(wp.cross(along, frames[instance, 3 * f + 2]))
+            facing = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], up)
+            front = step(leaning + (1.0 - leaning * leaning) * facing + 2.0 * height / grids[f].margin)
         else:
-            front = wp.where(height + middle > 0.0, 1.0, 0.0)
-    elif wp.length_sq(along) > 0.0:
-        front = front_presence(grids[f], height / wp.length(along))
+            front = wp.where(height > 0.0, 1.0, 0.0)
     fronts[batch, receiver, f] = front
 
 
-def find_fronts(points: wp.array, spheres: SpheresOfPoints, frames: wp.array, flats: Flats) -> wp.array:
-    """Part of the front of each flat that sources of light see; of the back they see the rest.
+def find_fronts(
+    points: wp.array,
+    normals: wp.array,
+    corners: wp.array | None,
+    spheres: SpheresOfPoints | None,
+    frames: wp.array,
+    flats: Flats,
+) -> wp.array:
+    """Part of the front of each flat that receivers see; of the back they see the rest.
 
     Args:
-        points: The sources [scene units], vec3 of shape [batch, receiver].
-        spheres: What stands in for them. Points without a sphere see what others do, by their own heights.
+        points: The receivers [scene units], vec3 of shape [batch, receiver].
+        normals: Their unit normals, vec3 of shape [batch, receiver].
+        corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
+            where it is not known: receivers are in front down to the plane itself.
+        spheres: What stands in for sources of light; None where no receiver has a sphere.
         frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`.Flats.frames`. Any batch may be 1.
         flats: The flats.
 
     Returns:
         Float32 of shape [batch, receiver, flat], 0 to 1.
 
-    Differentiable: points, centers and radii of spheres, frames.
+    Differentiable: points, normals, corners, centers and radii of spheres, frames.
     """
-    centers, radii, numbers = spheres
-    check.shape("numbers", numbers.shape, (points.shape[1],))
+    centers, radii, numbers = (None, None, None) if spheres is None else spheres
+    check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("frames", frames.shape, ("batch", 3 * flats.count))
-    count = common_batch({"points": points, "centers": centers, "radii": radii, "frames": frames})
+    if numbers is not None:
+        check.shape("numbers", numbers.shape, (points.shape[1],))
+    given = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
+    count = common_batch({**given, "corners": corners})
+    leanings = None if corners is None else _leanings(corners, frames, flats)
     fronts = wp.empty((count, points.shape[1], flats.count), dtype=wp.float32, device=points.device)
-    launch(_find_fronts, fronts.shape, inputs=[points, *spheres, frames, flats.grids], outputs=[fronts])
+    inputs = [points, normals, leanings, centers, radii, numbers, frames, flats.grids]
+    launch(_find_fronts, fronts.shape, inputs=inputs, outputs=[fronts])
     return fronts
+
+
+def _leanings(corners: wp.array, frames: wp.array, flats: Flats) -> wp.array:
+    """On which side of each flat a body lies, b, float32 of shape [batch, flat]. Differentiable: corners, frames."""
+    count = common_batch({"corners": corners, "frames": frames})
+    extremes = wp.empty((count, flats.count), dtype=wp.vec2i, device=corners.device)
+    launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])
+    leanings = wp.empty((count, flats.count), dtype=wp.float32, device=corners.device)
+    inputs = [corners, frames, flats.grids, extremes]
+    launch(_find_leanings, leanings.shape, inputs=inputs, outputs=[leanings])
+    return leanings
+
+
+@wp.kernel
+def _lift(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=FlatGrid),
+    skip: int,
+    # out
+    lifted: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a point of an instance."""
+    batch, receiver = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    point = points[instance_in(batch, points.shape[0]), receiver]
+    result = point
+    for f in range(grids.shape[0]):
+        along = frames[instance, 3 * f + 1]
+        if f != skip and wp.length_sq(along) > 0.0:
+            height = _height(point, frames, instance, f) / (2.0 * _LIFT * grids[f].margin)
+            if wp.abs(height) < 1.0:
+                near = 1.0 - height * height
+                up = wp.normalize(wp.cross(along, frames[instance, 3 * f + 2]))
+                side = 2.0 * fronts[batch, receiver, f] - 1.0
+                result += side * near * near * _LIFT * grids[f].margin * wp.length(along) * up
+    lifted[batch, receiver] = result
+
+
+def lifted_points(points: wp.array, fronts: wp.array, frames: wp.array, flats: Flats, skip: int | None) -> wp.array:
+    """Lift receivers off the flats in whose planes they lie.
+
+    Args:
+        points, frames, flats: As for :func:`find_fronts`.
+        fronts: Found by it.
+        skip: Number of the flat that the receivers are part of; None for none.
+
+    Returns:
+        Points, vec3 of shape [batch, receiver].
+
+    Differentiable: points, fronts, frames.
+    """
+    lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
+    inputs = [points, fronts, frames, flats.grids, -1 if skip is None else skip]
+    launch(_lift, lifted.shape, inputs=inputs, outputs=[lifted])
+    return lifted

@@ -62,7 +62,7 @@ def _cover(scene: FlatScene, grid: FlatGrid, place: OverFlat, is_back: bool, dir
     cosine = wp.dot(direction, place.normal)
     if presence > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
         covered.footprint = find_footprint(
-            grid, scene, on_side(place, is_back), toward_side(place, is_back, direction), presence
+            grid, scene, on_side(grid, place, is_back), toward_side(place, is_back, direction), presence
         )
         covered.part = 1.0
         if grid.is_whole == 0 and covered.footprint.share > 0.0:
@@ -105,7 +105,7 @@ def _cover_adjoint(
         -0.5 * footprint.per_cosine * adj_spot[2],
         wp.vec2(adj_spot[0], adj_spot[1]),
     )
-    return side_adjoint(place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
+    return side_adjoint(grid, place, is_back, direction, adj_at, adj_toward, adj_place), adj_presence
 
 
 @wp.func

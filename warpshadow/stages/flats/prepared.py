@@ -16,8 +16,8 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_MARGIN = 0.1
-"""Margin of borders and of planes, in widths of the smallest texel."""
+_MARGIN = 0.001
+"""Margin of planes, in widths of the smallest texel."""
 
 
 class FlatBody(NamedTuple):
