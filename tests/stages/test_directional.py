@@ -219,6 +219,17 @@ def test_no_spheres_and_spheres_of_radius_zero_let_everything_pass(radii, center
     assert (transmittance(points, normals, centers, radii, cells.fibonacci(64), device) == 1).all()
 
 
+def test_spheres_that_are_left_out_block_nothing(device):
+    points, normals, centers, radii = twins.random_scene(15)
+    without = radii.copy()
+    without[3:7] = 0
+    expected = transmittance(points, normals, centers, without, cells.fibonacci(64), device)
+    got = transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, 7))
+    np.testing.assert_array_equal(got, expected)
+    with pytest.raises(ValueError, match="skip: got"):
+        transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, len(radii) + 1))
+
+
 def test_concentric_and_hundreds_of_overlapping_spheres_are_finite(device):
     points, *_ = twins.random_scene(14)
     points[:3] = [[0, 0, 0], [1e-8, 0, 0], [1, 0, 0]]

@@ -298,3 +298,24 @@ def test_what_does_not_fit_is_refused(device):
         stage.sphere_light(*good[:3], negative, *good[4:], fibonacci(64))
     with pytest.raises(ValueError, match="softness: got 0.0 for 64 directions"):
         stage.sphere_light(*good, fibonacci(64), softness=0.0)
+
+
+@pytest.mark.parametrize("skip", [(0, 2), (1, 3), (5, 7)])
+def test_spheres_that_are_left_out_are_as_those_of_no_radius(skip, device, monkeypatch):
+    monkeypatch.setattr(merging, "MERGED_FROM", 4)
+    values = [value[None] for value in scene(11, 16)]
+    quads = np.random.default_rng(0).uniform(0.1, 1, (1, 1, 16, 4))
+    values[4] = np.concatenate([values[4], quads], axis=1)
+    weights = np.random.default_rng(12).normal(size=(1, 19, 3))
+    options = {"merging": 1.0}
+    got, got_gradients = gradients(values, weights, 16, device, skip=skip, **options)
+    radii, quad = values[3].copy(), slice(0, 4)
+    radii[0, slice(*skip)] = 0
+    if skip[0] < quad.stop:  # its four spheres no longer merge
+        options, values[4] = {"merging": 0}, values[4][:, :-1]
+        got_gradients[4] = got_gradients[4][:, :-1]
+    values[3] = radii
+    expected, expected_gradients = gradients(values, weights, 16, device, **options)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    for ours, wanted in zip(got_gradients, expected_gradients, strict=True):
+        np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())  # measured 2e-4

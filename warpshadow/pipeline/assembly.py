@@ -302,6 +302,14 @@ class Assembly:
         centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
         return centers, radii
 
+    def spheres_among(self, bodies: Sequence[int], body: int | None) -> tuple[int, int]:
+        """Where the spheres of a body begin and end among those of some bodies, rising; (0, 0) for another's."""
+        if body is None or body not in bodies:
+            return 0, 0
+        counts, place = self.sphere_counts, bodies.index(body)
+        first = int(counts[list(bodies[:place])].sum())
+        return first, first + int(counts[body])
+
     @staticmethod
     def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
         """Where the items of some bodies begin and end, consecutive bodies together and those without items left out.

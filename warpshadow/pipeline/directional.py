@@ -1,7 +1,7 @@
 """The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -81,14 +81,15 @@ class Directional(SphereMethod):
             return Seen(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
         # kept cells have light although their middles are below the horizon
         facing = normals if kept_rows is None else None
-        block, scales = functools.partial(directional.transmittance, points, facing, centers, radii), self._scales
+        given, scales = (points, facing, centers, radii), self._scales
+        block = functools.partial(directional.transmittance, *given, skip=group.skip)
         passing = block(taken.directions, **scales(1.0))
         if taken.narrow is not None:
             directions, places, scale = taken.narrow
             passing = put_narrow(passing, block(directions, **scales(scale)), places)
         return Seen(passing if past_own is None else multiply_transmittances(past_own, passing), past_own)
 
-    def _scales(self, scale: float) -> dict[str, float]:
+    def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
         return {"softness": scale * self.visibility.softness, "merging": scale * self.visibility.merging}
 

@@ -25,9 +25,9 @@ PART = 1 << 13
 """Receivers of each instance that are lit at once where no gradient is asked for."""
 
 
-def solid_bodies(assembly: Assembly, *, but: int | None = None) -> list[int]:
-    """Bodies, other than one, for which spheres stand in where light bounces: those that are not flat."""
-    return [body for body in range(len(assembly.scene.bodies)) if body != but and not assembly.is_flat[body]]
+def solid_bodies(assembly: Assembly) -> list[int]:
+    """Bodies for which spheres stand in where light bounces: those that are not flat."""
+    return [body for body in range(len(assembly.scene.bodies)) if not assembly.is_flat[body]]
 
 
 class Group(NamedTuple):
@@ -44,6 +44,7 @@ class Group(NamedTuple):
     flats: FlatsAround | None = None  # bodies that block as planes; None without any
     as_spheres: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
+    skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
 
     def among(self, frames: wp.array, flats: Flats, skip: int | None) -> tuple[wp.array, wp.array]:
         """Where they are lit among flats, off the planes they lie in, and the part of each front that they see."""
@@ -55,7 +56,7 @@ class Group(NamedTuple):
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners = self
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners, _ = self
         size = points.shape[1]
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
@@ -139,16 +140,19 @@ class Grouping:
     ) -> Iterator[Group]:
         """Those that may move."""
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
+        blocking, none = (self._assembly.spheres_of(some, spheres) for some in (bodies, []))
         as_spheres = self._as_spheres(spheres)
         if not receivers.spans:
-            blocking, flats = self._assembly.spheres_of(bodies, spheres), self._flats_around(frames)
+            flats = self._flats_around(frames)
             yield Group(receivers.points, receivers.normals, *blocking, flats=flats, as_spheres=as_spheres)
         for span in receivers.spans:
             points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
             is_traced = span.body in self._points.blocking.traced
-            others = [body for body in bodies if not (is_traced and body == span.body)]
-            blocking = self._assembly.spheres_of(others, spheres)
-            group = Group(points, normals, *blocking, flats=self._flats_around(frames, but=span.body))
+            skip = self._assembly.spheres_among(bodies, span.body) if is_traced else (0, 0)
+            others = none if skip == (0, blocking[1].shape[1]) else blocking
+            group = Group(points, normals, *others, flats=self._flats_around(frames, but=span.body))
+            if others is blocking:
+                group = group._replace(skip=skip)
             if span.body >= 0:
                 places = self._points.method.own_shadows.places(receivers, span)
                 group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))

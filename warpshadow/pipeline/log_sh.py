@@ -69,7 +69,7 @@ class LogSH(SphereMethod):
         if not points.size or (kept_rows is None and not radii.shape[1]):
             return Seen(None)
         if radii.shape[1]:
-            log = self._logs(*group[:4])
+            log = self._logs(*group[:4], skip=group.skip)
         else:
             log = wp.zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if kept_rows is not None:
@@ -136,6 +136,9 @@ class LogSH(SphereMethod):
             rows[of_body, 1] = found.numpy()[0]
         return wp.array(rows, dtype=wp.float32, device=device)
 
-    def _logs(self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array) -> wp.array:
+    def _logs(
+        self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array, skip: tuple[int, int] = (0, 0)
+    ) -> wp.array:
         log, merging = self.visibility.log, self.visibility.merging
-        return log_sh.accumulate(points, normals, centers, radii, order=self._order, log=log, merging=merging)
+        given = points, normals, centers, radii
+        return log_sh.accumulate(*given, order=self._order, log=log, merging=merging, skip=skip)

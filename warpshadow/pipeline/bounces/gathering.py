@@ -103,7 +103,6 @@ class StandIns:
 
     def __init__(self, senders: Senders, merging: float):
         self.senders, self.assembly, self._merging = senders, senders.assembly, merging
-        self._patches_of_spheres: dict[int | None, tuple[np.ndarray, np.ndarray]] = {}
 
     @functools.cached_property
     def flats(self) -> PlacedFlats | None:
@@ -123,19 +122,24 @@ class StandIns:
         found = Flats.of(bodies, *counts, device=assembly.device)
         return PlacedFlats(found, {number: k for k, number in enumerate(numbers)})
 
-    def patches_of_spheres(self, body: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """The patches that each sphere that blocks a body's receivers stands in for: where they begin, and numbers."""
-        if body not in self._patches_of_spheres:
-            self._patches_of_spheres[body] = patches_of_nodes(*self._nearest(body), merging=self._merging)
-        return self._patches_of_spheres[body]
+    @functools.cached_property
+    def solid(self) -> list[int]:
+        """The bodies for which spheres stand in."""
+        return solid_bodies(self.assembly)
 
-    def _nearest(self, body: int | None) -> tuple[np.ndarray, np.ndarray]:
+    @functools.cached_property
+    def patches_of_spheres(self) -> tuple[np.ndarray, np.ndarray]:
+        """The patches that each sphere stands in for: where they begin, and numbers."""
+        return patches_of_nodes(*self._nearest, merging=self._merging)
+
+    @functools.cached_property
+    def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
         """For each patch the nearest sphere of its body, and for each sphere the nearest patch; −1 for none."""
         rest, first_sphere, senders = self.assembly.rest, self.assembly.first_sphere, self.senders
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         spheres, start = np.full(len(senders.areas), -1, np.int32), 0
         nearest = [np.empty(0, int)]
-        for other in solid_bodies(self.assembly, but=body):
+        for other in self.solid:
             of_body = slice(*first_sphere[other : other + 2])
             count = len(radii[of_body])
             of_spheres = np.full(count, -1)
@@ -153,7 +157,7 @@ class StandIns:
     @functools.cached_property
     def spheres_of_sources(self) -> np.ndarray:
         """The sphere that stands in for each source, among those of bodies that are not flat; −1 for none."""
-        return self._nearest(None)[0][self.senders.patch_of_source]
+        return self._nearest[0][self.senders.patch_of_source]
 
     def shown(
         self,
@@ -172,7 +176,7 @@ class StandIns:
         """
         normals, flats, senders = sources.normals, self.flats, self.senders
         if flats is not None:
-            centers, radii = self.assembly.spheres_of(solid_bodies(self.assembly), spheres)
+            centers, radii = self.assembly.spheres_of(self.solid, spheres)
             numbers, points, device = self.spheres_of_sources, sources.points, normals.device
             of_sources = SpheresOfPoints(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_sources, frames, flats.all)
@@ -208,21 +212,19 @@ class Outgoing:
     ):
         self.stand_ins, self.senders, self.radiosity = stand_ins, stand_ins.senders, radiosity
         self._shown, self._spheres, self.frames = shown, spheres, frames
-        self._of_spheres: dict[int | None, tuple[wp.array, wp.array, wp.array]] = {}
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
         place = self.senders.bodies.index(body)
         return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
 
-    def of_spheres(self, body: int | None) -> tuple[wp.array, wp.array, wp.array]:
-        """Centers and radii of the spheres of bodies other than one, and what they send towards cells."""
-        if body not in self._of_spheres:
-            others = solid_bodies(self.stand_ins.assembly, but=body)
-            centers, radii = self.stand_ins.assembly.spheres_of(others, self._spheres)
-            given = self.radiosity, self._shown, self.senders.areas, *self.stand_ins.patches_of_spheres(body)
-            self._of_spheres[body] = centers, radii, sphere_exitance(*given)
-        return self._of_spheres[body]
+    @functools.cached_property
+    def of_spheres(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Centers and radii of the spheres that stand in for bodies, and what they send towards cells."""
+        stand_ins = self.stand_ins
+        centers, radii = stand_ins.assembly.spheres_of(stand_ins.solid, self._spheres)
+        given = self.radiosity, self._shown, self.senders.areas, *stand_ins.patches_of_spheres
+        return centers, radii, sphere_exitance(*given)
 
 
 class Gathering:
@@ -289,9 +291,11 @@ class Gathering:
         return flat_light(*given, cells.directions, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
-        centers, radii, exitance = outgoing.of_spheres(group.body)
-        if not radii.shape[1]:
+        stand_ins = outgoing.stand_ins
+        skip = stand_ins.assembly.spheres_among(stand_ins.solid, group.body)
+        if skip == (0, int(stand_ins.assembly.sphere_counts[stand_ins.solid].sum())):
             return None
+        centers, radii, exitance = outgoing.of_spheres
         count = common_batch({"geometry": group.points, "light": exitance})
         points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, centers, radii))
         given = (
@@ -304,4 +308,5 @@ class Gathering:
             cells.past_own,
             cells.directions,
         )
-        return sphere_light(*given, softness=self._visibility.softness, merging=self._visibility.merging)
+        visibility = self._visibility
+        return sphere_light(*given, softness=visibility.softness, merging=visibility.merging, skip=skip)

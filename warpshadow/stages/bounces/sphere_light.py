@@ -472,6 +472,7 @@ def sphere_light(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
+    skip: tuple[int, int] = (0, 0),
 ) -> wp.array:
     """Light that spheres send to receivers, through the cells that they block.
 
@@ -483,12 +484,13 @@ def sphere_light(
         exitance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of shape
             [batch, node, direction], from :func:`.exitance.sphere_exitance`. A batch of 1 serves every instance.
         transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same
-            directions, softness and merging.
+            directions, softness, merging and skip.
         unblocked: F, what T would be without these spheres, a factor of T, of the same shape; a batch of 1 serves every
             instance. None for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
+        skip: Spheres that are left out: the first, and the one after the last.
 
     Returns:
         What a white receiver reflects of that light, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
@@ -497,7 +499,7 @@ def sphere_light(
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
 
     Differentiable: points, normals, centers, radii, exitance, transmittance, unblocked. (The derivative in T is that at
-    a fixed blend of spheres.) Not: directions, softness, merging.
+    a fixed blend of spheres.) Not: directions, softness, merging, skip.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
@@ -515,7 +517,7 @@ def sphere_light(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     own_count = len(directions) // span_count
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)))
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip)
     dim = batch_count * group_count(vertex_count, lanes), span_count
     variables = [points, normals, *nodes, exitance, transmittance, unblocked]
     is_kept = varies(variables)

@@ -310,6 +310,7 @@ def transmittance(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
+    skip: tuple[int, int] = (0, 0),
 ) -> wp.array:
     """Transmittance of spheres towards cells of directions.
 
@@ -323,6 +324,7 @@ def transmittance(
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
+        skip: Spheres that are left out: the first, and the one after the last.
 
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
@@ -331,7 +333,7 @@ def transmittance(
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
 
-    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging.
+    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
@@ -343,7 +345,7 @@ def transmittance(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)))
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip)
     dim = batch_count * group_count(vertex_count, lanes), span_count
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)

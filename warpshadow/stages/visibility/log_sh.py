@@ -250,6 +250,7 @@ def accumulate(
     order: int = 8,
     log: str = "eigen",
     merging: float = MERGING,
+    skip: tuple[int, int] = (0, 0),
 ) -> wp.array:
     """Accumulate the log-visibility of spheres in spherical harmonics.
 
@@ -265,6 +266,7 @@ def accumulate(
         log: "eigen" (Ren et al. 2006, accurate where spheres overlap) or "cap" (the paper's).
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
+        skip: Spheres that are left out: the first, and the one after the last.
 
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
@@ -282,7 +284,7 @@ def accumulate(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2))
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2), skip)
     inputs = [points, normals, spheres, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2

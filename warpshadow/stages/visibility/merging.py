@@ -165,7 +165,21 @@ class Spheres:
     bounds_of_quads: wp.array2d(dtype=wp.vec4)
     bounds_of_runs: wp.array2d(dtype=wp.vec4)
     count: int  # of nodes that are no quad's
+    skip_begin: int  # these spheres are left out, up to the next
+    skip_end: int
     merging_angle: float
+
+
+@wp.func
+def meets(begin: int, end: int, spheres: Spheres):
+    """Whether one of some spheres that follow each other is left out."""
+    return wp.max(begin, spheres.skip_begin) < wp.min(end, spheres.skip_end)
+
+
+@wp.func
+def within(begin: int, end: int, spheres: Spheres):
+    """Whether all of some spheres that follow each other are left out."""
+    return begin >= spheres.skip_begin and end <= spheres.skip_end
 
 
 @wp.struct
@@ -242,7 +256,7 @@ def make_merged(lanes: int) -> wp.Function:
     @wp.func
     def merged(points: Vectors, batch: int, quad: int, spheres: Spheres):
         share = Lane(0.0)
-        if quad < spheres.extents.shape[1]:
+        if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
             offset, _inverse = relative(points, batch, quad, spheres)
             share_, _slope = blend(offset, spheres.merging_angle)
             share = share_
@@ -265,7 +279,7 @@ def make_merged_adjoint(lanes: int) -> wp.Function:
     @wp.func
     def adjoint(points: Vectors, batch: int, quad: int, adj_merged: Lane, spheres: Spheres, gradients: Gradients):
         adj_offset = Vectors()
-        if quad < spheres.extents.shape[1]:
+        if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
             offset, inverse = relative(points, batch, quad, spheres)
             _merged, slope = blend(offset, spheres.merging_angle)
             if is_any_above(slope, 0.0):

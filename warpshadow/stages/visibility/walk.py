@@ -23,6 +23,7 @@ from warpshadow.stages.visibility.merging import (
     make_merged,
     make_merged_adjoint,
     merge_where_far,
+    within,
 )
 
 QUADS = 4
@@ -76,13 +77,16 @@ def _bound(
     bounds[batch, run] = wp.vec4(middle[0], middle[1], middle[2], reach)
 
 
-def make_spheres(centers: wp.array, radii: wp.array, merging: float, cell: float) -> tuple[Nodes, Spheres]:
+def make_spheres(
+    centers: wp.array, radii: wp.array, merging: float, cell: float, skip: tuple[int, int] = (0, 0)
+) -> tuple[Nodes, Spheres]:
     """Merge spheres where there are enough of them, and bound their quads and runs.
 
     Args:
         centers, radii: Spheres, [batch, sphere].
         merging: τ in cell radii, 0 for never.
         cell: Radius of a cell [rad].
+        skip: Spheres that are left out: the first, and the one after the last.
 
     Returns:
         The spheres as arrays, and as kernels see them.
@@ -90,9 +94,12 @@ def make_spheres(centers: wp.array, radii: wp.array, merging: float, cell: float
     Differentiable: centers, radii to the nodes.
     """
     nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
+    if not 0 <= skip[0] <= skip[1] <= count:
+        raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
     spheres = Spheres()
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell
+    spheres.skip_begin, spheres.skip_end = skip
     spheres.bounds_of_quads = _find_bounds(nodes, count, 1)
     spheres.bounds_of_runs = _find_bounds(nodes, count, QUADS)
     return nodes, spheres
@@ -194,7 +201,9 @@ def make_walk(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: boo
         for run in range(spheres.bounds_of_runs.shape[1]):
             begin = run * QUADS
             end = wp.min(begin + QUADS, spheres.bounds_of_quads.shape[1])
-            run_count = cull(receivers, spheres.bounds_of_runs[batch, run], begin * ITEMS, ALL, task)
+            run_count = int(0)
+            if not within(begin * QUAD, wp.min(end * QUAD, spheres.count), spheres):
+                run_count = cull(receivers, spheres.bounds_of_runs[batch, run], begin * ITEMS, ALL, task)
             if run_count == 0:
                 end = begin
             for quad in range(begin, end):
@@ -210,7 +219,8 @@ def make_walk(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: boo
                             share = quad_share
                             sign = 1.0
                         radius = float(0.0)
-                        if node >= 0 and is_any_above(share, 0.0):
+                        is_left_out = item < QUAD and within(node, node + 1, spheres)
+                        if node >= 0 and not is_left_out and is_any_above(share, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
                             seen = Seen()
