@@ -82,7 +82,7 @@ class Directional(SphereMethod):
         # kept cells have light although their middles are below the horizon
         facing = normals if kept_rows is None else None
         given, scales = (points, facing, centers, radii), self._scales
-        block = functools.partial(directional.transmittance, *given, skip=group.skip)
+        block = functools.partial(directional.transmittance, *given, skip=group.skip, clusters=group.clusters)
         passing = block(taken.directions, **scales(1.0))
         if taken.narrow is not None:
             directions, places, scale = taken.narrow

@@ -20,6 +20,7 @@ from warpshadow.stages.flats.prepared import Flats
 from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.own_shadows.sites import Places
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.visibility.walk import Clusters, find_clusters
 
 PART = 1 << 13
 """Receivers of each instance that are lit at once where no gradient is asked for."""
@@ -45,6 +46,7 @@ class Group(NamedTuple):
     as_spheres: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
+    clusters: Clusters | None = None  # of the spheres, where they are found already
 
     def among(self, frames: wp.array, flats: Flats, skip: int | None) -> tuple[wp.array, wp.array]:
         """Where they are lit among flats, off the planes they lie in, and the part of each front that they see."""
@@ -56,7 +58,7 @@ class Group(NamedTuple):
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners, _ = self
+        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners, _, clusters = self
         size = points.shape[1]
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
@@ -65,9 +67,10 @@ class Group(NamedTuple):
             given["corners"] = corners
             count = common_batch(given)
             points, normals, centers, radii = [expand(array, count) for array in self[:4]]
+            clusters = clusters if radii is self.radii and centers is self.centers else None
         varying = [*self[:4], turns, frames, corners]
         if kept_rows is not None or size <= PART or varies(varying):
-            yield self._replace(points=points, normals=normals, centers=centers, radii=radii)
+            yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, PART):
             part = slice(start, min(start + PART, size))
@@ -78,6 +81,7 @@ class Group(NamedTuple):
                 radii=radii,
                 places=None if places is None else places.part(part),
                 as_spheres=None if as_spheres is None else as_spheres.part(part),
+                clusters=clusters,
             )
 
 
@@ -141,6 +145,7 @@ class Grouping:
         """Those that may move."""
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
         blocking, none = (self._assembly.spheres_of(some, spheres) for some in (bodies, []))
+        clusters = None
         as_spheres = self._as_spheres(spheres)
         if not receivers.spans:
             flats = self._flats_around(frames)
@@ -152,7 +157,8 @@ class Grouping:
             others = none if skip == (0, blocking[1].shape[1]) else blocking
             group = Group(points, normals, *others, flats=self._flats_around(frames, but=span.body))
             if others is blocking:
-                group = group._replace(skip=skip)
+                clusters = clusters or find_clusters(*blocking, self._points.method.visibility.merging)
+                group = group._replace(skip=skip, clusters=clusters)
             if span.body >= 0:
                 places = self._points.method.own_shadows.places(receivers, span)
                 group = group._replace(body=span.body, places=places, own_shadow=own_shadows.get(span.body))

@@ -1,7 +1,7 @@
 """The log-SH method: visibility in spherical harmonics, the exponential of a sum of logarithms over the spheres."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -69,7 +69,7 @@ class LogSH(SphereMethod):
         if not points.size or (kept_rows is None and not radii.shape[1]):
             return Seen(None)
         if radii.shape[1]:
-            log = self._logs(*group[:4], skip=group.skip)
+            log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
         else:
             log = wp.zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if kept_rows is not None:
@@ -137,8 +137,8 @@ class LogSH(SphereMethod):
         return wp.array(rows, dtype=wp.float32, device=device)
 
     def _logs(
-        self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array, skip: tuple[int, int] = (0, 0)
+        self, points: wp.array, normals: wp.array, centers: wp.array, radii: wp.array, **options: Any
     ) -> wp.array:
         log, merging = self.visibility.log, self.visibility.merging
         given = points, normals, centers, radii
-        return log_sh.accumulate(*given, order=self._order, log=log, merging=merging, skip=skip)
+        return log_sh.accumulate(*given, order=self._order, log=log, merging=merging, **options)

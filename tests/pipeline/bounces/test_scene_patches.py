@@ -96,7 +96,8 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     big, small = ws.icosphere(1.0, 2), ws.icosphere(100.0, 2)  # as meshes; in the scene the first is 3 times as large
     bodies = ws.Body(big, scale=3.0, name="big"), ws.Body(small, scale=0.01, translation=(9, 0, 0), name="small")
     flat = ws.Body(ws.plane(2.0, 4), scale=2.5, translation=(0, -9, 0), name="ground")
-    light, camera = ws.EnvironmentMap.constant(1.0, height=8), ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))
+    ball, light = ws.icosphere(1.0, 4), ws.EnvironmentMap.constant(1.0, height=8)
+    camera = ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))
     assembly = Assembly(ws.Scene((*bodies, flat), light, camera))
     senders = ScenePatches(assembly).senders(Materials.of_scene(assembly))
     areas = [senders.areas[first:end].sum() for first, end in zip(senders.first[:-1], senders.first[1:], strict=True)]
@@ -112,3 +113,15 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     shown = wp.full((1, len(senders.areas), 4), 0.25, wp.float32)
     sent = sphere_exitance(wp.array(radiosity, dtype=wp.vec3), shown, senders.areas, starts, numbers).numpy()[0, 0]
     np.testing.assert_allclose(sent[:, 0] / sent[:, 3], expected[0] / (expected[0] + expected[1]), rtol=1e-5)
+
+
+def test_many_bodies_share_a_scenes_patches_by_their_areas():
+    ball, light = ws.icosphere(1.0, 4), ws.EnvironmentMap.constant(1.0, height=8)
+    camera = ws.Camera.look_at((0, 3, 8), (0, 1, 0))
+    scales = [1.0] * 39 + [0.1]
+    bodies = [ws.Body(ball, blockers=1, scale=scale, name=f"{number}") for number, scale in enumerate(scales)]
+    few, many = (ScenePatches(Assembly(ws.Scene(tuple(some), light, camera))) for some in (bodies[:2], bodies))
+    assert few.of_body(0).count == 256
+    assert len(few.of_body(0).sources.patches) > 3 * 256
+    assert [many.of_body(number).count for number in (0, 39)] == [64, 32]
+    assert len(many.of_body(0).sources.patches) == 64

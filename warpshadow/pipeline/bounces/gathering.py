@@ -33,6 +33,7 @@ from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
 from warpshadow.stages.flats.prepared import FlatBody, Flats
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
+from warpshadow.stages.visibility.walk import Clusters, find_clusters
 
 CELLS = fibonacci(64)
 """Where receivers look for bounced light if direct light is found in harmonics."""
@@ -102,7 +103,7 @@ class StandIns:
     """
 
     def __init__(self, senders: Senders, merging: float):
-        self.senders, self.assembly, self._merging = senders, senders.assembly, merging
+        self.senders, self.assembly, self.merging = senders, senders.assembly, merging
 
     @functools.cached_property
     def flats(self) -> PlacedFlats | None:
@@ -130,7 +131,7 @@ class StandIns:
     @functools.cached_property
     def patches_of_spheres(self) -> tuple[np.ndarray, np.ndarray]:
         """The patches that each sphere stands in for: where they begin, and numbers."""
-        return patches_of_nodes(*self._nearest, merging=self._merging)
+        return patches_of_nodes(*self._nearest, merging=self.merging)
 
     @functools.cached_property
     def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
@@ -219,12 +220,12 @@ class Outgoing:
         return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
 
     @functools.cached_property
-    def of_spheres(self) -> tuple[wp.array, wp.array, wp.array]:
-        """Centers and radii of the spheres that stand in for bodies, and what they send towards cells."""
+    def of_spheres(self) -> tuple[wp.array, wp.array, wp.array, Clusters]:
+        """Centers and radii of the spheres that stand in for bodies, what they send towards cells, and clusters."""
         stand_ins = self.stand_ins
         centers, radii = stand_ins.assembly.spheres_of(stand_ins.solid, self._spheres)
         given = self.radiosity, self._shown, self.senders.areas, *stand_ins.patches_of_spheres
-        return centers, radii, sphere_exitance(*given)
+        return centers, radii, sphere_exitance(*given), find_clusters(centers, radii, stand_ins.merging)
 
 
 class Gathering:
@@ -295,9 +296,10 @@ class Gathering:
         skip = stand_ins.assembly.spheres_among(stand_ins.solid, group.body)
         if skip == (0, int(stand_ins.assembly.sphere_counts[stand_ins.solid].sum())):
             return None
-        centers, radii, exitance = outgoing.of_spheres
+        own_centers, own_radii, exitance, clusters = outgoing.of_spheres
         count = common_batch({"geometry": group.points, "light": exitance})
-        points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, centers, radii))
+        spheres = own_centers, own_radii
+        points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, *spheres))
         given = (
             points,
             normals,
@@ -308,5 +310,8 @@ class Gathering:
             cells.past_own,
             cells.directions,
         )
+        options: dict[str, Any] = {"skip": skip}
+        if radii is own_radii and centers is own_centers:
+            options["clusters"] = clusters
         visibility = self._visibility
-        return sphere_light(*given, softness=visibility.softness, merging=visibility.merging, skip=skip)
+        return sphere_light(*given, softness=visibility.softness, merging=visibility.merging, **options)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import rows
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.assembly import Assembly
@@ -14,10 +16,30 @@ from warpshadow.pipeline.flats import SceneFlats
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import Patches, find_flat_patches, find_patches
+from warpshadow.stages.bounces.patches import (
+    LEAST_PATCHES,
+    MOST_PATCHES,
+    PIECES,
+    SOURCES,
+    Patches,
+    find_flat_patches,
+    find_patches,
+)
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_SCENE_PATCHES = 4096
+"""Patches of a scene of more than 16 bodies, but no fewer than LEAST_PATCHES of each."""
+
+_SCENE_SOURCES = 4096
+"""Sources of the patches of a scene, but at least one of each."""
+
+
+def _area(mesh: Mesh) -> float:
+    """Area of a mesh [square of its units]."""
+    a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.surface.faces], 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 class ScenePatches:
@@ -52,8 +74,29 @@ class ScenePatches:
                 points = np.concatenate(others) if others else None
                 self._of_body[number] = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
             else:
-                self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided)
+                counts = self._counts
+                sources = max(1, min(SOURCES, _SCENE_SOURCES // sum(counts.values())))
+                find = functools.partial(find_patches, is_two_sided=is_two_sided, sources=sources)
+                self._of_body[number] = find(*corners, count=counts[number])
         return self._of_body[number]
+
+    @functools.cached_property
+    def _counts(self) -> dict[int, int]:
+        """Patches of each body that is not flat: of many, by its share of their area, as powers of 2.
+
+        So bodies of one shape that differ little in size have the same.
+        """
+        bodies = self.assembly.scene.bodies
+        areas = {n: body.scale**2 * _area(body.mesh) for n, body in enumerate(bodies) if n not in self.flats}
+        total, counts = sum(areas.values()), {}
+        for number, area in areas.items():
+            share = _SCENE_PATCHES * area / total if total > 0 else LEAST_PATCHES
+            least = max(LEAST_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
+            most = MOST_PATCHES
+            if len(areas) * MOST_PATCHES > _SCENE_PATCHES:
+                most = min(most, int(2 ** np.floor(np.log2(max(share, LEAST_PATCHES)))))
+            counts[number] = min(least, most)
+        return counts
 
     def senders(self, materials: Materials) -> Senders:
         """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""

@@ -13,23 +13,35 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.flats.grid import Grid, find_grid
 
-_LEAST_PATCHES = 32
+LEAST_PATCHES = 32
 """Patches of a body of few faces: each side of a box has some."""
 
-_PIECES = 8
+MOST_PATCHES = 256
+"""Patches of a body."""
+
+PIECES = 8
 """Pieces of each patch, at least."""
 
 _NEEDLE = 0.01
 """Area of a piece that stays whole however long it is, where pieces should be 1 long: so the number of pieces is
 bounded."""
 
-_SOURCES = 4
+SOURCES = 4
 """Sources of a patch, at most."""
 
 _NORMAL_WEIGHT = 0.4
 """How far apart opposite normals are, in halves of the body's size."""
+
+_COMPACT = np.repeat([1.0, 10.0], 3)
+"""Weights of position and normal by which patches are put in order. Kernels look at sources that follow each other at
+once, and leave out spheres below the horizon of all: in a city of 60 boxes and cylinders that saves a fifth of their
+time."""
+
+_COMPACT_RUN = 4
+"""Patches that are best near each other."""
 
 _LLOYD_STEPS = 8
 
@@ -98,7 +110,9 @@ class Patches:
         return np.abs(gaps).argmin(axis=1).astype(np.int32)
 
 
-def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, count: int = 256) -> Patches:
+def find_patches(
+    positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool, count: int = MOST_PATCHES, sources: int = SOURCES
+) -> Patches:
     """Find the patches of a body, by k-means of position and normal.
 
     Args:
@@ -106,14 +120,15 @@ def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool
         faces: Faces that wind alike, shape [face, 3].
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most. A body of few faces has fewer.
+        sources: Number of sources of each, at most.
 
     Returns:
         Patches; none where no face has an area.
     """
     sides = 2 if is_two_sided else 1
-    count = min(count, max(_LEAST_PATCHES, len(faces) // _PIECES)) // sides
+    count = min(count, max(LEAST_PATCHES, len(faces) // PIECES)) // sides
     total = np.linalg.norm(_areas(positions.astype(np.float64)[faces]), axis=1).sum()
-    longest = 2 * np.sqrt(total / (_PIECES * count))  # as in right triangles
+    longest = 2 * np.sqrt(total / (PIECES * count))  # as in right triangles
     cut = _cut(positions, faces, lambda points: points / longest)
     areas = np.linalg.norm(cut.areas, axis=1)
     half_size = np.linalg.norm(np.ptp(cut.middles, axis=0)) / 2 if len(areas) else 1.0
@@ -121,7 +136,7 @@ def find_patches(positions: np.ndarray, faces: np.ndarray, *, is_two_sided: bool
     labels = _clusters(features, areas, count)
     found: list[tuple[int, np.ndarray, int, float]] = []
     for patch, members in enumerate(_members(labels)):
-        for group in _split(members, cut.middles, areas, _SOURCES):
+        for group in _split(members, cut.middles, areas, sources):
             middle = np.average(cut.middles[group], axis=0, weights=areas[group])
             piece = group[np.linalg.norm(cut.middles[group] - middle, axis=1).argmin()]
             barycentrics = cut.pieces.corners[piece]
@@ -242,7 +257,8 @@ def _clusters(features: np.ndarray, weights: np.ndarray, count: int) -> np.ndarr
         total = np.bincount(nearest, weights[learned], len(centers))[:, None]
         centers = np.where(total > 0, sums / np.where(total > 0, total, 1), centers)
     _, nearest = cKDTree(centers).query(features)
-    return np.unique(nearest, return_inverse=True)[1]
+    used, labels = np.unique(nearest, return_inverse=True)
+    return np.argsort(compact_order(centers[used] * _COMPACT, runs=(_COMPACT_RUN,)))[labels]
 
 
 def _split(items: np.ndarray, points: np.ndarray, weights: np.ndarray, count: int) -> list[np.ndarray]:

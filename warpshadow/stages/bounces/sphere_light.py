@@ -41,6 +41,7 @@ from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres, merged_count
 from warpshadow.stages.visibility.walk import (
+    Clusters,
     make_load_receivers,
     make_spheres,
     make_walk,
@@ -473,6 +474,7 @@ def sphere_light(
     softness: float = SOFTNESS,
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
+    clusters: Clusters | None = None,
 ) -> wp.array:
     """Light that spheres send to receivers, through the cells that they block.
 
@@ -491,6 +493,7 @@ def sphere_light(
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
+        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
 
     Returns:
         What a white receiver reflects of that light, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
@@ -499,7 +502,7 @@ def sphere_light(
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
 
     Differentiable: points, normals, centers, radii, exitance, transmittance, unblocked. (The derivative in T is that at
-    a fixed blend of spheres.) Not: directions, softness, merging, skip.
+    a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
@@ -517,7 +520,7 @@ def sphere_light(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     own_count = len(directions) // span_count
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip)
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
     dim = batch_count * group_count(vertex_count, lanes), span_count
     variables = [points, normals, *nodes, exitance, transmittance, unblocked]
     is_kept = varies(variables)

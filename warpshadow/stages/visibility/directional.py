@@ -40,6 +40,7 @@ from warpshadow.stages.visibility.culling import (
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres
 from warpshadow.stages.visibility.walk import (
+    Clusters,
     make_load_receivers,
     make_spheres,
     make_walk,
@@ -311,6 +312,7 @@ def transmittance(
     softness: float = SOFTNESS,
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
+    clusters: Clusters | None = None,
 ) -> wp.array:
     """Transmittance of spheres towards cells of directions.
 
@@ -325,6 +327,7 @@ def transmittance(
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
+        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
 
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
@@ -333,7 +336,8 @@ def transmittance(
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
 
-    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip.
+    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
+    clusters.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
@@ -345,7 +349,7 @@ def transmittance(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip)
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
     dim = batch_count * group_count(vertex_count, lanes), span_count
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)

@@ -27,6 +27,7 @@ from warpshadow.stages.sh_kernels import (
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone, make_cone_adjoint
 from warpshadow.stages.visibility.merging import MERGING, Gradients, Spheres
 from warpshadow.stages.visibility.walk import (
+    Clusters,
     make_load_receivers,
     make_spheres,
     make_walk,
@@ -251,6 +252,7 @@ def accumulate(
     log: str = "eigen",
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
+    clusters: Clusters | None = None,
 ) -> wp.array:
     """Accumulate the log-visibility of spheres in spherical harmonics.
 
@@ -267,6 +269,7 @@ def accumulate(
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
+        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
 
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
@@ -284,7 +287,7 @@ def accumulate(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * group_count(vertex_count, lanes)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2), skip)
+    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2), skip, clusters)
     inputs = [points, normals, spheres, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2

@@ -6,7 +6,7 @@ spheres are visited. A method says what culling and a visit are; the walk is gen
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -77,31 +77,58 @@ def _bound(
     bounds[batch, run] = wp.vec4(middle[0], middle[1], middle[2], reach)
 
 
-def make_spheres(
-    centers: wp.array, radii: wp.array, merging: float, cell: float, skip: tuple[int, int] = (0, 0)
-) -> tuple[Nodes, Spheres]:
+class Clusters(NamedTuple):
+    """Spheres with their quads and the bounds of these, which serve any receivers."""
+
+    nodes: Nodes
+    bounds_of_quads: wp.array
+    bounds_of_runs: wp.array
+
+
+def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Clusters:
     """Merge spheres where there are enough of them, and bound their quads and runs.
+
+    Args:
+        centers, radii: Spheres, [batch, sphere].
+        merging: τ, 0 for never.
+
+    Differentiable: centers, radii to the nodes.
+    """
+    nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
+    return Clusters(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, QUADS))
+
+
+def make_spheres(
+    centers: wp.array,
+    radii: wp.array,
+    merging: float,
+    cell: float,
+    skip: tuple[int, int] = (0, 0),
+    clusters: Clusters | None = None,
+) -> tuple[Nodes, Spheres]:
+    """Put spheres together with their clusters.
 
     Args:
         centers, radii: Spheres, [batch, sphere].
         merging: τ in cell radii, 0 for never.
         cell: Radius of a cell [rad].
         skip: Spheres that are left out: the first, and the one after the last.
+        clusters: Of these spheres, where they are found already.
 
     Returns:
         The spheres as arrays, and as kernels see them.
 
     Differentiable: centers, radii to the nodes.
     """
-    nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
+    count = radii.shape[1]
     if not 0 <= skip[0] <= skip[1] <= count:
         raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
+    nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     spheres = Spheres()
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell
     spheres.skip_begin, spheres.skip_end = skip
-    spheres.bounds_of_quads = _find_bounds(nodes, count, 1)
-    spheres.bounds_of_runs = _find_bounds(nodes, count, QUADS)
+    spheres.bounds_of_quads, spheres.bounds_of_runs = bounds
     return nodes, spheres
 
 
