@@ -22,6 +22,7 @@ from warpshadow.spheres import fit as fit_module
 from warpshadow.spheres import measure as stage_3
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.spheres.receivers import Receivers
 from warpshadow.stages.visibility.cones import BLEND, FADE
 from warpshadow.stages.visibility.directional import SOFTNESS, transmittance
 
@@ -49,12 +50,6 @@ def bumpy() -> Mesh:
     x, y, z = ball.positions.astype(np.float64).T
     grow = 1 + 0.3 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.2 * np.sin(4 * z)
     return Mesh(ball.positions * grow[:, None] * [1.3, 1.0, 0.7], ball.faces)
-
-
-@pytest.fixture
-def short_cover(monkeypatch):
-    """Fewer steps of stage 1 for tests that do not look at its result."""
-    monkeypatch.setattr(fit_module, "COVER_STEPS_FIRST", (5, 5))
 
 
 # ------------------------------------------------------------------------------ float64 twins
@@ -99,15 +94,15 @@ def normalized(mesh, device) -> NormalizedMesh:
 def refinement(device):
     """A refinement of a small body, and spheres that receivers see from near, far and inside."""
     mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
-    spheres, _ = stage_1.greedy_cover(mesh, 12, rng)
-    return stage_2.Refinement(mesh, rng), spheres.astype(np.float32).astype(np.float64)
+    spheres = stage_1.greedy_cover(mesh, 12, rng)
+    return stage_2.Refinement(mesh, Receivers(mesh, 4096, rng), rng), spheres.astype(np.float32).astype(np.float64)
 
 
 def seen_from(fit, chosen):
     """Points [receiver, 3] of a refinement, and the directions that they look to [receiver, direction, 3]."""
-    places = fit.places[:, chosen].T.astype(np.float64)
+    places = fit.receivers.places[:, chosen].T.astype(np.float64)
     frames = places[:, 3:].reshape(-1, 3, 3)
-    return places[:, :3], np.einsum("qi,pij->pqj", stage_2.hemisphere(fit.DIRECTIONS), frames)
+    return places[:, :3], np.einsum("qi,pij->pqj", fit.receivers.directions, frames)
 
 
 def differences(loss, spheres, step):
@@ -171,7 +166,7 @@ def test_the_energy_of_a_cover_and_its_gradient_agree_with_float64(device):
 @pytest.mark.slow
 def test_descent_covers_more_of_the_surface_and_leaves_the_mesh_less(device):
     mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
-    start, _ = stage_1.greedy_cover(mesh, 12, rng)
+    start = stage_1.greedy_cover(mesh, 12, rng)
     *_, cover = stage_1.descend_cover(mesh, start, 60, rng)
     samples, points = stage_1.ball_samples(256, rng), mesh.sample(2000, rng)[0]
     before, after = (stage_1.cover_energy(mesh, each, samples, points)[0] for each in (start, cover))
@@ -192,7 +187,7 @@ def test_without_refinement_a_fit_covers_a_mesh_and_stays_in_it():
 @pytest.mark.slow
 def test_soft_transmittance_and_loss_agree_with_float64(refinement):
     fit, spheres = refinement
-    chosen = np.arange(0, fit.RECEIVERS, 97)
+    chosen = np.arange(0, 4096, 31)
     width = 0.1
     got = fit.transmittance(spheres, chosen, width)
     points, directions = seen_from(fit, chosen)
@@ -202,13 +197,13 @@ def test_soft_transmittance_and_loss_agree_with_float64(refinement):
 @pytest.mark.slow
 def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
     fit, spheres = refinement
-    chosen = np.arange(0, fit.RECEIVERS, 61)
+    seen, chosen = fit.receivers, np.arange(0, 4096, 19)
     width = 0.1
     points, directions = seen_from(fit, chosen)
 
     def loss(balls):
-        error = twin_transmittance(points, directions, balls, width) - fit.visibility[chosen]
-        return (fit.weights[chosen] * (error @ fit.lights.astype(np.float64)) ** 2).sum() / len(chosen)
+        error = twin_transmittance(points, directions, balls, width) - seen.visibility[chosen]
+        return (seen.weights[chosen] * (error @ seen.lights.astype(np.float64)) ** 2).sum() / len(chosen)
 
     got_loss, got = fit.gradient(spheres, chosen, width)
     assert got_loss == pytest.approx(loss(spheres), rel=1e-4)
@@ -301,8 +296,8 @@ def test_a_ball_is_one_sphere():
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, short_cover):
-    options = {**QUICK, "steps": 120, "device": device}  # enough for spheres to be relocated
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device):
+    options = {**QUICK, "device": device}
     first, second = (fit_spheres(bumpy(), 10, **options).spheres for _ in range(2))
     np.testing.assert_array_equal(first.centers, second.centers)
     np.testing.assert_array_equal(first.radii, second.radii)
@@ -311,7 +306,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(device, shor
 
 
 @pytest.mark.slow
-def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
+def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled():
     mesh = bumpy()
     moved = Mesh(mesh.positions.astype(np.float64) * 50 + [300, -70, 20], mesh.faces)
     options = {**QUICK, "steps": 10}  # rounding of the moved positions changes last bits, which descent amplifies
@@ -323,24 +318,23 @@ def test_a_mesh_moved_and_scaled_gets_its_spheres_moved_and_scaled(short_cover):
 
 
 @pytest.mark.slow
-def test_refinement_and_more_spheres_lower_the_error(short_cover):
+def test_refinement_and_more_spheres_lower_the_error():
     cover = fit_spheres(bumpy(), 16, **{**QUICK, "refine": False}).report
     few, some, many = (fit_spheres(bumpy(), count, **{**QUICK, "steps": 200}).report for count in (4, 16, 40))
-    assert some.visibility_error < 0.8 * cover.visibility_error
+    assert some.surface_error < 0.8 * cover.surface_error
     assert few.visibility_error > some.visibility_error > many.visibility_error
 
 
 @pytest.mark.slow
-def test_a_requested_error_is_met_with_as_few_spheres_as_needed(short_cover):
-    fit = fit_spheres(bumpy(), error=0.06, **{**QUICK, "steps": 150})
-    assert fit.report.visibility_error <= 0.06
+def test_a_requested_error_is_met_with_as_few_spheres_as_needed():
+    fit = fit_spheres(bumpy(), error=0.09, **{**QUICK, "steps": 100})
+    assert fit.report.visibility_error <= 0.09
     assert fit.report.sphere_count == len(fit.spheres) <= 64
 
 
 @pytest.mark.slow
-def test_open_and_multi_part_meshes_are_fitted(short_cover):
-    ball = icosphere(1.0, 3)
-    bowl = Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0])
+def test_open_and_multi_part_meshes_are_fitted():
+    ball, bowl = icosphere(1.0, 3), half_shell()
     grid = np.linspace(-1, 1, 12)
     x, z = np.meshgrid(grid, grid)
     index = np.arange(144).reshape(12, 12)
@@ -349,14 +343,62 @@ def test_open_and_multi_part_meshes_are_fitted(short_cover):
     sheet = Mesh(np.column_stack([x.ravel(), 0.3 * x.ravel(), z.ravel()]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
     two = joined(ball, Mesh(ball.positions + [2.5, 0.5, 0], ball.faces))
     for mesh, share in (
-        (bowl, 0.15),
-        (sheet, 0.5),
+        (bowl, 0.6),
+        (sheet, 0.6),
         (two, 0.15),
     ):  # small spheres are a poor sheet: they have a thickness
-        none, fit = (fit_spheres(mesh, count, **{**QUICK, "steps": 200}) for count in (0, 24))
+        none, fit = (fit_spheres(mesh, count, **{**QUICK, "steps": 100}) for count in (0, 24))
         assert 0 < len(fit.spheres) <= 24
-        unshadowed, error = (np.hypot(each.report.ground_error, each.report.surface_error) for each in (none, fit))
+        unshadowed, error = (np.hypot(each.report.ground_error, each.report.nearby_error) for each in (none, fit))
         assert error < share * unshadowed
+
+
+def revolved(*profile) -> Mesh:
+    """A solid of revolution by its outline, radius and height, from the axis to the axis."""
+    trimesh = pytest.importorskip("trimesh")
+    solid = trimesh.creation.revolve(np.array(profile, float), sections=32)
+    solid.fix_normals()
+    return Mesh(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])
+
+
+def half_shell() -> Mesh:
+    ball = icosphere(1.0, 3)
+    return Mesh(ball.positions, ball.faces[ball.positions[ball.faces].mean(axis=1)[:, 1] < 0])
+
+
+def test_no_sphere_is_in_the_open_and_cavities_stay_light(device):
+    """Of 64 spheres fitted to a bowl without a view into its cavity, eight touched no solid."""
+    angles = np.linspace(0, np.pi / 2, 12)
+    arc = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
+    bowl = revolved(*arc, *(arc * 0.93 + [0, 0.07])[::-1])
+    mug = revolved((0, 0), (0.42, 0), (0.42, 1), (0.37, 1), (0.37, 0.06), (0, 0.06))
+    for mesh in (bowl, mug, half_shell()):
+        fit = fit_spheres(mesh, 64, **QUICK, device=device)
+        corners = mesh.positions[mesh.faces].reshape(-1, 3)
+        middle, diagonal = (corners.min(axis=0) + corners.max(axis=0)) / 2, np.linalg.norm(np.ptp(corners, axis=0))
+        at_origin = Mesh(corners - middle, np.arange(len(corners)).reshape(-1, 3))
+        distances, _ = normalized(at_origin, device).signed_distances((fit.spheres.centers - middle) / diagonal)
+        assert (distances * diagonal <= fit.spheres.radii).all()
+        cavity = middle + [[0.0, 0.1, 0.0], [0.1, 0.2, 0.0], [0.0, 0.3, 0.1]]
+        gaps = np.linalg.norm(cavity[:, None] - fit.spheres.centers, axis=2) - fit.spheres.radii
+        assert (gaps > 0).all()
+
+
+def test_an_open_mesh_has_the_same_spheres_whatever_its_winding():
+    shell = half_shell()
+    turned = Mesh(shell.positions, shell.faces[:, ::-1])
+    one, other = (fit_spheres(each, 12, **QUICK) for each in (shell, turned))
+    np.testing.assert_array_equal(one.spheres.centers, other.spheres.centers)
+    assert dataclasses.replace(one.report, seconds=0) == dataclasses.replace(other.report, seconds=0)
+
+
+def test_a_fit_that_fills_a_cavity_is_not_called_good():
+    """A ball in half a shell has its shadow on the ground, and none of its light inside."""
+    shell = normalized(half_shell(), "cpu")
+    ball = np.array([[0, 0, 0, 1 / 3]])  # its diagonal is three radii
+    filled = stage_3.measure(shell, ball, 0.0)
+    assert filled.nearby_error > 0.3 and filled.outside_volume == 1
+    assert filled.visibility_error >= filled.nearby_error
 
 
 def test_no_spheres_are_an_empty_fit():
@@ -374,7 +416,7 @@ def test_the_error_of_a_shadow_is_relative_to_it():
 
 
 def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatch):
-    report = stage_3.FitReport(64, 0.9, 0.1, 0.02, 0.02, shadow_error=0.21, seconds=1.0)
+    report = stage_3.FitReport(64, 0.9, 0.1, 0.02, 0.02, 0.02, shadow_error=0.21, seconds=1.0)
     monkeypatch.setattr(fit_module, "_fit", lambda *_: (np.ones((1, 4), np.float32), report))
     thin, others = bumpy(), {"count": 64, "cache": False}
     with pytest.warns(UserWarning, match="'mesh' is thin for 64 spheres: .*21%.*blockers = 256.*ray-traced") as told:
@@ -419,7 +461,7 @@ def test_a_mesh_without_surface_is_refused():
 
 
 @pytest.mark.slow
-def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch, short_cover):
+def test_a_fit_is_read_from_the_cache_and_made_again_when_the_file_is_damaged(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     options = {**QUICK, "cache": True, "steps": 5}
     made = fit_spheres(bumpy(), 6, **options)
@@ -467,7 +509,7 @@ def test_of_two_processes_that_want_the_same_fit_one_waits_and_reads_it(tmp_path
 
 
 @pytest.mark.slow
-def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, short_cover):
+def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match="the fit could not be cached in"):
@@ -476,7 +518,7 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, s
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
-def test_fits_in_a_folder_that_is_shared_can_be_read_by_others(tmp_path, monkeypatch, short_cover):
+def test_fits_in_a_folder_that_is_shared_can_be_read_by_others(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     before = os.umask(0o002)
     try:

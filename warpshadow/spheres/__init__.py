@@ -2,12 +2,13 @@
 
     cover       stage 1, the paper's: medial balls picked greedily, then descent on the volume outside the mesh and
                 the surface left bare                               [Lyu et al. 2021, section 3.2; Wang et al. 2006]
-    refine      stage 2: gradient descent until receivers on and around the mesh have the same visibility past the
-                spheres as past the mesh, by rays; spheres that matter little are relocated
+    receivers   receivers on and around the mesh, in its cavities and on grounds, and what they see past it, by rays
+    refine      stage 2: from balls picked greedily, gradient descent until the receivers see as much past the spheres
     measure     irradiance under a sky with a sun, the spheres' against the mesh's
     fit         the stages in order, the search for an error, the cache
 
-Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh. Stage 2 uses the cones of
+Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh in part. An open mesh is a sheet, seen
+from both sides. Stage 2 uses the cones of
 warpshadow.stages.visibility.cones and the falloff of the directional method, so the fit accounts for what a renderer
 does at receivers on and inside spheres.
 """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 RADIUS_RATE = 10.0
@@ -11,18 +9,10 @@ RADIUS_RATE = 10.0
 
 
 class Adam:
-    """Gradient descent that does not depend on the gradient's scale; relocated spheres start without a history.
-
-    Written by hand, since in Warp's and torch's Adam all rows share one count of steps, and none starts anew alone.
-    """
+    """Gradient descent that does not depend on the gradient's scale."""
 
     def __init__(self, count: int):
-        self.mean, self.square, self.age = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros((count, 1))
-
-    def forget(self, spheres: Iterable[int]) -> None:
-        """Start these spheres anew."""
-        chosen = list(spheres)
-        self.mean[chosen] = self.square[chosen] = self.age[chosen] = 0
+        self.mean, self.square, self.age = np.zeros((count, 4)), np.zeros((count, 4)), 0
 
     def step(self, spheres: np.ndarray, gradient: np.ndarray, rate: float) -> None:
         """Move spheres [sphere, 4] in place, against the gradient by centers and logarithms of radii."""

@@ -46,28 +46,30 @@ def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
     radii = np.full(count, 0.5)
     for _ in range(12):
         centers = touching - radii[:, None] * normals
-        distances, slopes = mesh.signed_distances(centers)
-        chord = centers - distances[:, None] * slopes - touching
+        nearest = mesh.nearest(centers)
+        chord = nearest - touching
         depth = np.maximum(-2 * (chord * normals).sum(axis=1), 1e-9)
-        shrinks = np.abs(distances) < 0.98 * radii - 1e-5
+        shrinks = np.linalg.norm(nearest - centers, axis=1) < 0.98 * radii - 1e-5
         shrinks &= np.linalg.norm(chord, axis=1) > 1e-4
+        if not shrinks.any():
+            break
         radii = np.where(shrinks, np.minimum(radii, np.maximum((chord**2).sum(axis=1) / depth, 1e-3)), radii)
     centers = touching - radii[:, None] * normals
     radii = -mesh.signed_distances(centers)[0]
     return np.column_stack([centers, radii])[radii > 1e-3]
 
 
-def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Pick balls greedily until they cover volume and surface: the picked, and all balls [ball, 4].
+def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Pick balls greedily until they cover volume and surface, [sphere, 4].
 
     Balls of the medial axis fill what has an inside, balls on the surface cover what is thin or open.
     """
     spacing = np.sqrt(mesh.area / count)
-    on_surface, _ = mesh.sample(800, rng)
+    on_surface, _ = mesh.sample(600 + 2 * count, rng)
     flat = np.column_stack([on_surface, np.full(len(on_surface), 0.35 * spacing)])
-    balls = np.concatenate([medial_balls(mesh, 2000, rng), flat])
-    in_box = mesh.low + rng.uniform(size=(20000, 3)) * (mesh.high - mesh.low)
-    in_volume = in_box[mesh.signed_distances(in_box)[0] < 0][:3000]
+    balls = np.concatenate([medial_balls(mesh, 800 + 4 * count, rng), flat])
+    in_box = mesh.low + rng.uniform(size=(6000, 3)) * (mesh.high - mesh.low)
+    in_volume = in_box[mesh.signed_distances(in_box)[0] < 0][: 1500 + count]
     samples = np.concatenate([in_volume, on_surface])
     shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (in_volume, on_surface)]
     left = np.concatenate(shares).astype(np.float32)
@@ -87,7 +89,7 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
         covered = np.flatnonzero(covers[:, best])
         gain -= 0.9 * left[covered] @ covers[covered]
         left[covered] *= 0.1
-    return balls[chosen], balls
+    return balls[chosen]
 
 
 # ------------------------------------------------------------------------------------------------- descent
@@ -99,6 +101,7 @@ def _outside_volume(
     worker: int,
     # in
     mesh: wp.uint64,
+    is_sheet: bool,
     spheres: wp.array[wp.vec4],
     samples: wp.array[wp.vec3],
     # out
@@ -111,7 +114,7 @@ def _outside_volume(
     ball = spheres[sphere]
     radius = ball[3]
     offset = radius * samples[sample]
-    distance, slope = signed_distance(mesh, wp.vec3(ball[0], ball[1], ball[2]) + offset)
+    distance, slope = signed_distance(mesh, is_sheet, wp.vec3(ball[0], ball[1], ball[2]) + offset)
 
     share = 4.0 / 3.0 * wp.pi * radius * radius * radius / float(samples.shape[0])
     depth = distance / (EDGE * radius)  # from −1, inside, to 1, outside
@@ -173,7 +176,7 @@ def cover_energy(
     shape = (len(spheres), len(samples))
     volumes = wp.empty(shape, dtype=wp.float32, device=device)
     by_volume = wp.empty(shape, dtype=wp.vec4, device=device)
-    inputs = [mesh.mesh.id, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
+    inputs = [mesh.mesh.id, mesh.is_sheet, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
     launch(_outside_volume, shape, inputs=inputs, outputs=[volumes, by_volume], cost=_QUERY_COST)
 
     gaps = wp.empty(len(points), dtype=wp.float32, device=device)

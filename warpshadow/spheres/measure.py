@@ -12,7 +12,14 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.cover import ball_samples
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.occlusion import exact_occlusion
+from warpshadow.spheres.receivers import around
 from warpshadow.stages.ray_tracing import trace_visibility
+
+GROUND, SURFACE, NEARBY = 20, 400, 400
+"""Receivers on a side of the ground's grid, on the surface and in the air."""
+
+DIRECTIONS = 512
+"""Rays from each of them."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +35,13 @@ class FitReport:
     coverage: float
     """Share of the surface inside the spheres, each grown by 1% of the bounding box's diagonal."""
     outside_volume: float
-    """Share of the union's volume that lies outside the mesh (1 for a sheet, which has no inside)."""
+    """Share of the union's volume that lies outside the mesh, the air of a cavity included; 1 for a sheet."""
     ground_error: float
     """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
     surface_error: float
-    """On the mesh's own vertices, weighted by area."""
+    """On the mesh's own vertices, weighted by area; on both sides of an open mesh, whatever its winding."""
+    nearby_error: float
+    """In the air around it and in its cavities, most of it close to the mesh, on receivers that look anywhere."""
     shadow_error: float
     """The error on the ground relative to the shadow there, ‖E_spheres − E_mesh‖ / ‖E_unshadowed − E_mesh‖."""
     seconds: float
@@ -42,8 +51,8 @@ class FitReport:
 
     @property
     def visibility_error(self) -> float:
-        """The larger of the errors on the ground and on the surface."""
-        return max(self.ground_error, self.surface_error)
+        """The largest of the errors on the ground, on the surface and in the air."""
+        return max(self.ground_error, self.surface_error, self.nearby_error)
 
 
 def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
@@ -56,7 +65,7 @@ def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
 
 def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
     """L2 error of the irradiance at receivers, over four azimuths of the sun, relative to it and to what is missing."""
-    directions = fibonacci(1024)
+    directions = fibonacci(DIRECTIONS)
     array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
     receivers, rays = array(points[None].astype(np.float32)), array(directions.astype(np.float32))
     visible = trace_visibility(mesh.mesh, receivers, array(normals[None].astype(np.float32)), rays).numpy()[0]
@@ -75,7 +84,7 @@ def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, norma
 def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitReport:
     """Judge spheres [sphere, 4] by receivers that the refinement has not seen."""
     rng = np.random.default_rng(2021)
-    grid = (np.arange(24) + 0.5) / 24 - 0.5
+    grid = (np.arange(GROUND) + 0.5) / GROUND - 0.5
     x, z = np.meshgrid(2.5 * mesh.longest * grid, 2.5 * mesh.longest * grid)
     ground = np.column_stack([x.ravel(), np.full(x.size, mesh.low[1] - 1e-5), z.ravel()])
     up = np.tile([0.0, 1.0, 0.0], (len(ground), 1))
@@ -89,13 +98,17 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
         outside_volume = float(shares[outside].sum() / shares.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
+    air, _ = around(mesh, NEARBY, rng)
+    turned = rng.normal(size=air.shape)
+    nearby = air, turned / np.linalg.norm(turned, axis=1, keepdims=True)
     ground_error, shadow_error = _errors(mesh, spheres, ground, up)
     return FitReport(
         sphere_count=len(spheres),
         coverage=float((_containing(grown, surface) > 0).mean()),
         outside_volume=outside_volume,
         ground_error=ground_error,
-        surface_error=_errors(mesh, spheres, *mesh.sample_vertices(600, rng))[0],
+        surface_error=_errors(mesh, spheres, *mesh.sample_vertices(SURFACE, rng))[0],
+        nearby_error=_errors(mesh, spheres, *nearby)[0],
         shadow_error=shadow_error,
         seconds=seconds,
     )

@@ -1,16 +1,14 @@
 """Stage 2: spheres that cast the shadows of the mesh.
 
-Receivers are on the mesh, on grounds below it and in a shell around it. Rays tell which directions they see past the
-mesh. Adam moves and scales the spheres until their transmittance, with the falloff of
-warpshadow.stages.visibility.falloff, agrees with that under lights of several sharpnesses. Spheres that matter
-little are relocated on the way.
+Adam moves and scales the spheres until receivers on and around the mesh see as much past them, with the falloff of
+warpshadow.stages.visibility.falloff, as past the mesh, under lights of several sharpnesses. None leaves the mesh
+altogether.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,18 +24,18 @@ from warpshadow.device.lanes import (
 )
 from warpshadow.device.launch import launch
 from warpshadow.maths.directions import bundle_cones
-from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
+from warpshadow.spheres.receivers import BUNDLE, Receivers
 from warpshadow.stages.visibility.cones import make_cone
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.walk import seen_type
 
-BUNDLE = 16
-"""Directions of a receiver's hemisphere that are near each other, which a sphere reaches or misses together."""
+TOUCH = 0.8
+"""Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
 
-_RAY_COST = 500.0
-"""Nanoseconds that a ray takes."""
+PULLED = 5
+"""Steps after which spheres that are farther off are pulled back."""
 
 _SPHERE_COST = 10.0
 """Nanoseconds that it takes to see a sphere from a receiver."""
@@ -307,67 +305,6 @@ def _transmit_adjoint(
     sums[i, sphere] = own
 
 
-# ------------------------------------------------------------------------------------------------- receivers
-
-
-@wp.kernel(enable_backward=False)
-def _trace_frames(
-    first_row: int,
-    worker: int,
-    # in
-    mesh: wp.uint64,
-    points: wp.array[wp.vec3],
-    frames: wp.array[wp.mat33],
-    directions: wp.array[wp.vec3],
-    # out
-    visibility: wp.array2d[wp.uint8],
-):
-    """Each thread owns one ray: a receiver and a direction of its own frame."""
-    row, direction = wp.tid()
-    receiver = first_row + row
-    frame = frames[receiver]
-    start = points[receiver] + 1.0e-4 * frame[2]
-    blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
-    visibility[receiver, direction] = wp.uint8(wp.where(blocked, 0, 1))
-
-
-def hemisphere(count: int) -> np.ndarray:
-    """Directions about z with the cosine as density, each stands for as much irradiance; in bundles [count, 3]."""
-    i = np.arange(count) + 0.5
-    radius, azimuth = np.sqrt(i / count), i * np.pi * (1 + np.sqrt(5))
-    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], axis=1)
-    return directions[compact_order(directions, runs=(BUNDLE,))]
-
-
-def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """World-to-local rotations with the normal as z and a random turn about it, float32 [receiver, 3, 3]."""
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(helper, normals)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    y = np.cross(normals, x)
-    turn = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
-    rows = [np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x, normals]
-    return np.stack(rows, axis=1).astype(np.float32)
-
-
-def _light_metric(directions: np.ndarray) -> np.ndarray:
-    """Matrix F [direction, light] of the loss |e F|² of errors e of visibility, under light of several sharpnesses.
-
-    The error is smoothed with lobes of 0.6 and 0.25 radians and with the whole hemisphere: the irradiance
-    error under lights of that width from anywhere.
-    """
-    count = len(directions)
-    angles = np.arccos(np.clip(directions @ directions.T, -1, 1))
-    metric = np.full((count, count), 1 / count)
-    for lobe in (0.6, 0.25):
-        smooth = np.exp(-0.5 * (angles / lobe) ** 2)
-        smooth /= smooth.sum(axis=1, keepdims=True)
-        metric += smooth.T @ smooth
-    strengths, lights = np.linalg.eigh(metric / count)
-    matters = strengths > 1e-4 * strengths.max()
-    return (lights[:, matters] * np.sqrt(strengths[matters])).astype(np.float32)
-
-
 class _View(NamedTuple):
     """Spheres as the receivers of a batch see them."""
 
@@ -379,76 +316,26 @@ class _View(NamedTuple):
 
 
 class Refinement:
-    """Receivers around a body, their visibility past it by rays, and the loss of spheres against it."""
+    """The loss of spheres against what receivers around a body see, and its descent."""
 
-    DIRECTIONS = 128
-    RECEIVERS = 12288
-    GROUND, SHELL = 0.6, 0.15
-    """Shares of the receivers on grounds and around the mesh; the others lie on it."""
     BATCH = 256
     WIDTHS = (0.1, 0.04)
     """Half-width of the cones' falloff [radians], first and last."""
     RATE = 0.003
     """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
-    VISIBLE_FLOOR = 0.2
-    """Weight of receivers that nothing can see, next to 1 for those in the open."""
-    RELOCATIONS = 9
 
-    def __init__(self, mesh: NormalizedMesh, rng: np.random.Generator):
+    def __init__(self, mesh: NormalizedMesh, receivers: Receivers, rng: np.random.Generator):
         use_vector_registers(__name__)
-        self.device, self.rng = mesh.device, rng
-        points, normals = self._receivers(mesh)
-        frames = _frames(normals, rng)
-        directions = hemisphere(self.DIRECTIONS)
-        array = partial(wp.array, device=self.device)
-        self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
-        bundles = np.ascontiguousarray(directions.T, dtype=np.float32).reshape(3, -1, BUNDLE)
-        self.directions = array(bundles, dtype=_Bundle)
-        self.caps = array(np.column_stack(bundle_cones(directions, max(self.WIDTHS), BUNDLE)), dtype=wp.float32)
-        visibility = wp.empty((len(points), self.DIRECTIONS), dtype=wp.uint8, device=self.device)
-        rays = array(directions.astype(np.float32), dtype=wp.vec3)
-        starts = array(points.astype(np.float32), dtype=wp.vec3), array(frames, dtype=wp.mat33)
-        inputs = [mesh.mesh.id, *starts, rays]
-        launch(_trace_frames, visibility.shape, inputs=inputs, outputs=[visibility], cost=_RAY_COST)
-        self.visibility = visibility.numpy().astype(np.float32)
-        self.lights = _light_metric(directions)
-        # a camera in the open sees a receiver along the rays that escape, so its error counts as often
-        openness = (self.visibility / directions[:, 2]).mean(axis=1) / 2
-        floor = self.VISIBLE_FLOOR
-        self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
-
-    def _receivers(self, mesh: NormalizedMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Draw receivers on the surface, on grounds at and below the lowest point, and in a shell around."""
-        rng = self.rng
-        ground_count = int(self.GROUND * self.RECEIVERS)
-        shell_count = int(self.SHELL * self.RECEIVERS)
-        surface_count = self.RECEIVERS - ground_count - shell_count
-        at_vertices = mesh.sample_vertices(surface_count // 2, rng)
-        between = mesh.sample(surface_count - surface_count // 2, rng)
-        surface, surface_normals = (np.concatenate(pair) for pair in zip(at_vertices, between, strict=True))
-
-        square = rng.uniform(-1, 1, size=(ground_count, 2))
-        square *= 1.25 * mesh.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
-        drop = np.where(rng.uniform(size=ground_count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=ground_count)
-        ground = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - drop, square[:, 1]])
-        ground_normals = np.tile([0.0, 1.0, 0.0], (ground_count, 1))
-
-        away = rng.normal(size=(shell_count, 3))
-        away *= (
-            rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)
-        )
-        shell = mesh.sample(shell_count, rng)[0] + away
-        distances, slopes = mesh.signed_distances(shell)
-        inside = distances < 0
-        toward = 0.5 * rng.normal(size=shell.shape) - slopes
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        shell[inside], toward[inside] = surface[:shell_count][inside], surface_normals[:shell_count][inside]
-        return np.concatenate([surface, ground, shell]), np.concatenate([surface_normals, ground_normals, toward])
+        self.mesh, self.receivers, self.rng, self.device = mesh, receivers, rng, mesh.device
+        bundles = np.ascontiguousarray(receivers.directions.T, dtype=np.float32).reshape(3, -1, BUNDLE)
+        self.directions = wp.array(bundles, dtype=_Bundle, device=self.device)
+        caps = np.column_stack(bundle_cones(receivers.directions, max(self.WIDTHS), BUNDLE))
+        self.caps = wp.array(caps, dtype=wp.float32, device=self.device)
 
     def _project(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> _View:
         lanes = lane_count(self.device)
         groups = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
-        places = np.ascontiguousarray(self.places[:, groups]).reshape(_PLACE, -1, lanes)
+        places = np.ascontiguousarray(self.receivers.places[:, groups]).reshape(_PLACE, -1, lanes)
         placed = wp.array(places, dtype=lane_type(lanes), device=self.device)
         balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
         shape = len(groups), len(spheres)
@@ -480,8 +367,8 @@ class Refinement:
 
     def _loss(self, transmittance: np.ndarray, chosen: np.ndarray) -> tuple[float, np.ndarray]:
         """Loss of a batch, and its gradient by the errors under the lights, [receiver, light]."""
-        errors = (transmittance - self.visibility[chosen]) @ self.lights
-        weighted = errors * (self.weights[chosen] / len(chosen))
+        errors = (transmittance - self.receivers.visibility[chosen]) @ self.receivers.lights
+        weighted = errors * (self.receivers.weights[chosen] / len(chosen))
         return float(np.vdot(weighted, errors)), 2 * weighted
 
     def gradient(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> tuple[float, np.ndarray]:
@@ -491,11 +378,11 @@ class Refinement:
         upstream = np.zeros_like(transmittance)
         passing = transmittance[: len(chosen)]
         loss, by_errors = self._loss(passing, chosen)
-        upstream[: len(chosen)] = (by_errors @ self.lights.T) * passing
+        upstream[: len(chosen)] = (by_errors @ self.receivers.lights.T) * passing
         by_logs = wp.array(upstream.reshape(len(upstream), -1, BUNDLE), dtype=_Bundle, device=self.device)
         sums = wp.empty(view.axes.shape, dtype=_Sums, device=self.device)
         inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
-        cost = 2 * _PAIR_COST * self.DIRECTIONS
+        cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
         # every group of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
         shape = view.places.shape[1], len(spheres)
@@ -507,58 +394,26 @@ class Refinement:
         gradient[:, 3] *= spheres[:, 3]
         return loss, gradient
 
-    def _relocate(self, spheres: np.ndarray, balls: np.ndarray, width: float) -> list[int]:
-        """Move the spheres that matter least to where one helps most, in place; returns their indices."""
-        rng = self.rng
-        chosen = rng.choice(self.RECEIVERS, 384, replace=False)
-        near = spheres[rng.choice(len(spheres), 75)]
-        near[:, :3] += 0.8 * near[:, 3:] * rng.normal(size=(75, 4))[:, :3]
-        near[:, 3] *= rng.uniform(0.4, 1.0, size=75)
-        fresh = balls[rng.choice(len(balls), 75)]
-        fresh[:, 3] = np.minimum(fresh[:, 3], 2 * np.median(spheres[:, 3])) * rng.uniform(0.5, 1.1, size=75)
-        candidates = np.concatenate([fresh, near])
+    def _pull_back(self, spheres: np.ndarray) -> None:
+        """Move spheres that left the body to where they touch it, in place."""
+        distances, slopes = self.mesh.signed_distances(spheres[:, :3])
+        beyond = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
+        spheres[:, :3] -= beyond[:, None] * slopes
 
-        alone = self._alone(np.concatenate([spheres, candidates]), chosen, width)
-        alone, offers = alone[: len(spheres)], alone[len(spheres) :]
-        together = np.prod(alone, axis=0)
-        without = [self._loss(together / each, chosen)[0] for each in alone]
-        current = self._loss(together, chosen)[0]
-        moved = []
-        for sphere in np.argsort(without)[:6]:
-            rest = together / alone[sphere]
-            losses = [self._loss(rest * offer, chosen)[0] for offer in offers]
-            best = int(np.argmin(losses))
-            if losses[best] > 0.999 * current:
-                break
-            spheres[sphere] = candidates[best]
-            together, current = rest * offers[best], losses[best]
-            moved.append(int(sphere))
-        return moved
-
-    def _alone(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> np.ndarray:
-        """Transmittance of each sphere [sphere, receiver, direction], kept from 0 so that it can be divided out."""
-        view = self._project(spheres, chosen, width)
-        rows = [each.reshape((-1, 1)) for each in (view.axes, view.edges, view.reached)]  # of one sphere each
-        alone = self._see_through(_View(view.places, view.balls, *rows))
-        alone = alone.reshape(-1, len(spheres), self.DIRECTIONS)[: len(chosen)].swapaxes(0, 1)
-        return np.maximum(alone, np.float32(1e-6))
-
-    def run(self, spheres: np.ndarray, balls: np.ndarray, steps: int) -> Iterator[np.ndarray]:
+    def run(self, spheres: np.ndarray, steps: int) -> Iterator[np.ndarray]:
         """Refine spheres by Adam; yields them [sphere, 4] after every step."""
         spheres = spheres.astype(np.float64)
         adam = Adam(len(spheres))
-        relocation_count = min(self.RELOCATIONS, steps // 100)
-        relocations = set(np.linspace(0, 0.6 * steps, relocation_count + 1).astype(int)[1:])
         first_rate = self.RATE * min(1.0, np.sqrt(64 / len(spheres)))
         queue = np.zeros(0, int)
         for step in range(steps):
             done = step / steps
             width = self.WIDTHS[0] * (self.WIDTHS[1] / self.WIDTHS[0]) ** min(1.0, 1.3 * done)
-            if step in relocations:
-                adam.forget(self._relocate(spheres, balls, width))
             if len(queue) < self.BATCH:
-                queue = self.rng.permutation(self.RECEIVERS)
+                queue = self.rng.permutation(len(self.receivers))
             chosen, queue = queue[: self.BATCH], queue[self.BATCH :]
             _, gradient = self.gradient(spheres, chosen, width)
             adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * done)))
+            if step % PULLED == 0 or step == steps - 1:
+                self._pull_back(spheres)
             yield spheres

@@ -1,0 +1,163 @@
+"""Receivers on and around a body, the light that they see past it by rays, and how errors of that count."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.maths.spatial_sort import compact_order
+from warpshadow.spheres.normalized_mesh import NormalizedMesh
+
+BUNDLE = 16
+"""Directions of a receiver's hemisphere that are near each other, which a sphere reaches or misses together."""
+
+LEAST_LIGHT = 0.01
+"""Lights of the metric that count less than this, next to the strongest, are left out: 27 of 128 are in."""
+
+_RAY_COST = 500.0
+"""Nanoseconds that a ray takes."""
+
+
+@wp.kernel(enable_backward=False)
+def _trace_frames(
+    first_row: int,
+    worker: int,
+    # in
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    frames: wp.array[wp.mat33],
+    directions: wp.array[wp.vec3],
+    # out
+    visibility: wp.array2d[wp.uint8],
+):
+    """Each thread owns one ray: a receiver and a direction of its own frame."""
+    row, direction = wp.tid()
+    receiver = first_row + row
+    frame = frames[receiver]
+    start = points[receiver] + 1.0e-4 * frame[2]
+    blocked = wp.mesh_query_ray_anyhit(mesh, start, wp.transpose(frame) * directions[direction], 1.0e30)
+    visibility[receiver, direction] = wp.uint8(wp.where(blocked, 0, 1))
+
+
+def hemisphere(count: int) -> np.ndarray:
+    """Directions about z with the cosine as density, each stands for as much irradiance; in bundles [count, 3]."""
+    i = np.arange(count) + 0.5
+    radius, azimuth = np.sqrt(i / count), i * np.pi * (1 + np.sqrt(5))
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], axis=1)
+    return directions[compact_order(directions, runs=(BUNDLE,))]
+
+
+class Receivers:
+    """Receivers on a body, around it and in its cavities, and on grounds below it.
+
+    Args:
+        mesh: The body.
+        count: How many.
+        rng: Draws them.
+
+    A receiver sees 128 directions of a hemisphere. Those on a mesh look along its normals, to both sides of an open
+    one. Of those in the space around a body and within its bounds, half look toward the nearest surface, and half
+    anywhere: a sphere in the middle of a cavity is seen from all that is around it.
+    """
+
+    DIRECTIONS = 128
+    GROUND, SURFACE = 0.55, 0.25
+    """Shares of the receivers on grounds and on the mesh; the others lie around it."""
+    VISIBLE_FLOOR = 0.2
+    """Weight of receivers that nothing can see, next to 1 for those in the open."""
+
+    def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator):
+        ground, surface = int(self.GROUND * count), int(self.SURFACE * count)
+        parts = [_on_surface(mesh, surface, rng), _on_grounds(mesh, ground, rng)]
+        parts.append(_around(mesh, count - ground - surface, rng))
+        points, normals = (np.concatenate(each) for each in zip(*parts, strict=True))
+        frames = _frames(normals, rng)
+        self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
+        """Where they are: points, and the rows of frames, [12, receiver]."""
+        self.directions = hemisphere(self.DIRECTIONS)
+        """Directions in the frame of each receiver [direction, 3]."""
+        self.lights = _light_metric(self.directions)
+        array = partial(wp.array, device=mesh.device)
+        visibility = wp.empty((count, self.DIRECTIONS), dtype=wp.uint8, device=mesh.device)
+        rays = array(self.directions.astype(np.float32), dtype=wp.vec3)
+        starts = array(points.astype(np.float32), dtype=wp.vec3), array(frames, dtype=wp.mat33)
+        inputs = [mesh.mesh.id, *starts, rays]
+        launch(_trace_frames, visibility.shape, inputs=inputs, outputs=[visibility], cost=_RAY_COST)
+        self.visibility = visibility.numpy().astype(np.float32)
+        """Whether light from each direction gets to each receiver [receiver, direction]."""
+        # a camera in the open sees a receiver along the rays that escape, so its error counts as often
+        openness = (self.visibility / self.directions[:, 2]).mean(axis=1) / 2
+        floor = self.VISIBLE_FLOOR
+        self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
+        """How much errors at receivers count [receiver, 1]."""
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.visibility)
+
+
+def _on_surface(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Half at vertices, where renderers shade, half between them."""
+    parts = mesh.sample_vertices(count // 2, rng), mesh.sample(count - count // 2, rng)
+    points, normals = (np.concatenate(pair) for pair in zip(*parts, strict=True))
+    return points, normals
+
+
+def _on_grounds(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """On grounds at and below the lowest point."""
+    square = rng.uniform(-1, 1, size=(count, 2))
+    square *= 1.25 * mesh.longest * np.abs(square).max(axis=1, keepdims=True) ** 0.5  # denser near the body
+    drop = np.where(rng.uniform(size=count) < 0.25, 0.3 * mesh.longest, 0.0) * rng.uniform(size=count)
+    points = np.column_stack([square[:, 0], mesh.low[1] - 1e-5 - drop, square[:, 1]])
+    return points, np.tile([0.0, 1.0, 0.0], (count, 1))
+
+
+def around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points outside a body, most of them near it, a third anywhere within its bounds: positions, and toward it."""
+    shell_count = count - count // 3
+    away = rng.normal(size=(shell_count, 3))
+    away *= rng.uniform(size=(shell_count, 1)) ** 2 * 0.5 * mesh.longest / np.linalg.norm(away, axis=1, keepdims=True)
+    within = mesh.low + rng.uniform(size=(count // 3, 3)) * (mesh.high - mesh.low)
+    points = np.concatenate([mesh.sample(shell_count, rng)[0] + away, within])
+    distances, slopes = mesh.signed_distances(points)
+    inside = distances < 0  # and from there out of it
+    points[inside] -= (distances[inside, None] - 1e-3) * slopes[inside]
+    return points, -slopes
+
+
+def _around(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    points, toward = around(mesh, count, rng)
+    toward = 0.5 * rng.normal(size=(count, 3)) + np.where(rng.uniform(size=(count, 1)) < 0.5, toward, 0.0)
+    return points, toward / np.linalg.norm(toward, axis=1, keepdims=True)
+
+
+def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """World-to-local rotations with the normal as z and a random turn about it, float32 [receiver, 3, 3]."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(helper, normals)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(normals, x)
+    turn = rng.uniform(0, 2 * np.pi, size=(len(normals), 1))
+    rows = [np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x, normals]
+    return np.stack(rows, axis=1).astype(np.float32)
+
+
+def _light_metric(directions: np.ndarray) -> np.ndarray:
+    """Matrix F [direction, light] of the loss |e F|² of errors e of visibility, under light of several sharpnesses.
+
+    The error is smoothed with lobes of 0.6 and 0.25 radians and with the whole hemisphere: the irradiance
+    error under lights of that width from anywhere.
+    """
+    count = len(directions)
+    angles = np.arccos(np.clip(directions @ directions.T, -1, 1))
+    metric = np.full((count, count), 1 / count)
+    for lobe in (0.6, 0.25):
+        smooth = np.exp(-0.5 * (angles / lobe) ** 2)
+        smooth /= smooth.sum(axis=1, keepdims=True)
+        metric += smooth.T @ smooth
+    strengths, lights = np.linalg.eigh(metric / count)
+    matters = strengths > LEAST_LIGHT * strengths.max()
+    return (lights[:, matters] * np.sqrt(strengths[matters])).astype(np.float32)
