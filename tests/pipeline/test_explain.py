@@ -459,9 +459,9 @@ SHADOWS = ("static shadows", VISIBILITY)
 
 
 def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
-    """The stage that a kernel with some inputs belongs to; None for copies, and for poses, which come before."""
+    """The stage that a kernel with some inputs belongs to; None for copies, poses and corners, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
-    if module in ("device.batch", "stages.poses", "stages.own_shadows.sites"):
+    if module in ("device.batch", "stages.poses", "stages.own_shadows.sites", "stages.sparse"):
         return None
     if module in ("stages.own_shadows.trace", "stages.own_shadows.lookup", "stages.own_shadows.lobes"):
         return "own shadows"

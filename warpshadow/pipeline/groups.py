@@ -58,18 +58,17 @@ class Group(NamedTuple):
 
         For a gradient they come all at once, and so do those with kept rows.
         """
-        points, normals, centers, radii, kept_rows, _, places, own_shadow, flats, as_spheres, corners, _, clusters = self
-        size = points.shape[1]
+        own_shadow, flats, clusters = self.own_shadow, self.flats, self.clusters
         turns = None if own_shadow is None else own_shadow.turned
         frames = None if flats is None else flats.frames
+        given = points, normals, centers, radii = self[:4]
         if radii.shape[1] or turns is not None or frames is not None:
-            given = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "flats": frames}
-            given["corners"] = corners
-            count = common_batch(given)
-            points, normals, centers, radii = [expand(array, count) for array in self[:4]]
+            arrays = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "flats": frames}
+            count = common_batch(arrays | {"corners": self.corners})
+            points, normals, centers, radii = [expand(array, count) for array in given]
             clusters = clusters if radii is self.radii and centers is self.centers else None
-        varying = [*self[:4], turns, frames, corners]
-        if kept_rows is not None or size <= PART or varies(varying):
+        size = points.shape[1]
+        if self.kept_rows is not None or size <= PART or varies([*given, turns, frames, self.corners]):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, PART):
@@ -79,8 +78,8 @@ class Group(NamedTuple):
                 normals=normals[:, part].contiguous(),
                 centers=centers,
                 radii=radii,
-                places=None if places is None else places.part(part),
-                as_spheres=None if as_spheres is None else as_spheres.part(part),
+                places=None if self.places is None else self.places.part(part),
+                as_spheres=None if self.as_spheres is None else self.as_spheres.part(part),
                 clusters=clusters,
             )
 

@@ -96,7 +96,7 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     big, small = ws.icosphere(1.0, 2), ws.icosphere(100.0, 2)  # as meshes; in the scene the first is 3 times as large
     bodies = ws.Body(big, scale=3.0, name="big"), ws.Body(small, scale=0.01, translation=(9, 0, 0), name="small")
     flat = ws.Body(ws.plane(2.0, 4), scale=2.5, translation=(0, -9, 0), name="ground")
-    ball, light = ws.icosphere(1.0, 4), ws.EnvironmentMap.constant(1.0, height=8)
+    light = ws.EnvironmentMap.constant(1.0, height=8)
     camera = ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))
     assembly = Assembly(ws.Scene((*bodies, flat), light, camera))
     senders = ScenePatches(assembly).senders(Materials.of_scene(assembly))
