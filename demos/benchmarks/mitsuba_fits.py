@@ -123,7 +123,7 @@ def _method(case: Case) -> tuple[inverse.Free, Method]:
 def placed(free: inverse.Free, values: Tensors, setting: Any) -> Tensors:
     """What a free parameter sets in Mitsuba's scene, by the names there. Differentiable: values."""
     if isinstance(free, inverse.Texture):
-        return {f"body{free.body}.bsdf.reflectance.data": values["texels"]}
+        return {f"body{free.body}.bsdf.brdf_0.reflectance.data": values["texels"]}
     if isinstance(free, inverse.Light):
         functions = free.basis.functions(map_directions(LIGHT_HEIGHT).reshape(-1, 3))
         radiance = setting.tensor(functions) @ free.coefficients(values, setting)
@@ -222,9 +222,10 @@ def _mesh(body: ws.Body, number: int) -> Any:
 
     mesh = body.world_mesh()
     positions, faces = mesh.positions, mesh.faces
-    normals = vertex_normals(torch.tensor(positions), faces).numpy()
+    normals = vertex_normals(torch.tensor(positions), mesh.surface.faces).numpy()
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _reflectance(body)})
+    diffuse = {"type": "diffuse", "reflectance": _reflectance(body)}
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "side": diffuse})
     if body.texture is not None:
         positions, normals = positions[faces.ravel()], normals[faces.ravel()]
         faces = np.arange(len(positions)).reshape(-1, 3)

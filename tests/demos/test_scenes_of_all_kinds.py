@@ -1,0 +1,158 @@
+"""Scenes of all kinds: how errors are measured, and four of the scenes, small."""
+
+import dataclasses
+import json
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from demos import kinds, shapes
+from demos.benchmarks import scenes_of_all_kinds as bench
+from demos.references import Reference, Request, turned
+
+SMALL = 40  # pixels across
+
+
+@pytest.fixture
+def gray():
+    """A reference of 16 × 16 pixels: a gray body on the left, a white one on the right, a row of nothing."""
+    images = np.ones((2, 16, 16, 4), np.float32)
+    images[:, :, :8, :3] = 0.5
+    images[:, 15] = 0
+    body = np.where(np.arange(16) < 8, 0, 1) * np.ones((16, 1), int)
+    body[15] = -1
+    return Reference(images, body, np.ones((16, 16), bool))
+
+
+class Here:
+    """Stands for a pool of processes: does at once, in this one, all that is submitted."""
+
+    def __init__(self, *arguments, **options):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+    def submit(self, function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+
+def with_few_spheres(kind):
+    """The same scene with spheres that are found at once: they cover the meshes, but are not refined."""
+
+    def scene(sources, size):
+        whole = kind(sources, size)
+        bodies = [
+            body
+            if body.mesh.is_flat
+            else dataclasses.replace(body, blockers=ws.fit_spheres(body.mesh, 48, refine=False, cache=False).spheres)
+            for body in whole.bodies
+        ]
+        return dataclasses.replace(whole, bodies=bodies)
+
+    return scene
+
+
+def noisy(reference, deviation):
+    """The same with noise of both images."""
+    noise = np.random.default_rng(0).normal(scale=deviation, size=reference.images.shape)
+    noise[..., 3] = 0
+    return dataclasses.replace(reference, images=reference.images + noise * reference.covered[..., None])
+
+
+# ---------------------------------------------------------------------------------------------- measures
+
+
+def test_a_body_that_is_too_bright_is_named_and_others_are_not(gray):
+    image = gray.mean.copy()
+    image[:, 8:, :3] *= 1.1
+    assert gray.body_errors(image, 3) == [pytest.approx(0), pytest.approx(0.1), None]
+    assert gray.error(image) == pytest.approx(0.1 / np.sqrt(1.25))
+    assert gray.worst_block(image) == (pytest.approx(0.1 / 0.75), (0, 8))
+
+
+def test_noise_of_a_reference_is_taken_off(gray):
+    reference = noisy(gray, 0.2)
+    assert 0.1 < reference.noise() < 0.25
+    assert reference.error(gray.mean) < 0.3 * reference.noise()
+    brighter = gray.mean * (1.2, 1.2, 1.2, 1)
+    assert reference.error(brighter) == pytest.approx(0.2, abs=0.05)
+
+
+def test_a_body_of_few_pixels_is_measured_where_it_is_seen_at_all_and_one_of_fewer_is_not(gray):
+    is_whole = gray.is_whole & ((gray.body != 1) | (np.indices((16, 16))[0] < 1))  # 8 pixels of the white one
+    thin = dataclasses.replace(gray, is_whole=is_whole)
+    assert (thin.pixels(1) == ((gray.body == 1) & gray.covered)).all()
+    hardly = dataclasses.replace(gray, body=np.where((gray.body == 1) & ~is_whole, 0, gray.body))
+    assert hardly.body_errors(gray.mean, 2)[1] is None
+
+
+def test_a_scene_that_is_turned_with_its_light_looks_the_same():
+    scene = kinds.nested_boxes(kinds.Sources(), SMALL)
+    scene = dataclasses.replace(scene, visibility=ws.Visibility(method="none"))
+    image, other = ws.render(scene), ws.render(turned(scene))
+    difference = np.abs(image - other).max(axis=-1)
+    assert np.quantile(difference, 0.98) < 2e-3 * image.max()  # others are edges
+
+
+def test_a_reference_is_found_again_until_its_scene_changes(tmp_path):
+    scene = kinds.letters(kinds.Sources(), 16)
+    request = Request(scene, "rays", 0, 32, tmp_path)
+    first = request.reference()
+    assert request.path().exists()
+    np.testing.assert_array_equal(request.reference().images, first.images)
+    bodies = [dataclasses.replace(scene.bodies[0], translation=scene.bodies[0].translation + 0.01), *scene.bodies[1:]]
+    for change in ({"bounces": 1}, {"samples": 64}, {"scene": dataclasses.replace(scene, bodies=bodies)}):
+        assert dataclasses.replace(request, **change).path() != request.path()
+    settings = dataclasses.replace(scene, visibility=ws.Visibility(method="none"), supersampling=1)
+    assert dataclasses.replace(request, scene=settings).path() == request.path()
+
+
+# ---------------------------------------------------------------------------------------------- scenes
+
+
+def test_solids_are_closed_and_sheets_are_not():
+    closed = [shapes.bowl(), shapes.cup(), shapes.bottle(), shapes.bracket(), shapes.wheel()]
+    assert all(mesh.surface.is_closed for mesh in closed)
+    assert not shapes.tent().surface.is_closed and not shapes.wall_with_window(3, 3, (1, 1)).surface.is_closed
+
+
+def test_scenes_have_all_that_they_are_about_in_sight():
+    assert len(kinds.SCENES) >= 16
+    assert len(kinds.city(kinds.Sources(), SMALL).bodies) == 61
+    for name in ("cups", "shelf", "corner", "thousand_to_one"):
+        scene = kinds.SCENES[name](kinds.Sources(), SMALL)
+        renderer = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility(method="none")), progress=False)
+        assert set(renderer.body_ids().ravel()) >= set(range(len(scene.bodies))) - {0} * (name == "thousand_to_one")
+
+
+@pytest.mark.slow
+def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
+    """In this process, with spheres that need no fit, so that it takes seconds."""
+    names = ("bowl", "corner", "letters", "nested_boxes")
+    monkeypatch.setattr(bench, "SCENES", {name: with_few_spheres(kinds.SCENES[name]) for name in names})
+    monkeypatch.setattr(bench, "ProcessPoolExecutor", Here)
+    options = bench.Options(size=SMALL, samples=256, output=tmp_path / "out", references=tmp_path / "references")
+    results = bench.main(names, options)
+    assert list(results) == list(names) == list(json.loads((options.output / "results.json").read_text())["scenes"])
+    printed = capsys.readouterr().out
+    for name, result in results.items():
+        assert list(result["settings"]) == list(bench.SETTINGS)
+        scene = options.scene(name)
+        for setting, figures in result["settings"].items():
+            assert 0 < figures["error"] < figures["block"]
+            assert figures["peak MiB"] > 50 and ("moved CPU ms" in figures) == setting.startswith("kept")
+            assert list(figures["bodies"]) == [body.called for body in scene.bodies]
+            assert all(abs(error) < 1 for error in figures["bodies"].values() if error is not None)
+            assert f"{name:20}{setting}" in printed
+        sheet = ws.read_image(options.output / f"{name}.png")
+        assert sheet.shape[1] > 5 * SMALL and np.ptp(sheet[..., :3]) > 0.9
+    assert sum(error is not None for error in results["letters"]["settings"]["kept-full"]["bodies"].values()) == 5
+    assert bench.missing_references("bowl", options) == []
