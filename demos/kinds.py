@@ -4,7 +4,6 @@ Each is a function of the image's size and of :class:`Sources`. The library is t
 them is made easy: bodies have the default settings, shapes have the faces that a modeler gives them, and parts overlap.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 
 import warpshadow as ws
 from demos import shapes
-from demos.problems import bent, pattern
 from demos.scenes import shipped_mesh
 from demos.shapes import Point, X, Z, ball, box, cone, joined, open_box, ring, rod, turned
 
@@ -206,6 +204,8 @@ def cups(sources: Sources, size: int) -> ws.Scene:
 
 
 def textured(sources: Sources, size: int) -> ws.Scene:
+    from demos.problems import pattern
+
     bodies = [
         ws.Body(shapes.vase(), texture=pattern(1), name="vase"),
         ws.Body(ws.plane(6.0, 64), texture=pattern(2), name="ground"),
@@ -284,6 +284,8 @@ def over_ball(sources: Sources, size: int) -> ws.Scene:
 
 
 def deformed(sources: Sources, size: int) -> ws.Scene:
+    from demos.problems import bent
+
     bodies = [standing(bent(shipped_mesh("bunny"), 4), GOLD, (0, 0, 0), 2.0)]
     return seen([*bodies, ground()], ws.synthetic_sky(HIGH_SUN), size)
 
@@ -362,8 +364,3 @@ SCENES: dict[str, Kind] = {
     )
 }  # fmt: skip
 """All scenes by their names."""
-
-
-def resized(scene: ws.Scene, size: int) -> ws.Scene:
-    """The scene with an image of another size."""
-    return dataclasses.replace(scene, camera=scene.camera.resized(size / scene.camera.width))

@@ -98,7 +98,9 @@ def wheel(spokes: int = 14) -> ws.Mesh:
     """A rim with thin spokes between it and a hub, around the z axis."""
     hub = rod((0, 0, -0.12), (0, 0, 0.12), 0.1, 16)
     angles = 2 * np.pi * np.arange(spokes) / spokes
-    rods = [rod((0, 0, 0), (0.9 * np.cos(a), 0.9 * np.sin(a), 0), 0.018, 8) for a in angles]
+    rods = [
+        rod((0.05 * np.cos(a), 0.05 * np.sin(a), 0), (0.9 * np.cos(a), 0.9 * np.sin(a), 0), 0.018, 8) for a in angles
+    ]
     return joined("wheel", [ring(0.92, 0.06), hub, *rods])
 
 
@@ -180,8 +182,8 @@ def vase() -> ws.Mesh:
     """A closed vessel with uvs, as wide as a sine wave."""
 
     def point(u: np.ndarray, v: np.ndarray) -> npt.ArrayLike:
-        radius = (0.42 + 0.2 * np.sin(2 * np.pi * (v + 0.05))) * np.minimum(1, 12 * np.minimum(v, 1 - v)) + 1e-4
-        angle = 2 * np.pi * u
+        radius = (0.42 + 0.2 * np.sin(2 * np.pi * (v + 0.05))) * np.minimum(1, 12 * np.minimum(v, 1 - v))
+        angle = 2 * np.pi * (u % 1)
         return radius * np.sin(angle), 1.7 * v, radius * np.cos(angle)
 
     return sheet("vase", point, 64, 60)
@@ -300,7 +302,7 @@ def knot(sections: tuple[int, int] = (160, 20)) -> ws.Mesh:
     """A tube along a trefoil knot."""
 
     def point(u: np.ndarray, v: np.ndarray) -> npt.ArrayLike:
-        t, angle = 2 * np.pi * u, 2 * np.pi * v
+        t, angle = 2 * np.pi * (u % 1), 2 * np.pi * (v % 1)  # both ends are the same points, bit for bit
 
         def line(t: np.ndarray) -> np.ndarray:
             return np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1) / 3

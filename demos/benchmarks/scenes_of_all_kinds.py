@@ -31,7 +31,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ class Options:
 
     data: Path | None = None
     size: int = 256
-    samples: int = 512
+    samples: int = 2048
     bounces: int = 2
     settings: tuple[str, ...] = SETTINGS
     output: Path = Path("out/scenes_of_all_kinds")
@@ -239,41 +239,46 @@ def main(names: Sequence[str], options: Options, *, jobs: int = 1, body_count: i
     unknown = [name for name in names if name not in SCENES]
     if unknown:
         raise ValueError(f"scenes: got {', '.join(unknown)}, expected some of {', '.join(SCENES)}")
-    context = multiprocessing.get_context("spawn")
+    print(f"{processor()}; {options.size}² pixels, {options.samples} samples, {options.bounces} bounces")
+    print(f"{'':34}{'error':>7}{'block':>8}{'first':>10}{'moved':>9}{'memory':>10}  bodies", flush=True)
     results: dict[str, Any] = {}
-    with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        wanted = [each for name in names for each in missing_references(name, options)]
-        made = [pool.submit(make_reference, *each, options) for each in wanted]
-        for each, future in zip(wanted, made, strict=True):
-            print(f"reference: {', '.join(each)}, {future.result():.0f} CPU s", flush=True)
-        print(f"{processor()}; {options.size}² pixels, {options.samples} samples, {options.bounces} bounces")
-        print(f"{'':34}{'error':>7}{'block':>8}{'first':>10}{'moved':>9}{'memory':>10}  bodies", flush=True)
-        measured = [pool.submit(measure, name, options) for name in names]
-        for name, future in zip(names, measured, strict=True):
-            results[name] = future.result()
-            print_scene(name, results[name], body_count)
-    print_means(results, options)
     options.output.mkdir(parents=True, exist_ok=True)
     path = options.output / "results.json"
-    path.write_text(json.dumps({"options": described(options), "scenes": results}, indent=1, ensure_ascii=False))
+    context = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as processes,
+        ThreadPoolExecutor(jobs) as threads,
+    ):
+
+        def measured(name: str) -> dict[str, Any]:
+            """What a process finds, after another one has made the references."""
+            if missing_references(name, options):
+                processes.submit(make_references, name, options).result()
+            return processes.submit(measure, name, options).result()
+
+        for name, result in zip(names, threads.map(measured, names), strict=True):
+            results[name] = result
+            print_scene(name, result, body_count)
+            found = {"options": described(options), "scenes": results}
+            path.write_text(json.dumps(found, indent=1, ensure_ascii=False))
+    print_means(results, options)
     print(f"{path}, and a picture of each scene beside it")
     return results
 
 
-def missing_references(name: str, options: Options) -> list[tuple[str, str, str]]:
-    """Scene, light and maker of references that are not there."""
+def missing_references(name: str, options: Options) -> list[Request]:
+    """References of a scene that are not there."""
     makers = ["rays", "mitsuba"] if options.mitsuba else ["rays"]
-    wanted = [(name, light, by) for light in options.lights() for by in makers]
-    return [each for each in wanted if not options.request(*each).path().exists()]
+    wanted = [options.request(name, light, by) for light in options.lights() for by in makers]
+    return [request for request in wanted if not request.path().exists()]
 
 
-def make_reference(name: str, light: str, by: str, options: Options) -> float:
-    """Make and keep a reference; returns the CPU seconds that it took."""
+def make_references(name: str, options: Options) -> None:
+    """Make and keep the references of a scene that are not there."""
     ws.quiet(progress=False)
-    warnings.simplefilter("ignore")  # of coarse meshes and thin bodies: how wrong they are, is measured here
-    start = time.process_time()
-    options.request(name, light, by).reference()
-    return time.process_time() - start
+    warnings.simplefilter("ignore")
+    for request in missing_references(name, options):
+        request.reference()
 
 
 def print_scene(name: str, result: dict[str, Any], body_count: int) -> None:
