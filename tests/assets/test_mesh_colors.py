@@ -83,9 +83,10 @@ def test_colors_of_faces_are_taken_where_no_vertex_has_two(tmp_path, name):
 
 def test_the_color_of_a_gltf_material_is_that_of_its_part(tmp_path):
     scene = trimesh.Scene()
-    for factor in ([255, 51, 0, 255], [255, 255, 255, 255]):  # white is what glTF says of nothing
+    for x, factor in enumerate(([255, 51, 0, 255], [255, 255, 255, 255])):  # white is what glTF says of nothing
         material = trimesh.visual.material.PBRMaterial(baseColorFactor=factor)
-        scene.add_geometry(box(visual=trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)))
+        part = box(visual=trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material))
+        scene.add_geometry(part.apply_translation([2 * x, 0, 0]))
     scene.export(tmp_path / "a.glb")
     for source in (scene, tmp_path / "a.glb"):
         found = {tuple(map(tuple, np.unique(part, axis=0))) for part in ws.Body(source).albedo.reshape(2, 8, 3)}

@@ -443,36 +443,20 @@ def test_a_strip_with_one_side_stays_as_it_is():
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
+@pytest.mark.parametrize("has_own_vertices", [False, True])
 @pytest.mark.parametrize("chosen", [slice(None), slice(3, 4)])
-def test_faces_that_are_listed_twice_wind_as_the_first_of_them(chosen, is_reversed):
-    """As exports have them that are "double-sided": normals of copies that wind back would cancel."""
-    copies = bowl() if not is_reversed else turned_over(bowl())
-    twice = replace(
-        bowl(),
-        faces=np.concatenate([bowl().faces, copies.faces[chosen]]),
-        uv_faces=np.concatenate([bowl().uv_faces, copies.uv_faces[chosen]]),
-    )
-    surface, once = twice.surface, bowl().surface
-    count = len(once.faces)
-    for name in ("faces", "uv_faces", "neighbors"):
-        expected = getattr(once, name)
-        got = getattr(surface, name)
-        np.testing.assert_array_equal(got[:count], expected)
-        assert [{*row} for row in got[count:].tolist()] == [{*row} for row in expected[chosen].tolist()]
-    corners, copied = once.faces[chosen], surface.faces[count:]
-    is_alike = np.any([(np.roll(corners, k, axis=1) == copied).all(axis=1) for k in range(3)], axis=0)
-    assert is_alike.all()
-    across = np.take_along_axis(surface.neighbors[count:], np.argsort(copied, axis=1), axis=1)
-    np.testing.assert_array_equal(
-        across, np.take_along_axis(once.neighbors[chosen], np.argsort(corners, axis=1), axis=1)
-    )
-    light = ws.EnvironmentMap.constant(1.0, height=8)
-    images = [
-        ws.render(ws.Scene((ws.Body(mesh, albedo=(1, 1, 1), blockers=0),), light, ABOVE, ws.Visibility("none")))
-        for mesh in (twice, bowl())
-    ]
-    inside = images[1][..., 3] == 1
-    assert np.abs(images[0] - images[1])[inside].max() < 0.02  # a face that counts twice bends normals slightly
+def test_of_faces_that_are_listed_twice_the_first_is_kept(chosen, is_reversed, has_own_vertices):
+    """As exports have them that are "double-sided": normals of copies would cancel, and rays meet both."""
+    once, copies = bowl(), turned_over(bowl()) if is_reversed else bowl()
+    points = [once.positions, once.positions] if has_own_vertices else [once.positions]
+    faces = [once.faces, copies.faces[chosen] + (once.vertex_count if has_own_vertices else 0)]
+    uv_faces = [once.uv_faces, copies.uv_faces[chosen]]
+    with pytest.warns(UserWarning, match=f"^mesh: {len(faces[1])} duplicate faces dropped$"):
+        twice = ws.Mesh(*map(np.concatenate, (points, faces)), once.uvs, np.concatenate(uv_faces))
+    np.testing.assert_array_equal(twice.faces, once.faces)
+    np.testing.assert_array_equal(twice.uv_faces, once.uv_faces)
+    assert twice.vertex_count == len(points) * once.vertex_count
+    np.testing.assert_array_equal(twice.surface.neighbors, once.surface.neighbors)
 
 
 def test_a_mesh_is_closed_only_if_each_of_its_pieces_looks_outward():

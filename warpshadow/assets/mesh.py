@@ -19,7 +19,15 @@ import numpy.typing as npt
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import linear_to_srgb
-from warpshadow.assets.topology import CREASE, Surface, creases, join_faces, part_at_creases, rounds_edges
+from warpshadow.assets.topology import (
+    CREASE,
+    Surface,
+    creases,
+    is_listed_first,
+    join_faces,
+    part_at_creases,
+    rounds_edges,
+)
 from warpshadow.check import AnyPath
 from warpshadow.maths.plane import plane_normal
 
@@ -43,9 +51,15 @@ class Mesh:
         colors: Reflectance at vertices, linear RGB in [0, 1], float32, shape [vertex, 3], or None. It is the default of
             ``Body(mesh)``.
 
+    Of faces that are listed again, with either winding, as in "double-sided" exports, the first alone is kept, with its
+    uvs: rays would meet the others in the same place, and normals of both would cancel. Vertices keep their numbers.
+
     Raises:
         MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
         ValueError: for colors or origins of another shape, and colors out of range.
+
+    Warns:
+        Of the faces that are dropped.
     """
 
     positions: np.ndarray = field(repr=False)
@@ -71,10 +85,12 @@ class Mesh:
             raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
         held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None, "colors": None}
         held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
-        held["faces"] = _indices("faces", faces, len(vertices), "vertex")
+        held["faces"] = indices = checked_indices("faces", faces, len(vertices), "vertex")
         if uvs is not None and uv_faces is not None:
             held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
-            held["uv_faces"] = _indices("uv_faces", uv_faces, len(corners), "uv")
+            held["uv_faces"] = uv_indices = checked_indices("uv_faces", uv_faces, len(corners), "uv")
+            if len(uv_indices) != len(indices):
+                raise MeshError(f"uv_faces: got {len(uv_indices)} faces, expected {len(indices)}")
         if origins is not None:
             held["origins"] = copied = np.array(origins, np.int32)
             check.shape("origins", copied.shape, (len(vertices),))
@@ -83,12 +99,14 @@ class Mesh:
             held["colors"] = reflectances = check.pixels("colors", colors, expected=expected, error=MeshError)
             check.shape("colors", reflectances.shape, (len(vertices), 3))
             check.reflectance("colors", reflectances)
+        is_first = is_listed_first(vertices, indices)
+        if not is_first.all():
+            check.warn(f"{name}: {np.sum(~is_first)} duplicate faces dropped")
+            held |= {key: values[is_first] for key in ("faces", "uv_faces") if (values := held[key]) is not None}
         for array in held.values():
             if array is not None:
                 array.setflags(write=False)
         vars(self).update(held, name=name)
-        if self.uv_faces is not None and len(self.uv_faces) != self.face_count:
-            raise MeshError(f"uv_faces: got {len(self.uv_faces)} faces, expected {self.face_count}")
 
     def __repr__(self) -> str:
         return f"Mesh({self.name!r}, {self.vertex_count} vertices, {self.face_count} faces)"
@@ -227,7 +245,7 @@ def _coordinates(name: str, given: npt.ArrayLike, width: int, item: str) -> np.n
     return values
 
 
-def _indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarray:
+def checked_indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarray:
     """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
     check.numbers(name, given, expected="integers [face, 3]", error=MeshError)
     faces = np.asarray(given)

@@ -13,8 +13,8 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import read_rgb
-from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, moved_part, turned_over
-from warpshadow.assets.topology import CREASE
+from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
+from warpshadow.assets.topology import CREASE, is_listed_first
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -154,13 +154,16 @@ def _concatenate(parts: list[MeshPart], name: str) -> _Found:
     positions, faces = _stack((part.positions, part.faces) for part in parts)
     textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
     uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
-    mesh = Mesh(positions, faces, uvs, uv_faces, name, colors=_joined_colors(parts))
+    used = np.unique(checked_indices("faces", faces, len(positions), "vertex"))
+    is_first = is_listed_first(positions, faces)  # here, so that one warning has all remarks
+    own_uv_faces = None if uv_faces is None else uv_faces[is_first]
+    mesh = Mesh(positions, faces[is_first], uvs, own_uv_faces, name, colors=_joined_colors(parts))
 
     a, b, c = np.moveaxis(mesh.positions.astype(np.float64)[mesh.faces], 1, 0)
     counts = {
         "degenerate faces (no area)": np.sum(~np.cross(b - a, c - a).any(axis=1)),
-        "duplicate faces": mesh.face_count - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)),
-        "unreferenced vertices": mesh.vertex_count - len(np.unique(mesh.faces)) - sum(part.welded for part in parts),
+        "duplicate faces dropped": np.sum(~is_first),
+        "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
     }
     remarks = [f"{count} {what}" for what, count in counts.items() if count]
     remarks += [part.remark for part in parts if part.remark]

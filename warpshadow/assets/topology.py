@@ -162,8 +162,7 @@ class Surface(NamedTuple):
 
     Faces joined along an edge wind alike: where some wind against most of their piece, they are turned over. So normals
     of neighbors add up, and one side of a piece is its front, all over. On a one-sided piece (a Möbius strip) they
-    cannot, and stay as they are. Of faces listed twice, as in "double-sided" exports, the copies wind as the first, or
-    their normals would cancel.
+    cannot, and stay as they are.
     """
 
     faces: np.ndarray
@@ -179,36 +178,22 @@ class Surface(NamedTuple):
     """
 
 
-def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
-    """Join the faces; those that are listed again, with either winding, become as the first of them."""
-    places = _places(positions)[faces]
-    first = _first_of_equal(places)
-    own = np.unique(first)
-    if len(own) == len(first):
-        return _joined(positions, faces, uv_faces)
-    joined = _joined(positions, faces[own], None if uv_faces is None else uv_faces[own])
-    row = np.searchsorted(own, first)
-    wanted = _places(positions)[joined.faces][row]
-    is_turned = ~np.any([(np.roll(wanted, k, axis=1) == places).all(axis=1) for k in range(3)], axis=0)
-    corner = (_with_turned(places, is_turned)[:, :, None] == wanted[:, None, :]).argmax(axis=2)
-    across = np.take_along_axis(joined.neighbors[row], corner, axis=1)
-    return Surface(
-        _with_turned(faces, is_turned),
-        None if uv_faces is None else _with_turned(uv_faces, is_turned),
-        np.where(across < 0, across, own[across]).astype(np.int32),
-        joined.is_closed,
+def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether no face before each has the same three corners, by their places and in any order, bool of shape [face].
+
+    Faces without area are not compared.
+    """
+    corners = np.sort(_places(positions)[faces], axis=1)
+    order = np.lexsort(corners.T)  # which keeps the order of equal ones
+    is_equal = (corners[order[1:]] == corners[order[:-1]]).all(axis=1) & (np.diff(corners[order[1:]], axis=1) != 0).all(
+        1
     )
+    is_first = np.ones(len(faces), bool)
+    is_first[order[1:]] = ~is_equal
+    return is_first
 
 
-def _first_of_equal(places: np.ndarray) -> np.ndarray:
-    """The first face with the same three corners as each, in any order; a face without area is its own."""
-    corners = np.sort(places, axis=1)
-    _, first, group = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-    has_area = (np.diff(corners, axis=1) != 0).all(axis=1)
-    return np.where(has_area, first[group.ravel()], np.arange(len(places)))
-
-
-def _joined(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
+def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
     """Join faces of which none is listed twice."""
     neighbors, places = edge_neighbors(faces, positions), _places(positions)[faces]
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
