@@ -331,12 +331,19 @@ def test_without_uvs_nothing_is_welded(tmp_path, name):
     assert mesh.uvs is None and mesh.vertex_count == 10
 
 
-def test_an_stl_stays_flat_shaded(tmp_path):
-    sphere = icosphere(subdivisions=0)
-    mesh = load_mesh(export(tmp_path, "a.stl", vertices=sphere.positions, faces=sphere.faces))
-    assert (mesh.vertex_count, mesh.face_count) == (60, 20)
-    np.testing.assert_array_equal(mesh.faces, np.arange(60).reshape(20, 3))
-    np.testing.assert_allclose(mesh.positions, sphere.positions[sphere.faces].reshape(-1, 3), atol=1e-6)
+def test_an_stl_is_merged_but_at_sharp_edges(tmp_path):
+    """A cylinder: its side is smooth, and its caps have corners of their own."""
+    import trimesh
+
+    can = trimesh.creation.cylinder(1.0, 2.0, sections=24)
+    mesh = load_mesh(export(tmp_path, "a.stl", vertices=can.vertices, faces=can.faces))
+    assert (mesh.face_count, mesh.vertex_count) == (96, 4 * 24 + 2)  # both ends of the side and both caps, and centers
+    assert mesh.surface.is_closed and not mesh.rounds_edges
+    np.testing.assert_allclose(mesh.positions[mesh.faces], can.vertices[can.faces], atol=1e-6)
+    twice = np.concatenate([can.faces, can.faces[:, ::-1]])
+    with pytest.warns(UserWarning, match="96 duplicate faces dropped"):
+        other = load_mesh(export(tmp_path, "c.stl", vertices=can.vertices, faces=twice))
+    np.testing.assert_array_equal(other.faces, mesh.faces)
 
 
 PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"

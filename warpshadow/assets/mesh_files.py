@@ -14,7 +14,7 @@ from warpshadow import check
 from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
-from warpshadow.assets.topology import CREASE, is_listed_first
+from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -51,9 +51,10 @@ class _Found(NamedTuple):
 def load_mesh(path: MeshSource) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file, or take what trimesh has, as one mesh.
 
-    Vertices keep the file's order and none is merged or dropped. Polygons become fans of triangles. The nodes
-    of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF), faces refer
-    to the first of the vertices that are duplicated only for their uvs (same position and color, and same normal
+    Vertices keep the file's order and none is merged or dropped; but those of STL, where each face has three of its
+    own, are merged where edges bend by 30° or less. Faces that are listed twice are dropped. Polygons become fans of
+    triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
+    faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same normal
     where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does not
     break the shading; without uvs they stay as they are.
     A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
@@ -332,9 +333,26 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     cuts_colors = path.suffix.lower() in (".gltf", ".glb") and _cuts_colors(path)
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded, of_file=True)
+    if path.suffix.lower() == ".stl":
+        return [_merged(part) for part in parts]
     if cuts_colors:
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
+
+
+def _merged(part: MeshPart) -> MeshPart:
+    """Make one vertex of those at the same place and of the same color, where every face has three of its own.
+
+    Edges that are sharp keep two.
+    """
+    told = [] if part.colors is None else [part.colors]
+    is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
+    remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
+    used, faces = np.unique(_weld(part.faces[is_first], part.positions, *told), return_inverse=True)
+    positions, faces = part.positions[used], faces.reshape(-1, 3)
+    faces, origins = part_at_creases(faces, join_faces(positions, faces, None), positions, CREASE)
+    colors = None if part.colors is None else part.colors[used][origins]
+    return part._replace(positions=positions[origins], faces=faces, colors=colors, remark=remark)
 
 
 def _cuts_colors(path: Path) -> bool:
