@@ -203,7 +203,13 @@ def test_poses_and_geometries_of_other_batches_are_refused(mixed):
         mixed.placed(WHICH, rotations[0], translations[0], moving="ground")
     with pytest.raises(ValueError, match=r"^geometry\[1\]: got 3 instances, expected 2, as many images as which has"):
         which = [0, 1, 1, 1, 2]
-        mixed(WHICH, geometry=mixed.placed(which, rotations[which], translations[which]))
+        mixed(WHICH, geometry=list(mixed.placed(which, rotations[which], translations[which])))
+    swapped = WHICH[::-1]  # as many images of each scene
+    with pytest.raises(
+        ValueError, match=r"^geometry: got that of placed with which = \[.*expected that of the same which"
+    ):
+        mixed(WHICH, geometry=mixed.placed(swapped, rotations[swapped], translations[swapped]))
+    mixed(WHICH, geometry=mixed.placed(swapped, rotations[0], translations[0]))
 
 
 def test_renderers_whose_images_are_no_batch_are_refused(mixed):

@@ -54,9 +54,9 @@ def load_mesh(path: MeshSource) -> Mesh:
     Vertices keep the file's order and none is merged or dropped; but those of STL, where each face has three of its
     own, are merged where edges bend by 30° or less. Faces that are listed twice are dropped. Polygons become fans of
     triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
-    faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same normal
-    where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does not
-    break the shading; without uvs they stay as they are.
+    faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same
+    normal where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does
+    not break the shading; without uvs they stay as they are.
     A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
     uvs are kept only when every face has them. Textures are not read: they are a body's, and ``Body(path)`` takes them.
 

@@ -29,6 +29,12 @@ from warpshadow.torch.autograd import check_float32
 from warpshadow.torch.renderer import TorchRenderer
 
 
+class _Placed(list[Geometry[torch.Tensor] | None]):
+    """Geometries of scenes, and which scene each image was of when they were placed; None where all had one pose."""
+
+    which: tuple[int, ...] | None = None
+
+
 class MixedRenderer(torch.nn.Module):
     """Render batches whose images are of different scenes.
 
@@ -149,7 +155,11 @@ class MixedRenderer(torch.nn.Module):
         given = {"rotations": (rotations, (3, 3)), "translations": (translations, (3,)), "scales": (scales, ())}
         poses = [batch.split(name, self._checked_poses(name, *each), 1 + len(each[1])) for name, each in given.items()]
         bodies = None if moving is None else self._known("moving", moving)
-        geometries: list[Geometry[torch.Tensor] | None] = [None] * len(self.renderers)
+        geometries = _Placed([None] * len(self.renderers))
+        if any(
+            tensor is not None and tensor.ndim > 1 + len(item) and len(tensor) > 1 for tensor, item in given.values()
+        ):
+            geometries.which = batch.numbers
         for scene in batch.rows:
             renderer, counts = self._renderer(scene), self._vertex_counts[scene]
             R, t, s = (_cut(of(scene), n, len(renderer.scene.bodies)) for of, n in zip(poses, (3, 2, 1), strict=True))
@@ -252,7 +262,7 @@ class _Batch:
             raise ValueError(f"which: got {check.described(which)}, expected the scene of each image, [batch]")
         for row, scene in enumerate(numbers):
             check.index(f"which[{row}]", scene, scene_count, "scene")
-        self.count, self._scene_count = len(numbers), scene_count
+        self.numbers, self.count, self._scene_count = tuple(numbers), len(numbers), scene_count
         self.rows: dict[int, list[int]] = {}
         for row, scene in enumerate(numbers):
             self.rows.setdefault(scene, []).append(row)
@@ -284,6 +294,11 @@ class _Batch:
         check.instance("geometry", geometry, (list, tuple), expected)
         if len(geometry) != self._scene_count:
             raise ValueError(f"geometry: got {len(geometry)} items, expected {expected}")
+        if isinstance(geometry, _Placed) and geometry.which not in (None, self.numbers):
+            raise ValueError(
+                f"geometry: got that of placed with which = {check.described([*geometry.which])}, expected that of the "
+                f"same which, {check.described([*self.numbers])}: its poses are those of images in their order"
+            )
         for scene, given in enumerate(geometry):
             count = len(self.rows.get(scene, ()))
             got = 0 if given is None else _instances(as_geometry(f"geometry[{scene}]", given))
