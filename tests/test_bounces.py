@@ -121,10 +121,10 @@ def furnace(method: str, bounces: int, albedo: float) -> np.ndarray:
     return ws.Renderer(ws.Scene(bodies, light, ON_BOTH, ws.Visibility(method), bounces=bounces)).shade().numpy()
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_in_a_white_furnace_all_is_as_bright_as_the_light(method):
+@pytest.mark.parametrize("method, bounces", [(METHODS[0], 16), *((method, "all") for method in METHODS)])
+def test_in_a_white_furnace_all_is_as_bright_as_the_light(method, bounces):
     in_the_mean, at_most = FURNACE[method]
-    shading = furnace(method, 16, 1.0)
+    shading = furnace(method, bounces, 1.0)
     assert abs(shading.mean() - 1) < in_the_mean
     assert abs(shading - 1).max() < at_most
 
@@ -158,6 +158,26 @@ def test_bounces_add_ever_less_light():
     gains = np.diff(shadings)
     assert (gains > 0).all()
     assert (gains[1:] < 0.5 * gains[:-1]).all()
+
+
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_all_bounces_are_those_that_many_come_to(is_kept):
+    """In a room that is open in front, of albedo 0.8. At 0.7 "all" is 0.2% off and four bounces 4%."""
+    walls = [((0, 0, 0), (0, -1, 0)), ((180, 0, 0), (0, 1, 0)), ((90, 0, 0), (0, 0, -1))]
+    walls += [((0, 0, -90), (-1, 0, 0)), ((0, 0, 90), (1, 0, 0))]
+    bodies = [
+        ws.Body(ws.plane(2.0, 8), albedo=(0.8, 0.8, 0.8), rotation=turn, translation=place, name=f"{place}")
+        for turn, place in walls
+    ]
+    scene = ws.Scene(bodies, ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH)
+    camera, images = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=36, size=(24, 24)), []
+    for bounces in (4, 16, "all"):
+        renderer = TorchRenderer(dataclasses.replace(scene, camera=camera, bounces=bounces))
+        albedo = [torch.full((1, 1, 3), 0.8) for _ in bodies] if is_kept else None
+        images.append(renderer(albedo=albedo).numpy()[..., :3])
+    four, many, every = images
+    assert relative_error(every, many) < 1e-2
+    assert relative_error(four, many) > 3e-2
 
 
 def test_a_colored_ground_colors_what_stands_on_it():

@@ -63,8 +63,8 @@ def _note(text: str, is_quiet: bool) -> None:
         typer.echo(text)
 
 
-def _count_of_bounces(text: str) -> int:
-    """A number of bounces; what is none is refused as everywhere else."""
+def _count_of_bounces(text: str) -> Any:
+    """A number of bounces, or "all"; others are refused as everywhere else."""
     from warpshadow.scene.scene import check_bounces
 
     count = int(text) if text.lstrip("-").isdecimal() else text
@@ -72,7 +72,7 @@ def _count_of_bounces(text: str) -> int:
         check_bounces(count)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    return int(count)
+    return count
 
 
 def _print_version(is_asked: bool) -> None:
@@ -177,11 +177,11 @@ def render(
         typer.Option(help="Of the ray-traced method: rays of a pixel, and with bounces half as many paths.", min=1),
     ] = None,
     bounces: Annotated[
-        Optional[int],
+        Any,
         typer.Option(
-            help="How often light bounces, 0 to 16, in place of the scene's.",
+            help="How often light bounces, 0 to 16 or all, in place of the scene's.",
             parser=_count_of_bounces,
-            metavar="INTEGER",
+            metavar="INTEGER|all",
         ),
     ] = None,
     device: Device = "cpu",
@@ -342,12 +342,12 @@ def tune(
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
     ] = None,
     bounces: Annotated[
-        Optional[int],
+        Any,
         typer.Option(
             help="How often light bounces in the truth, such as 12; then 0 to 4 bounces are tried, which takes some "
             "five to ten minutes in place of one.",
             parser=_count_of_bounces,
-            metavar="INTEGER",
+            metavar="INTEGER|all",
         ),
     ] = None,
     fit: Annotated[

@@ -103,9 +103,11 @@ def test_a_scene_that_is_written_reads_back_bit_for_bit_and_renders_the_same(tmp
     np.testing.assert_array_equal(ws.render(again), ws.render(scene))
 
 
-def test_bounces_are_written(tmp_path):
-    scene = ws.Scene([ws.Body(ws.icosphere(1.0, 0))], LIGHTS["sh"], ws.Camera.look_at((0, 0, 4), (0, 0, 0)), bounces=3)
-    assert ws.load_scene(write_scene(scene, tmp_path)[0]).bounces == 3
+@pytest.mark.parametrize("bounces", [3, "all"])
+def test_bounces_are_written(bounces, tmp_path):
+    camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0))
+    scene = ws.Scene([ws.Body(ws.icosphere(1.0, 0))], LIGHTS["sh"], camera, bounces=bounces)
+    assert ws.load_scene(write_scene(scene, tmp_path)[0]).bounces == bounces
 
 
 def test_no_spheres_at_all_are_written_as_none(tmp_path):

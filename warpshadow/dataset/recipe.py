@@ -14,7 +14,7 @@ from warpshadow.check import AnyPath
 from warpshadow.dataset.layers import LAYERS
 from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
-from warpshadow.scene.scene import Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.scene import Bounces, Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
@@ -76,7 +76,7 @@ class Recipe:
     ranges: Ranges = Ranges()
     visibility: Visibility = field(default_factory=Visibility)
     supersampling: int = Scene.supersampling
-    bounces: int = 0
+    bounces: Bounces = 0
 
     def __post_init__(self) -> None:
         check.whole("images", self.images)

@@ -321,7 +321,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Source | Non
     """Node of what static bodies block of the light of receivers on them; its value is None where there is nothing."""
     static = points.static
     if static is None or not static.spheres[1].shape[1]:
-        bouncing = method.assembly.scene.bounces > 0
+        bouncing = bool(method.assembly.scene.bounces)
         why = "light bounces: nothing of static bodies is kept" if bouncing else "no static body has blockers"
         return Node("static shadows", None, idle=why)
     rows = method.kept_rows(static, light, points.blocking)

@@ -79,11 +79,11 @@ class Rays(Method):
 
     @functools.cached_property
     def _bounces(self) -> "KeptBounces":
-        from warpshadow.pipeline.bounces.kept import OWN_BOUNCES, KeptBounces
+        from warpshadow.pipeline.bounces.kept import KeptBounces
         from warpshadow.pipeline.bounces.patches import ScenePatches
 
         given = ScenePatches(self.assembly), self.assembly.scene.bounces
-        return KeptBounces(*given, own_bounces=OWN_BOUNCES, progress=self.progress)
+        return KeptBounces(*given, progress=self.progress)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""

@@ -741,7 +741,12 @@ class Renderer:
         is_host = self.device.is_cpu or self.clock.waits
         notes = receiver_notes(self._given_scene, self._choices)
         if self.scene.bounces:
-            notes.append(f"Light bounces {self.scene.bounces} time{'s' * (self.scene.bounces != 1)}.")
+            count = self.scene.bounces
+            notes.append(
+                "Light bounces {}.".format(
+                    "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
+                )
+            )
         return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes)
 
 

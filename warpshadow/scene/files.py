@@ -27,6 +27,7 @@ from warpshadow.scene.scene import (
     READ_BY,
     SCENE,
     Body,
+    Bounces,
     Scene,
     Visibility,
     check_bounces,
@@ -60,7 +61,7 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message says where and what is accepted."""
 
 
-def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object) -> Scene:
+def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: object) -> Scene:
     """Read a scene file.
 
     Args:
@@ -80,7 +81,7 @@ def load_scene(path: AnyPath, *, bounces: int | None = None, **settings: object)
         return _scene(toml_tables.read(path, "scene file"), path.parent, bounces, settings)
 
 
-def _scene(scene: Table, folder: Path, bounces: int | None, settings: Table) -> Scene:
+def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table) -> Scene:
     with check.located("the scene"):
         _check_keys("", scene, ("camera", "light", "visibility", "body"), what="table")
     for name in ("camera", "light", "body"):
@@ -257,7 +258,7 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
         light: Table = {"envmap": "light.exr"}
     else:
         light = {"sh": [_numbers(row) for row in scene.light]}
-    light["bounces"] = int(scene.bounces)
+    light["bounces"] = scene.bounces if scene.bounces == "all" else int(scene.bounces)
     visibility = asdict(scene.visibility)
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
     path = folder / "scene.toml"

@@ -21,7 +21,7 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import sh
-from warpshadow.scene.scene import Body, Scene, Visibility
+from warpshadow.scene.scene import Body, Bounces, Scene, Visibility
 from warpshadow.spheres import Spheres
 
 GROUND_SIZE = 10.0  # scene units; a body is about one
@@ -173,7 +173,7 @@ class RandomScenes:
     supersampling: int = 2
     maps: Sequence[EnvironmentMap] | None = field(default=None, repr=False)
     ranges: Ranges = Ranges()
-    bounces: int = 0
+    bounces: Bounces = 0
 
     def __post_init__(self) -> None:
         check.whole("seed", self.seed, least=0)

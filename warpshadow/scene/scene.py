@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +47,9 @@ BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)
 """The methods that find light that bounces."""
 
 MOST_BOUNCES = 16
+
+Bounces = int | Literal["all"]
+"""How often light bounces."""
 
 RECEIVERS = (AUTO, "vertex", "pixel")
 
@@ -397,9 +400,11 @@ def check_supersampling(count: object) -> None:
 
 
 def check_bounces(count: object) -> None:
-    """Raise ValueError unless it is a number of bounces, 0 to 16."""
-    if not check.is_integer(count) or count not in range(MOST_BOUNCES + 1):
-        raise ValueError(f"bounces: got {check.described(count)}, expected a whole number from 0 to {MOST_BOUNCES}")
+    """Raise ValueError unless it is a number of bounces, 0 to 16, or "all"."""
+    is_all = isinstance(count, str) and count == "all"
+    if not is_all and (not check.is_integer(count) or count not in range(MOST_BOUNCES + 1)):
+        expected = f'a whole number from 0 to {MOST_BOUNCES}, or "all"'
+        raise ValueError(f"bounces: got {check.described(count)}, expected {expected}")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -414,7 +419,8 @@ class Scene:
         supersampling: Each pixel averages this many samples across and down, which smooths silhouettes.
         bounces: How often light bounces between bodies before it reaches what the camera sees, 0 to 16; 0 is direct
             light alone, which is the paper's model. Within a body, such as a bowl, it then goes on eight times more,
-            which costs next to nothing; only paths, of ``ray-traced``, end after so many bounces of any kind.
+            which costs next to nothing; only paths, of ``ray-traced``, end after so many bounces of any kind. "all"
+            costs as much as seven, and adds all further ones as a geometric series (:mod:`.stages.bounces.tail`).
     """
 
     bodies: tuple[Body, ...]
@@ -422,7 +428,7 @@ class Scene:
     camera: Camera
     visibility: Visibility
     supersampling: int = 2
-    bounces: int = 0
+    bounces: Bounces = 0
 
     @check.keywords(
         cameras="camera; several go to Renderer(scene, cameras=[…])", method="visibility=Visibility(method)"
@@ -434,7 +440,7 @@ class Scene:
         camera: Camera | None = None,
         visibility: Visibility = _DIRECTIONAL,
         supersampling: int = supersampling,
-        bounces: int = bounces,
+        bounces: Bounces = bounces,
     ):
         check.instance("bodies", bodies, Iterable, "a list of one or more: [Body(mesh)]")
         vars(self).update(bodies=tuple(bodies), light=light, camera=camera)

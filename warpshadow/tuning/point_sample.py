@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow.maths.spatial_sort import z_order_of_cells
 from warpshadow.pipeline.renderer import Renderer
 from warpshadow.pipeline.view import View
-from warpshadow.scene.scene import AUTO, Scene, Visibility
+from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility
 from warpshadow.stages.normals import vertex_normals
 
 
@@ -60,7 +60,7 @@ class PointSample:
         *,
         count: int = 1024,
         direction_count: int = 2048,
-        bounces: int | None = None,
+        bounces: Bounces | None = None,
         seed: int = 0,
         device: wp.DeviceLike = "cpu",
         progress: bool = False,

@@ -22,7 +22,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
-from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Scene, Visibility, check_bounces
+from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Bounces, Scene, Visibility, check_bounces
 from warpshadow.spheres import Spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
@@ -127,7 +127,7 @@ _HEAD = f"{'method':18}{'bounces':>8}{'spheres':>12}  {'receivers':16}"
 
 def _columns(scene: Scene, fitted: Iterable[int]) -> str:
     """The settings of a scene, below the head of a table."""
-    columns = f"{_method(scene.visibility):18}{scene.bounces:8}{_spheres(scene, fitted):>12}"
+    columns = f"{_method(scene.visibility):18}{scene.bounces:>8}{_spheres(scene, fitted):>12}"
     return f"{columns}  {_listed(_receivers(scene)):16}"
 
 
@@ -180,7 +180,7 @@ def tune(
     *,
     error: float | None = None,
     milliseconds: float | None = None,
-    bounces: int | None = None,
+    bounces: Bounces | None = None,
     fits: bool = False,
     device: wp.DeviceLike = "cpu",
     progress: bool = True,
@@ -194,8 +194,8 @@ def tune(
         scene: The scene; its "auto" is not looked at.
         error: Largest relative error of the shading, such as 0.03.
         milliseconds: In place of an error the longest time of an image.
-        bounces: How often light bounces in what errors are against, such as 12 for all that matters: then 0, 1, 2 and
-            4 bounces are tried, too, as far as there are so many. By default the scene's, which are not varied.
+        bounces: How often light bounces in what errors are against, such as 12 or "all": then 0, 1, 2 and 4 bounces are
+            tried, too, as far as there are so many, and "all". By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
             number is, and others where fits are kept already.
         device: Where to render.
@@ -226,7 +226,9 @@ def tune(
             scene.bodies, sample.decided(scene).bodies, np.where(is_coarse, "pixel", "vertex").tolist(), strict=True
         )
     ]
-    counts = (scene.bounces,) if bounces is None else [count for count in BOUNCE_COUNTS if count <= bounces]
+    counts: Sequence[Bounces] = (scene.bounces,)
+    if bounces is not None:
+        counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
     bounced = [replace(scene, bounces=count) for count in counts]
     settings = [setting for each in bounced for setting in _settings(each, fine, fits, device)]
     with warnings.catch_warnings():

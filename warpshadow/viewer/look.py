@@ -17,6 +17,7 @@ from warpshadow.scene.scene import (
     READ_BY,
     RECEIVERS,
     Body,
+    Bounces,
     Scene,
     Visibility,
     check_bounces,
@@ -80,7 +81,7 @@ class Look:
     softness: float
     spheres: int | None
     receivers: str
-    bounces: int
+    bounces: Bounces
     shows: str
     shows_light: bool
     poses: tuple[Pose, ...]
@@ -100,7 +101,8 @@ class Look:
             within("spheres", self.spheres, 1, MOST_SPHERES)
         check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
         check_bounces(self.bounces)
-        within("bounces", self.bounces, 0, MOST_BOUNCES)
+        if self.bounces != "all":
+            within("bounces", self.bounces, 0, MOST_BOUNCES)
         check.choice("shows", self.shows, (PICTURE, ERROR))
         check.flag("shows_light", self.shows_light)
         for pose in self.poses:
@@ -118,7 +120,7 @@ class Look:
             softness=scene.visibility.softness,
             spheres=None,
             receivers=AS_GIVEN,
-            bounces=min(scene.bounces, MOST_BOUNCES),
+            bounces=scene.bounces if scene.bounces == "all" else min(scene.bounces, MOST_BOUNCES),
             shows=PICTURE,
             shows_light=False,
             poses=tuple(Pose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),

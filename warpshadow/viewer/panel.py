@@ -90,7 +90,7 @@ class Panel:
             )
             receivers = gui.add_dropdown("Receivers", (AS_GIVEN, *RECEIVERS), initial_value=look.receivers)
             self._bind(receivers, lambda look: look.receivers, lambda value: {"receivers": value})
-            if self._scene.bounces:
+            if self._scene.bounces and look.bounces != "all":
                 bounces = gui.add_slider("Bounces", 0, max(4, look.bounces), 1, look.bounces)
                 self._bind(bounces, lambda look: look.bounces, lambda value: {"bounces": value})
             shows = gui.add_dropdown("Show", (PICTURE, ERROR), hint="Red: too bright, by 20% of the mean; blue: dark")

@@ -8,7 +8,7 @@ and G is applied as often as light bounces: first at the sources, points where p
 of the image. G has three parts, each a stage of its own: what a body's own patches send to it, what flat bodies send,
 and what bodies send that spheres stand in for. Where the light of a cell is blocked one of them takes its place.
 Between patches of one body the first part is a small matrix that does not change. Hollow bodies keep light for long:
-there it goes on when it has bounced often enough between bodies.
+there it goes on when it has bounced often enough between bodies. :mod:`.repeated` has how often.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ import numpy as np
 import warp as wp
 
 from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, Outgoing, SeenCells, StandIns, see_cells
-from warpshadow.pipeline.bounces.kept import OWN_BOUNCES, KeptBounces
+from warpshadow.pipeline.bounces.kept import KeptBounces
 from warpshadow.pipeline.bounces.own_factors import OwnFactors
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.repeated import OWN_BOUNCES, after_bounces
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
 from warpshadow.pipeline.groups import Group
 from warpshadow.pipeline.lighting import LitPoints, joined, receiver_words
 from warpshadow.pipeline.node import Call, Node, Source
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
@@ -115,7 +117,7 @@ class Radiosity(Node):
 
     def __init__(
         self,
-        count: int,
+        count: Bounces,
         stand_ins: StandIns,
         own_factors: OwnFactors,
         gathering: Gathering,
@@ -142,15 +144,22 @@ class Radiosity(Node):
         def sent(radiosity: wp.array) -> Outgoing:
             return Outgoing(self._stand_ins, radiosity, shown, spheres, frames)
 
-        past = radiosity = self._reflect.run(call, albedo, joined([part.direct for part in lit]), senders.mean)
-        for bounce in range(1, count if between is None else count + OWN_BOUNCES):
-            if bounce < count:
+        def past_own(radiosity: wp.array | None) -> wp.array:
+            """What patches send of the light of the sky and of others."""
+            if radiosity is None:
+                parts = [part.direct for part in lit]
+            else:
                 outgoing = sent(radiosity)
-                light = joined([self._light(call, part, outgoing) for part in lit])
-                past = self._reflect.run(call, albedo, light, senders.mean)
-            parts = [past] if between is None else [past, self._own.run(call, albedo, radiosity, between)]
-            radiosity = total_light(parts)
-        return sent(radiosity)
+                parts = [self._light(call, part, outgoing) for part in lit]
+            return self._reflect.run(call, albedo, joined(parts), senders.mean)
+
+        def with_own(past: wp.array, radiosity: wp.array | None) -> wp.array:
+            if between is None or radiosity is None:
+                return past
+            return total_light([past, self._own.run(call, albedo, radiosity, between)])
+
+        own_bounces = 0 if between is None else OWN_BOUNCES
+        return sent(after_bounces(count, past_own, with_own, senders.areas, own_bounces=own_bounces))
 
     def _light(self, call: Call, part: LitPart, outgoing: Outgoing) -> wp.array:
         """Light of a part of the sources past its own body, from the sky and from others."""
@@ -290,7 +299,7 @@ class SphereBounces:
 
     @functools.cached_property
     def _still(self) -> KeptBounces:
-        return KeptBounces(self._patches, self._count, own_bounces=OWN_BOUNCES, progress=self._method.progress)
+        return KeptBounces(self._patches, self._count, progress=self._method.progress)
 
     def _at(
         self, sources: Node, points: LitPoints, materials: Materials, sphere_of_point: np.ndarray | None = None

@@ -21,9 +21,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.repeated import OWN_BOUNCES, after_bounces
 from warpshadow.pipeline.lighting import LitPoints, receiver_words
 from warpshadow.pipeline.node import Node, Source
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.factors import loose_mesh, trace_factors
 from warpshadow.stages.bounces.nodes import choose_nodes, interpolation
@@ -34,8 +36,6 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-OWN_BOUNCES = 8
-"""How often a body's light for itself goes on where that of others has ended. Of a hollow body it dies away slowly."""
 
 _RAYS = 1024
 """Rays of a node or source, which find its form factors."""
@@ -68,14 +68,12 @@ class KeptBounces:
 
     Args:
         patches: Of the scene.
-        bounces: How often, 1 or more.
-        own_bounces: How often a body's light for itself goes on then.
+        bounces: How often, 1 or more; "all" until nothing is left.
         progress: Show progress where it takes longer than a second.
     """
 
-    def __init__(self, patches: ScenePatches, bounces: int, *, own_bounces: int = 0, progress: bool = False):
-        self._patches, self._progress = patches, progress
-        self._bounces, self._own_bounces = bounces, own_bounces
+    def __init__(self, patches: ScenePatches, bounces: Bounces, *, progress: bool = False):
+        self._patches, self._progress, self._bounces = patches, progress, bounces
 
     def sources(self, points: LitPoints, materials: Materials) -> Node:
         """Node of the points of patches that are lit, of one instance."""
@@ -125,7 +123,8 @@ class KeptBounces:
 
         def bounced() -> Node:
             given = self._patches.albedo(materials, senders.bodies), lit, self._factors(points, materials, senders)
-            return Node("transfer of bounces", lambda *given: _as_transfer(self._at_nodes(*given)), *given)
+            find = functools.partial(self._at_nodes, senders=senders)
+            return Node("transfer of bounces", lambda *given: _as_transfer(find(*given)), *given)
 
         def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: _Factors) -> wp.array:
             return factors.to_receivers(direct, colored_light(transfer, light))
@@ -138,19 +137,23 @@ class KeptBounces:
         senders = self._patches.senders(materials)
 
         def bounce(direct: wp.array, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
-            return factors.to_receivers(direct, self._at_nodes(albedo, at_patches, factors))
+            return factors.to_receivers(direct, self._at_nodes(albedo, at_patches, factors, senders))
 
         albedo, factors = self._patches.albedo(materials, senders.bodies), self._factors(points, materials, senders)
         return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._words(points, senders))
 
-    def _at_nodes(self, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
+    def _at_nodes(self, albedo: wp.array, at_patches: wp.array, factors: _Factors, senders: Senders) -> wp.array:
         """What nodes get of light that has bounced, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
-        past, radiosity = at_patches, reflect(albedo, at_patches)  # past their own bodies, from the sky and from others
-        for bounce in range(1, self._bounces + self._own_bounces):
-            if bounce < self._bounces:
-                past = multiply(factors.of_others, radiosity, plus=at_patches)
-            radiosity = reflect(albedo, multiply(factors.of_itself, radiosity, plus=past))
-        return multiply(factors.of_nodes, radiosity)
+
+        def past_own(radiosity: wp.array | None) -> wp.array:
+            """What patches get of the light of the sky and of others."""
+            return at_patches if radiosity is None else multiply(factors.of_others, radiosity, plus=at_patches)
+
+        def with_own(past: wp.array, radiosity: wp.array | None) -> wp.array:
+            return reflect(albedo, past if radiosity is None else multiply(factors.of_itself, radiosity, plus=past))
+
+        given = self._bounces, past_own, with_own, senders.areas
+        return multiply(factors.of_nodes, after_bounces(*given, own_bounces=OWN_BOUNCES))
 
     def _words(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
         return lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"

@@ -1,0 +1,53 @@
+"""How often light bounces between patches: a number of times, or until nothing is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from warpshadow.scene.scene import Bounces
+from warpshadow.stages.bounces.tail import with_tail
+
+OWN_BOUNCES = 8
+"""How often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then."""
+
+_COUNTED = 6
+"""Bounces among patches before the tail; the receivers find one more. In a white room that is open in front the energy
+among patches is then 1.0% too low, with four bounces 8.6%, and at an albedo of 0.9 0.3% and 3.6%."""
+
+
+def after_bounces(
+    bounces: Bounces,
+    light: Callable[[wp.array | None], wp.array],
+    reflect: Callable[[wp.array, wp.array | None], wp.array],
+    areas: np.ndarray,
+    *,
+    own_bounces: int,
+) -> wp.array:
+    """Radiosity of patches after all bounces but the last, which receivers find.
+
+    Args:
+        bounces: How often light bounces.
+        light: Takes the radiosity of patches, or None for direct light alone, to what they get past their own bodies.
+        reflect: Takes that and the radiosity, None for none, to what patches send of it and of their own body's light.
+        areas: Of patches, shape [patch].
+        own_bounces: How often a body's light for itself goes on after the others; 0 where there is none.
+    """
+    past = light(None)
+    radiosity = reflect(past, None)
+    if bounces == "all":
+        terms: list[wp.array] = []
+        for bounce in range(_COUNTED):
+            past = light(radiosity) if bounce else past
+            for _ in range(max(own_bounces, 1 if bounce else 0)):
+                radiosity = reflect(past, radiosity)
+            terms.append(radiosity)
+        before, last, now = terms[-3:]
+        return with_tail(before, last, now, areas)
+    for bounce in range(1, bounces + own_bounces):
+        if bounce < bounces:
+            past = light(radiosity)
+        radiosity = reflect(past, radiosity)
+    return radiosity
