@@ -617,7 +617,8 @@ def test_only_what_moves_is_projected_onto_what_stands_still(monkeypatch):
     transmittance = directional.transmittance
 
     def recorded(points, normals, centers, radii, *arguments, **options):
-        asked.append((points.shape[1], radii.shape[1], points.requires_grad))
+        first, end = options["skip"]
+        asked.append((points.shape[1], radii.shape[1] - (end - first), points.requires_grad))
         return transmittance(points, normals, centers, radii, *arguments, **options)
 
     monkeypatch.setattr(directional, "transmittance", recorded)
