@@ -17,8 +17,8 @@ import warpshadow as ws
 LEAST_PIXELS = 16  # of a body, to be measured
 BLOCK = 8  # pixels across
 _ACROSS = 2
-"""Samples across a pixel. Rays go in sixteen sets of directions, so few rays of many samples are all wrong in the same way:
-of 512, 2048 and 8192 rays a pixel a scene was 1.1, 0.1 and 0.0% brighter than in Mitsuba (4 across: 1.5% and 1.1%)."""
+"""Samples across a pixel. Rays go in sixteen sets of directions, so few rays of many samples err all in the same way:
+with 512, 2048 and 8192 rays a pixel a table was 1.1, 0.1 and 0.0% brighter than in Mitsuba; 4 across, 1.5 and 1.1%."""
 
 _MAP_ROWS = 2048  # of Mitsuba's map, whose rows lie elsewhere
 _PASS = 64  # samples of Mitsuba at once

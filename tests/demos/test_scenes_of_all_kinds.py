@@ -15,6 +15,9 @@ from demos.references import Reference, Request, turned
 
 SMALL = 40  # pixels across
 
+# relative L2 error of four scenes, with spheres that are not fitted, half again as much as measured
+BOUNDS = {"bowl": 0.33, "letters": 0.12, "shelf": 0.33, "tent": 0.46}
+
 
 @pytest.fixture
 def gray():
@@ -152,25 +155,25 @@ def test_scenes_have_all_that_they_are_about_in_sight():
 @pytest.mark.slow
 def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
     """In this process, with spheres that need no fit, so that it takes seconds."""
-    names = ("bowl", "letters", "shelf", "tent")
-    monkeypatch.setattr(bench, "SCENES", {name: with_quick_spheres(kinds.SCENES[name]) for name in names})
+    monkeypatch.setattr(bench, "SCENES", {name: with_quick_spheres(kinds.SCENES[name]) for name in BOUNDS})
     monkeypatch.setattr(bench, "ProcessPoolExecutor", Here)
     monkeypatch.setattr(bench, "MOVED_RUNS", 1)
     settings = ("still-direct", "kept-full")
     options = bench.Options(
         size=SMALL, samples=128, settings=settings, output=tmp_path / "out", references=tmp_path / "references"
     )
-    results = bench.main(names, options)
-    assert list(results) == list(names) == list(json.loads((options.output / "results.json").read_text())["scenes"])
+    results = bench.main(list(BOUNDS), options)
+    assert list(results) == list(BOUNDS) == list(json.loads((options.output / "results.json").read_text())["scenes"])
     printed = capsys.readouterr().out
     for name, result in results.items():
         assert list(result["settings"]) == list(settings)
         scene = options.scene(name)
         for setting, figures in result["settings"].items():
-            assert 0 < figures["error"] < figures["block"]
+            assert 0 < figures["error"] < min(BOUNDS[name], figures["block"])
             assert figures["peak MiB"] > 50 and ("moved CPU ms" in figures) == setting.startswith("kept")
             assert list(figures["bodies"]) == [body.called for body in scene.bodies]
-            assert all(abs(error) < 1 for error in figures["bodies"].values() if error is not None)
+            assert all(abs(error) < 0.7 for error in figures["bodies"].values() if error is not None)
+            assert abs(list(figures["bodies"].values())[-1]) < 0.2
             assert f"{name:20}{setting}" in printed
         sheet = ws.read_image(options.output / f"{name}.png")
         assert sheet.shape[1] > 5 * SMALL and np.ptp(sheet[..., :3]) > 0.9
