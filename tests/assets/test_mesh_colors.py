@@ -93,6 +93,17 @@ def test_the_color_of_a_gltf_material_is_that_of_its_part(tmp_path):
         assert found == {(tuple(np.float32((1, 0.2, 0))),), (tuple(np.float32((0.8, 0.8, 0.8))),)}
 
 
+def test_the_color_of_a_gltf_material_is_not_rounded(tmp_path):
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 1, 64, 255])
+    part = box(visual=trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material))
+    for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene(part)).items():
+        (tmp_path / name).write_bytes(content)
+    tree = json.loads((tmp_path / "model.gltf").read_text())
+    tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0.003, 0.25, 1.0]
+    (tmp_path / "model.gltf").write_text(json.dumps(tree))
+    np.testing.assert_allclose(ws.Body(tmp_path / "model.gltf").albedo, [0.5, 0.003, 0.25], rtol=1e-6)
+
+
 @pytest.mark.parametrize("material", [False, True])
 def test_colors_of_16_bits_are_read_or_said_to_be_dropped(tmp_path, material):
     codes = np.uint16([(65535, 32768, 0), (0, 257, 1), (1, 2, 3)])

@@ -29,6 +29,12 @@ class OfTrimesh(Protocol):
         """What trimesh knows of it, such as the file."""
 
 
+Factors = Mapping[tuple[int, ...], tuple[float, ...]]
+"""Linear factors of materials, by the codes that trimesh rounds them to."""
+
+NO_FACTORS: Factors = {}
+"""Of meshes whose file is not known."""
+
 MeshSource = AnyPath | OfTrimesh
 """What is read as a mesh."""
 
@@ -330,12 +336,12 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
     import trimesh
 
-    cuts_colors = path.suffix.lower() in (".gltf", ".glb") and _cuts_colors(path)
+    tree = _gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    parts = _trimesh_parts(loaded, of_file=True)
+    parts = _trimesh_parts(loaded, of_file=True, factors=_base_color_factors(tree))
     if path.suffix.lower() == ".stl":
         return [_merged(part) for part in parts]
-    if cuts_colors:
+    if _cuts_colors(tree):
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
 
@@ -355,40 +361,62 @@ def _merged(part: MeshPart) -> MeshPart:
     return part._replace(positions=positions[origins], faces=faces, colors=colors, remark=remark)
 
 
-def _cuts_colors(path: Path) -> bool:
-    """Whether trimesh would take the lower half of 16-bit colors: those in a glTF file that are not behind a material.
-
-    On bad JSON it would even read a model.gltf beside the file instead; here, that raises.
-    """
+def _gltf_tree(path: Path) -> dict:
+    """The JSON of a glTF file; on bad JSON trimesh would even read a model.gltf beside the file instead."""
     content = path.read_bytes()
     if content[:4] == b"glTF":
         content = content[20:][: int.from_bytes(content[12:16], "little")]
-    tree = json.loads(content)
+    return json.loads(content)
+
+
+def _cuts_colors(tree: dict) -> bool:
+    """Whether trimesh would take the lower half of 16-bit colors: those of a glTF file that no material goes with."""
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
     colors = [each["attributes"].get("COLOR_0") for each in primitives if "material" not in each]
     return any(color is not None and tree["accessors"][color]["componentType"] == 5123 for color in colors)
 
 
-def _trimesh_parts(given: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False) -> list[MeshPart]:
+def _base_color_factors(tree: dict) -> Factors:
+    """Factors of a glTF file's materials by the codes that trimesh rounds them to; the mean where several have one."""
+    found: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for material in tree.get("materials", []):
+        factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1.0, 1.0, 1.0))
+        exact = np.clip(np.array(factor[:3], np.float64), 0.0, 1.0)
+        found.setdefault(tuple((255 * exact).round().astype(int).tolist()), []).append(exact)
+    return {codes: tuple(np.mean(factors, axis=0).tolist()) for codes, factors in found.items()}
+
+
+def _base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
+    """The linear factor of a material of trimesh, in steps of 1/255 where its file is not known; None where none is."""
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is None:
+        return None
+    codes = tuple(factor[:3].tolist())
+    return factors.get(codes, tuple(code / 255 for code in codes))
+
+
+def _trimesh_parts(
+    given: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: Factors = NO_FACTORS
+) -> list[MeshPart]:
     """The meshes of a scene of trimesh in world space; or one mesh, as it is."""
     import trimesh
 
     if isinstance(given, trimesh.Trimesh):
-        return [_trimesh_part(given, of_file)]
+        return [_trimesh_part(given, of_file, factors)]
     scene, parts = given, []
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
         shape = scene.geometry[geometry]
         if isinstance(shape, trimesh.Trimesh):
-            parts.append(moved_part(_trimesh_part(shape, of_file), transform[:3, :3], transform[:3, 3]))
+            parts.append(moved_part(_trimesh_part(shape, of_file, factors), transform[:3, :3], transform[:3, 3]))
     return parts
 
 
-def _trimesh_part(shape, of_file: bool) -> MeshPart:
+def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
-    pictures = (_trimesh_picture(getattr(shape.visual, "material", None)),)
+    pictures = (_trimesh_picture(getattr(shape.visual, "material", None), factors),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
-    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures), shape)
+    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures), shape, factors)
     corner_uvs = _ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
         return part._replace(uvs=corner_uvs, uv_faces=np.arange(len(corner_uvs)).reshape(-1, 3))
@@ -405,7 +433,7 @@ def _trimesh_part(shape, of_file: bool) -> MeshPart:
     return part._replace(faces=welded, uvs=uvs, uv_faces=faces, welded=lost)
 
 
-def _trimesh_colored(part: MeshPart, shape) -> MeshPart:
+def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
     """Give a part the colors that a mesh of trimesh has: of vertices, of faces, or of its material."""
     from trimesh.visual import to_rgba
 
@@ -423,22 +451,22 @@ def _trimesh_colored(part: MeshPart, shape) -> MeshPart:
     colors = visual.vertex_attributes.get("color", of_ply)
     if colors is not None:
         part = _colored(part, colors, linear=linear)
-    factor = getattr(visual.material, "baseColorFactor", None)  # in steps of 1/255, and linear
-    if factor is None or any(part.pictures) or (factor[:3] == 255).all():  # white, glTF's default, says nothing
+    factor = _base_color_factor(visual.material, factors)
+    if factor is None or any(part.pictures) or factor == (1.0, 1.0, 1.0):  # white, glTF's default, says nothing
         return part
     white = np.ones((len(part.positions), 3), np.float32)
-    return part._replace(colors=(white if part.colors is None else part.colors) * np.float32(factor[:3] / 255))
+    return part._replace(colors=(white if part.colors is None else part.colors) * np.array(factor, np.float32))
 
 
-def _trimesh_picture(material) -> BaseColor | None:
+def _trimesh_picture(material, factors: Factors) -> BaseColor | None:
     """The picture of a material, glTF's or a simple one."""
     from trimesh.visual.material import empty_material
 
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or image == empty_material().image:  # which trimesh puts where there is none
         return None
-    factor = getattr(material, "baseColorFactor", None)  # in steps of 1/255
-    return BaseColor(image) if factor is None else BaseColor(image, tuple((factor[:3] / 255).tolist()))
+    factor = _base_color_factor(material, factors)
+    return BaseColor(image) if factor is None else BaseColor(image, factor)
 
 
 def _ply_corner_uvs(shape) -> np.ndarray | None:
