@@ -15,7 +15,7 @@ def test_objects_say_in_a_line_what_they_are():
     shown = {
         "Mesh('icosphere', 42 vertices, 80 faces)": mesh,
         "Body('ball', 42 vertices, 80 faces, 1 spheres)": body,
-        "Body('plane', 4 vertices, 2 faces, 64 spheres, texture 3 × 2)": ground,
+        "Body('plane', 4 vertices, 2 faces, auto spheres, texture 3 × 2)": ground,
         "EnvironmentMap(8 × 4)": light,
         "Camera(8 × 6, eye (0, 1, 4), fov_y 30)": camera,
         f"Scene([{body}, {ground}], {light}, {camera}, 'none')": scene,

@@ -351,7 +351,7 @@ def tune(
         ),
     ] = None,
     fit: Annotated[
-        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s each; they are kept for later.")
+        bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are kept for later.")
     ] = False,
     device: Device = "cpu",
     is_quiet: Quiet = False,
@@ -579,7 +579,9 @@ def dataset(
 @app.command()
 def spheres(
     mesh: Annotated[Path, typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .gltf or .usd.")],
-    count: Annotated[Optional[int], typer.Option(help="Number of spheres; 64 by default.", min=1)] = None,
+    count: Annotated[
+        Optional[int], typer.Option(help="Number of spheres; as many as the mesh needs by default.", min=1)
+    ] = None,
     error: Annotated[
         Optional[float],
         typer.Option(help="In place of --count: as many spheres as this relative error takes."),
@@ -603,7 +605,7 @@ def spheres(
         loaded = load_mesh(mesh)
         if count is not None and error is not None:
             raise ValueError("--count, --error: got both, expected one of them")
-        wanted = {"count": count or 64} if error is None else {"error": error}
+        wanted = {"count": count or "auto"} if error is None else {"error": error}
         fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **wanted)
         typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
         report = fit.report
@@ -612,6 +614,7 @@ def spheres(
         typer.echo(f"irradiance error on the ground   {report.ground_error:6.1%}")
         typer.echo(f"error of the shadow there        {report.shadow_error:6.1%}")
         typer.echo(f"irradiance error on the surface  {report.surface_error:6.1%}")
+        typer.echo(f"irradiance error in the air      {report.nearby_error:6.1%}")
         typer.echo(f"surface covered                  {report.coverage:6.1%}")
         typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")
         if output is not None:

@@ -56,7 +56,7 @@ def test_every_key_has_the_documented_default_but_camera_light_and_a_body(load):
     assert visibility.merging == 0.75
     assert (visibility.order, visibility.log, visibility.base) == (8, "eigen", "quadratic")
     (body,) = scene.bodies
-    assert (body.blockers, body.scale, body.receivers, body.texture) == (64, 1.0, "auto", None)
+    assert (body.blockers, body.scale, body.receivers, body.texture) == ("auto", 1.0, "auto", None)
     np.testing.assert_array_equal(body.rotation, np.zeros(3))
     np.testing.assert_array_equal(body.translation, np.zeros(3))
     np.testing.assert_array_equal(body.mesh.positions, ws.icosphere().positions)

@@ -187,7 +187,7 @@ def test_a_fit_that_is_kept_is_known_to_be(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     mesh = ws.icosphere(1.0, 1)
     assert not ws.spheres.is_fitted(mesh, 2)
-    monkeypatch.setattr("warpshadow.spheres.fit.Refinement.run", lambda self, spheres, balls, steps: [spheres])
+    monkeypatch.setattr("warpshadow.spheres.fit.Refinement.run", lambda self, spheres, steps: [spheres])
     ws.fit_spheres(mesh, 2)
     assert ws.spheres.is_fitted(mesh, 2)
     assert ws.spheres.is_fitted(mesh.transformed(scale=3.0), 2)

@@ -13,8 +13,8 @@ from warpshadow.device.batch import common_batch, concatenate
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import SPHERE_METHODS, BodyLike, Scene
-from warpshadow.spheres import Spheres
+from warpshadow.scene.scene import AUTO, SPHERE_METHODS, BodyLike, Scene
+from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
@@ -188,13 +188,13 @@ class Assembly:
 
     @property
     def sphere_counts(self) -> np.ndarray:
-        """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for."""
+        """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for, or 64."""
         if "_spheres" in self.__dict__:
             return np.diff(self.first_sphere)
         if self.scene.visibility.method not in SPHERE_METHODS:
             return np.zeros(len(self.scene.bodies), int)
-        blockers = [body.blockers for body in self.scene.bodies]
-        return np.array([count if isinstance(count, int) else len(count) for count in blockers])
+        blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
+        return np.array([len(asked) if isinstance(asked, Spheres) else asked for asked in blockers])
 
     @functools.cached_property
     def first_sphere(self) -> np.ndarray:

@@ -39,11 +39,11 @@ def blocking_planes(scene: Scene) -> tuple[int, ...]:
     )
 
 
-def fitted_counts(scene: Scene) -> dict[int, int]:
+def fitted_counts(scene: Scene) -> dict[int, int | str]:
     """Find the bodies to whose meshes spheres are fitted: neither grounds, nor those with spheres of their own.
 
     Returns:
-        Numbers of the bodies, from 0, and how many spheres each asks for.
+        Numbers of the bodies, from 0, and how many spheres each asks for, or "auto".
     """
     grounds = _ground_spheres(scene)
     return {
@@ -51,7 +51,7 @@ def fitted_counts(scene: Scene) -> dict[int, int]:
     }
 
 
-def _wanted(body: Body) -> int:
+def _wanted(body: Body) -> int | str:
     """How many spheres a body asks for."""
     return 0 if isinstance(body.blockers, Spheres) else body.blockers
 

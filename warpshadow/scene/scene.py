@@ -159,8 +159,9 @@ class Body:
             mesh has, or gray, 0.8.
         texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
-        blockers: Number of spheres to fit to the mesh, or the spheres themselves, or an .npz file of them; 0 or none
-            casts no shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane
+        blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
+            (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
+            shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane
             that it is, whatever the number; by others a flat body with all else on one side is a ground, for
             which any number means one sphere touching it from behind. Where light bounces, a body of 0 or none is lit
             and reflects all the same, and takes its light from nobody. If it is not flat, other bodies get that light
@@ -186,7 +187,7 @@ class Body:
     mesh: Mesh
     albedo: np.ndarray
     texture: np.ndarray | None = field(repr=False)
-    blockers: int | Spheres
+    blockers: int | str | Spheres
     rotation: np.ndarray
     translation: np.ndarray
     scale: float
@@ -201,7 +202,7 @@ class Body:
         mesh: Mesh | MeshSource,
         albedo: npt.ArrayLike | AnyPath | None = None,
         texture: npt.ArrayLike | AnyPath | None = None,
-        blockers: int | Spheres | AnyPath = 64,
+        blockers: int | str | Spheres | AnyPath = AUTO,
         rotation: npt.ArrayLike = (0.0, 0.0, 0.0),
         translation: npt.ArrayLike = (0.0, 0.0, 0.0),
         scale: float = 1.0,
@@ -220,11 +221,11 @@ class Body:
         object.__setattr__(self, "albedo", self._checked_albedo())
         if self.texture is not None:
             object.__setattr__(self, "texture", self._checked_texture(self.texture))
-        if not isinstance(self.blockers, Spheres):
+        if not isinstance(self.blockers, Spheres) and not (isinstance(self.blockers, str) and self.blockers == AUTO):
             if not check.is_integer(self.blockers) or self.blockers < 0:
                 raise ValueError(
                     f"blockers: got {check.described(self.blockers)}, expected a number of spheres, 0 or more, or "
-                    "Spheres, such as fit_spheres(mesh).spheres, or an .npz file of them"
+                    "'auto', or Spheres, such as fit_spheres(mesh).spheres, or an .npz file of them"
                 )
             object.__setattr__(self, "blockers", int(self.blockers))
         remedies = {"rotation": "an axis-angle vector in degrees; scipy's Rotation.as_rotvec(degrees=True) makes one"}

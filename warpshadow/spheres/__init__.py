@@ -4,22 +4,23 @@
                 the surface left bare                               [Lyu et al. 2021, section 3.2; Wang et al. 2006]
     receivers   receivers on and around the mesh, in its cavities and on grounds, and what they see past it, by rays
     refine      stage 2: from balls picked greedily, gradient descent until the receivers see as much past the spheres
+    enough      how many spheres a body needs, by short fits of a few counts
     measure     irradiance under a sky with a sun, the spheres' against the mesh's
     fit         the stages in order, the search for an error, the cache
 
 Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh in part. An open mesh is a sheet, seen
-from both sides. Stage 2 uses the cones of
-warpshadow.stages.visibility.cones and the falloff of the directional method, so the fit accounts for what a renderer
-does at receivers on and inside spheres.
+from both sides. Stage 2 uses the cones of warpshadow.stages.visibility.cones and the falloff of the directional method,
+so the fit accounts for what a renderer does at receivers on and inside spheres.
 """
 
-from warpshadow.spheres.fit import SphereFit, fit_spheres, is_fitted
+from warpshadow.spheres.fit import MANY, SphereFit, fit_spheres, is_fitted
 from warpshadow.spheres.measure import FitReport
 from warpshadow.spheres.occlusion import exact_occlusion
 from warpshadow.spheres.plot import check_matplotlib, plot_spheres
 from warpshadow.spheres.sphere_set import Spheres
 
 __all__ = [
+    "MANY",
     "FitReport",
     "SphereFit",
     "Spheres",

@@ -93,6 +93,8 @@ class Receivers:
         floor = self.VISIBLE_FLOOR
         self.weights = (floor + (1 - floor) * np.minimum(openness, 1)).astype(np.float32)[:, None]
         """How much errors at receivers count [receiver, 1]."""
+        self.off_surface = np.arange(surface, count)
+        """Those that are not on the mesh."""
 
     def __len__(self) -> int:
         """How many."""

@@ -65,7 +65,7 @@ class PointSample:
         device: wp.DeviceLike = "cpu",
         progress: bool = False,
     ):
-        self._device = wp.get_device(device)
+        self.device = wp.get_device(device)
         self._progress = progress
         self._direction_count = direction_count
         self._bounces = scene.bounces if bounces is None else bounces
@@ -120,7 +120,7 @@ class PointSample:
         scene = self.decided(scene)
         # it draws no image, so that what else a renderer prepares may be as small as can be
         glimpse = replace(scene.camera, width=1, height=1)
-        renderer = Renderer(scene, cameras=[glimpse], device=self._device, progress=self._progress)
+        renderer = Renderer(scene, cameras=[glimpse], device=self.device, progress=self._progress)
         receivers = self.receivers([body.receivers for body in scene.bodies])
         sides = receivers.sides
         order = np.argsort(renderer.assembly.body_of_face[sides % renderer.assembly.first_face[-1]], kind="stable")

@@ -23,7 +23,7 @@ from warpshadow.device.threads import one_at_a_time
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts
 from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Bounces, Scene, Visibility, check_bounces
-from warpshadow.spheres import Spheres, is_fitted
+from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
 from warpshadow.tuning.timing import image_times
@@ -335,7 +335,12 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
     if not scene.bounces:  # bounced light needs visibility
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
-    own = fitted_counts(scene)
+    own = {
+        number: len(fit_spheres(scene.bodies[number].mesh, device=sample.device).spheres)
+        if count == AUTO
+        else int(count)
+        for number, count in fitted_counts(scene).items()
+    }
     factor, most = 2, max(own.values(), default=SPHERE_COUNTS[-1])
     while factor * most <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
         yield from _all_directions(_with_spheres(scene, {number: factor * count for number, count in own.items()}))

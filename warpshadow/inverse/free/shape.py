@@ -13,15 +13,17 @@ from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import Found, Setting, World
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
-from warpshadow.spheres import Spheres
+from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import apply, rotation_matrices
 
 _STRETCH = 0.4  # a unit of stretch: nodes stretch less than they turn
 
 
 def _sphere_count(body: Body) -> int:
-    """Spheres of a body, or how many are asked for."""
-    return body.blockers if isinstance(body.blockers, int) else len(body.blockers)
+    """Spheres of a body, or how many are asked for; where that is "auto" they are fitted."""
+    if isinstance(body.blockers, Spheres):
+        return len(body.blockers)
+    return body.blockers if isinstance(body.blockers, int) else len(fit_spheres(body.mesh, progress=False).spheres)
 
 
 @dataclass(frozen=True)
