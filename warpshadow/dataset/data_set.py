@@ -177,7 +177,7 @@ class _Read(NamedTuple):
 
 
 @functools.lru_cache(_KEPT_BODIES)
-def _read_body(path: Path, blockers: int, creased: float | None, fits: bool, device: str) -> _Read:
+def _read_body(path: Path, blockers: int | str, creased: float | None, fits: bool, device: str) -> _Read:
     body = Body(path, blockers=blockers)
     content_hash = body.mesh.content_hash
     colors = body.albedo if body.texture is None else body.texture

@@ -14,7 +14,7 @@ from warpshadow.check import AnyPath
 from warpshadow.dataset.layers import LAYERS
 from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
-from warpshadow.scene.scene import Bounces, Scene, Visibility, check_bounces, check_supersampling
+from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
@@ -53,7 +53,7 @@ class Recipe:
         splits: Part of the images, and about that part of the meshes and maps, by the name of the split; their sum
             is 1.
         meshes: Folder of meshes, those in its folders, too; None for simple shapes.
-        blockers: Spheres that are fitted to each mesh of the folder.
+        blockers: Spheres that are fitted to each mesh of the folder, or "auto" for as many as it needs.
         creased: The meshes of the folder are parted where faces bend by more [degrees], 0 to 180; None for nowhere. See
             :meth:`warpshadow.Mesh.creased`.
         maps: Folder of environment maps; None for skies and lamps that are drawn.
@@ -69,7 +69,7 @@ class Recipe:
     format: str = "exr"
     splits: Mapping[str, float] = field(default_factory=lambda: {"train": 1.0})
     meshes: Path | None = None
-    blockers: int = 64
+    blockers: int | str = 64
     creased: float | None = None
     maps: Path | None = None
     size: tuple[int, int] = (128, 128)
@@ -90,7 +90,8 @@ class Recipe:
         object.__setattr__(self, "layers", tuple(self.layers))
         check.choice("format", self.format, FORMATS)
         object.__setattr__(self, "splits", _checked_splits(self.splits))
-        check.whole("blockers", self.blockers, least=0)
+        if self.blockers != AUTO:
+            check.whole("blockers", self.blockers, least=0)
         if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
             raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
         object.__setattr__(self, "size", check.image_size(self.size))
