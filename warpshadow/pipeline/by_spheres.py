@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.flats import SceneFlats
@@ -133,6 +134,11 @@ class SphereMethod(Method):
             return self.bounces.free_shading(points, Node("", self._taken_if_given, light), light, materials)
         direct = super().free_shading(points, light, materials)
         return direct if self.bounces is None else self.bounces.kept_free_shading(direct, points, light, materials)
+
+    def openness(self, points: LitPoints) -> Node:
+        """What points send back as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
+        sky = Source("light", EnvironmentMap.constant(1.0))
+        return InParts(self, points, Node("", self.taken_from, sky), sky, joined, where=" in an even sky")
 
     def _taken_if_given(self, light: wp.array) -> Any:
         """What the method takes of free light that is given. Differentiable: light."""

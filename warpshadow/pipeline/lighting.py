@@ -205,6 +205,10 @@ class Method:
         """Transfer vectors of points to :attr:`basis`, an array for each group."""
         raise NotImplementedError
 
+    def openness(self, points: LitPoints) -> Node | None:
+        """What points send back as white surfaces under an even sky of 1; None where rays find it on average."""
+        return None
+
 
 def check_light(light: object) -> None:
     """Raise ValueError for what is no light, or None."""

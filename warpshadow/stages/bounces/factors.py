@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,13 @@ _COUNTED = 1 << 22
 
 GOLDEN = (5**0.5 - 1) / 2
 """Turn from ray to ray, as a part of a full turn."""
+
+
+UNLIT = ("black surfaces", "insides of closed bodies")
+"""What rays meet that sends nothing, where it is told apart: in places of their own after all patches."""
+
+_BURIED = 0.5
+"""Part of its hemisphere from which a point that sees insides of closed bodies counts as inside one itself."""
 
 
 @wp.kernel(enable_backward=False)
@@ -127,3 +134,49 @@ def trace_factors(
     if not found:
         return csr_matrix((0, count), dtype=np.float32)
     return (vstack(found, format="csr") / rays).astype(np.float32)
+
+
+# ---------------------------------------------------------------------------------------------------- with direct light
+
+
+class SeenPatches(NamedTuple):
+    """What points see of patches."""
+
+    factors: csr_matrix  # [point, patch]
+    is_buried: np.ndarray  # whether they lie inside another body, bool of shape [point]
+
+
+def scaled_to_sky(found: csr_matrix, casts: np.ndarray, sky: np.ndarray | None) -> SeenPatches:
+    """Scale form factors so that they and the sky of direct light fill the hemisphere: by (1 − s) / f.
+
+    Args:
+        found: f by rays, of patches and of UNLIT, shape [point, patch + 2].
+        casts: Which of these cast shadows, bool of shape [patch + 2]; the others take nothing of the sky.
+        sky: s, part of the hemisphere that is open where direct light is found, shape [point]; None for rays, too.
+    """
+    from scipy.sparse import diags
+
+    is_buried = found[:, [-1]].toarray().ravel() > _BURIED
+    if sky is not None:
+        blocking = found @ diags(casts.astype(np.float32))
+        found = (found + scaled(blocking, ratios(1 - sky, np.asarray(blocking.sum(axis=1)).ravel()) - 1)).tocsr()
+    return SeenPatches(found[:, : -len(UNLIT)], is_buried)
+
+
+def ratios(wanted: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """Factors that take values to those wanted, 0 where these are negative; 1 where there is nothing."""
+    return np.where(given > 0, np.maximum(wanted, 0) / np.where(given > 0, given, 1), 1)
+
+
+def scaled(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
+    """Scale the rows of a matrix."""
+    from scipy.sparse import diags
+
+    return (diags(factors) @ matrix).tocsr()
+
+
+def mean_outside(means: csr_matrix, is_buried: np.ndarray) -> csr_matrix:
+    """Means over items that are not buried, [row, item]; as they were where all are."""
+    left = scaled(means.T, (~is_buried).astype(np.float32)).T.tocsr()
+    wanted, sums = (np.asarray(each.sum(axis=1)).ravel() for each in (means, left))
+    return scaled(left, ratios(wanted, sums)) + scaled(means, (sums == 0).astype(np.float32))
