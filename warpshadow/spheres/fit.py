@@ -31,7 +31,7 @@ from warpshadow.spheres.receivers import Receivers
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
-ALGORITHM_VERSION = 7
+ALGORITHM_VERSION = 8
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
 
 COVER_STEPS = 200
@@ -96,8 +96,8 @@ def fit_spheres(
     Args:
         mesh: The mesh [scene units], y up; open and multi-part meshes, too.
         count: Number of spheres; 0 gives none. "auto" takes as many as the body needs, 8 to 1024: until the error of
-            its shadows around it is some 3%, or no longer falls by 15% where they are doubled. It is 8 for a ball, 32
-            for a cow, 64 for a box, 256 for a bunny, 1024 for a chair.
+            its shadows around it is some 3%, or no longer falls by 15% where they are doubled. It is 8 for a ball, 64
+            for a cow and a box, 256 for a bunny, 1024 for a chair.
         error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
             of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
             comes with a warning.
