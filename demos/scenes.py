@@ -15,7 +15,7 @@ def shipped_mesh(name: str) -> ws.Mesh:
 
 
 def on_ground(
-    mesh: ws.Mesh, light: ws.EnvironmentMap, *, blockers: int = 64, ground: ws.Body | None = None
+    mesh: ws.Mesh, light: ws.EnvironmentMap, *, blockers: int | str = 64, ground: ws.Body | None = None
 ) -> ws.Scene:
     """A mesh made 2 units large, on the middle of a ground of 6 × 6 units and 64 × 64 quads, seen from above."""
     low, high = mesh.bounds

@@ -1,10 +1,11 @@
 """What each millisecond buys: error against the time of an image, for all settings and for a path tracer.
 
     python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--light direct full] [--quick]
+        [--kinds NAME ...]
 
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
-spot, the most even one and the one between.
+spot, the most even one and the one between. Four more are of demos/kinds.py, or as many as ``--kinds`` names.
 
 Time is that of a warm image, forward, with the renderer made: each call places the bodies a hair's breadth elsewhere,
 so that nothing can be kept from the call before: projection, rasterization, visibility, shading and film run anew.
@@ -14,7 +15,7 @@ pixels, against rays through the meshes, 4096 a pixel.
 
 Also measured: rays at few directions; Mitsuba 3 where it is installed, and how many times as long it needs to come as
 near to its own image of 4096 samples as our default does; whether any setting is both faster and more accurate than
-the default; and what the default's error consists of.
+the default; what ``ws.tune`` picks; and what the default's error consists of.
 
 Against full light, path traced with all bounces, there is less to compare: no shadows, the default, which knows direct
 light alone, the default with 1, 2 and 4 bounces, and Mitsuba's path integrator. The demo prints tables and writes
@@ -38,17 +39,23 @@ import warp as wp
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos.kinds import SCENES, Sources
 from demos.scenes import image_error, on_ground, shipped_mesh
+from warpshadow.scene.scene import AUTO
 from warpshadow.spheres import exact_occlusion
 from warpshadow.stages import accumulate, exponentiate, sample_map, sh_transfer, shade, trace_visibility
 from warpshadow.stages.visibility.merging import MERGED_FROM
 from warpshadow.tuning.point_sample import PointReceivers, PointSample
 from warpshadow.tuning.timing import median_times, whole_image
-from warpshadow.tuning.tune import pareto_front
+from warpshadow.tuning.tune import describe, pareto_front
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
 SPHERE_COUNTS = (16, 32, 64, 128, 256, 512)
+KINDS = ("bowl", "chair_wheel_fence", "city", "open_room")
+KIND_COUNTS = (64, 256)  # of spheres, for scenes of several bodies
+SIZE = 256  # pixels across
+TUNED_ERROR = 0.05  # that tune is asked for
 RAY_COUNTS = (16, 64, 256)
 PATH_COUNTS = (4, 16, 64, 256, 1024)
 TRUE_COUNT = 4096  # rays or paths of a pixel
@@ -93,10 +100,18 @@ class Measured:
         return f"{self.family} {self.size}{', ' if self.details else ''}{self.details}"
 
 
-def main(data: Path | None, output: Path, runs: int, quick: bool, lights: Sequence[str] = ("direct", "full")) -> None:
+def main(
+    data: Path | None,
+    output: Path,
+    runs: int,
+    quick: bool,
+    lights: Sequence[str] = ("direct", "full"),
+    kinds: Sequence[str] = (),
+) -> None:
     ws.quiet()
     warnings.filterwarnings("ignore", module="warpshadow")  # many spheres in spherical harmonics; coarse faces
     scenes = quick_scenes() if quick else load_scenes(data)
+    scenes |= {name: SCENES[name](Sources(data), SIZE) for name in kinds}
     true_count = 1024 if quick else TRUE_COUNT
     output.mkdir(exist_ok=True)
     for light in lights:
@@ -106,7 +121,8 @@ def main(data: Path | None, output: Path, runs: int, quick: bool, lights: Sequen
             if light == "full":
                 results[name] = compare_full(scene, runs, true_count=true_count)
             else:
-                results[name] = compare(scene, () if quick else SPHERE_COUNTS, runs, true_count=true_count)
+                counts = KIND_COUNTS if name in kinds else SPHERE_COUNTS
+                results[name] = compare(scene, () if quick else counts, runs, true_count=true_count)
         path = output / ("full_light_vs_time.json" if light == "full" else "error_vs_time.json")
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False))
         plot(results, path.with_suffix(".png"))
@@ -120,10 +136,15 @@ def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_co
     front = [ours[number] for number in pareto_front([(each.milliseconds, each.error) for each in ours])]
     better = better_than(default, ours)
     parts = error_parts(scene)
+    tuned = ws.tune(scene, error=TUNED_ERROR, progress=False)
     print_table(measured, {default.label: ">"} | {each.label: "*" for each in front if each is not default})
     print("> default    * no other setting is both faster and more accurate")
     print(f"both faster and more accurate than the default by {MARGIN:.0%}: ", end="")
     print("; ".join(each.label for each in better) or "none")
+    print(f"the default is {'' if default in front else 'not '}on the Pareto front")
+    print(
+        f"tune, asked for {TUNED_ERROR:.0%}: {describe(tuned.scene)} ({tuned.error:.2%}, {tuned.milliseconds:.1f} ms)"
+    )
     for method, of_method in parts.items():
         print(f"error of {method}: " + ", ".join(f"{part} {value:.2%}" for part, value in of_method.items()))
     print_equal(equal)
@@ -132,6 +153,7 @@ def compare(scene: ws.Scene, sphere_counts: Sequence[int], runs: int, *, true_co
         "default": default.label,
         "front": [each.label for each in front],
         "better_than_default": [each.label for each in better],
+        "tuned": describe(tuned.scene),
         "parts": parts,
         "equal_error": equal,
     }
@@ -195,19 +217,19 @@ def load_scenes(data: Path | None) -> dict[str, ws.Scene]:
         skies = [maps[name] for name in names]
     bodies = ", ".join(mesh.name for mesh in meshes)
     return {
-        f"{meshes[0].name}, {names[0]}": on_ground(meshes[0], skies[0]),
-        f"{meshes[1].name}, {names[1]}": on_ground(meshes[1], skies[1]),
+        f"{meshes[0].name}, {names[0]}": on_ground(meshes[0], skies[0], blockers=AUTO),
+        f"{meshes[1].name}, {names[1]}": on_ground(meshes[1], skies[1], blockers=AUTO),
         f"{bodies}, {names[2]}": several_on_ground(meshes, skies[2]),
     }
 
 
 def several_on_ground(meshes: Sequence[ws.Mesh], light: ws.EnvironmentMap) -> ws.Scene:
     """Three bodies of 1.3 units beside one another, on the ground of one."""
-    whole = on_ground(meshes[0], light)
+    whole = on_ground(meshes[0], light, blockers=AUTO)
     places = [(-1.2, 0.0, 0.4), (0.2, 0.0, -0.9), (1.2, 0.0, 0.7)]
     bodies = []
     for mesh, place in zip(meshes, places, strict=True):
-        body = on_ground(mesh, light).bodies[0]
+        body = on_ground(mesh, light, blockers=AUTO).bodies[0]
         bodies.append(dataclasses.replace(body, scale=0.65 * body.scale, translation=0.65 * body.translation + place))
     return dataclasses.replace(whole, bodies=(*bodies, whole.bodies[1]))
 
@@ -229,8 +251,7 @@ def settings(scene: ws.Scene, sphere_counts: Sequence[int]) -> list[Setting]:
     """What is compared: methods with all numbers of spheres; bases and pixels as receivers with some."""
     found = list(methods(scene, ""))
     for count in sphere_counts:
-        if count != 64:
-            found += methods(with_spheres(scene, count), f"{count} spheres")
+        found += methods(with_spheres(scene, count), f"{count} spheres")
     for log, base in itertools.product(("eigen", "cap"), ("linear", "optimal_linear")):
         found += [
             Setting(
@@ -238,9 +259,9 @@ def settings(scene: ws.Scene, sphere_counts: Sequence[int]) -> list[Setting]:
             )
             for order in ORDERS
         ]
-    for count in (64, *(count for count in sphere_counts if count in (128, 256))):
-        pixels = with_receivers(scene if count == 64 else with_spheres(scene, count), "pixel")
-        spheres = "" if count == 64 else f"{count} spheres, "
+    for count in (None, *(count for count in sphere_counts if count in (128, 256))):
+        pixels = with_receivers(with_spheres(scene, count) if count else scene, "pixel")
+        spheres = f"{count} spheres, " if count else ""
         found += [
             Setting("directional", directions, f"{spheres}pixel", with_visibility(pixels, directions=directions))
             for directions in (64, 128, 256)
@@ -531,6 +552,10 @@ if __name__ == "__main__":
     parser.add_argument(
         "--light", nargs="+", choices=["direct", "full"], default=["direct", "full"], help="what errors are against"
     )
+    parser.add_argument(
+        "--kinds", nargs="*", choices=SCENES, default=KINDS, help="scenes of all kinds beside the three"
+    )
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
     arguments = parser.parse_args()
-    main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light)
+    kinds = () if arguments.quick else arguments.kinds
+    main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light, kinds)
