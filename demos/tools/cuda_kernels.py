@@ -15,7 +15,7 @@ from warpshadow.spheres import refine
 from warpshadow.stages import transfer
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.interpolate import _make_interpolate, _make_interpolate_adjoint
-from warpshadow.stages.own_shadows import gather, lobes
+from warpshadow.stages.own_shadows import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -68,6 +68,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{make.__name__: partial(make, LANES) for make in (sphere_light._make_light, sphere_light._make_light_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_pull)},
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
+    "trace._make_trace": trace._make_trace,
+    "sun_cells._make_trace": sun_cells._make_trace,
     "_make_empty": partial(lanes._make_empty, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""

@@ -10,6 +10,7 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.maths import sh
+from warpshadow.maths.spatial_sort import z_order_of_cells
 
 _AT_ONCE = 2**14
 """Sums in rows of cells that are found at once: few enough to stay in a cache, and row by row in the same order."""
@@ -57,7 +58,7 @@ def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.nd
     if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
         raise ValueError("directions: expected at least one, all unit vectors")
     count, height = len(directions), len(radiance)
-    split = int(np.ceil(4 * np.pi * np.sqrt(count) / height))  # an eighth of a cell's angular radius 2/√Q
+    split = _split(height, count)
     owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
     weights, towards = sh.pixel_solid_angles(height * split), sh.equirectangular_directions(height * split)
     integrals = np.zeros((6, count))
@@ -72,6 +73,39 @@ def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.nd
             of_rows[0] += integral
             integral[:] = of_rows.sum(axis=0)
     return integrals[:3].T, integrals[3:].T
+
+
+def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, count: int) -> np.ndarray:
+    """Draw directions from the light of some cells around directions, in proportion to its luminance.
+
+    Args:
+        radiance, directions: As for :func:`gather_cells`.
+        cells: Numbers of the cells, none of which is dark.
+        count: Directions that are drawn of each.
+
+    Returns:
+        Unit vectors, shape [cell, count, 3].
+    """
+    height, split = len(radiance), _split(len(radiance), len(directions))
+    owners = _cells_of_pixels(height * split, np.asarray(directions).astype(np.float32).tobytes())
+    luminance = np.abs(radiance @ LUMINANCE) * sh.pixel_solid_angles(height)[:, None]
+    levels = (np.arange(count) + 0.5) / count
+    jitter = (0.5 + np.outer(np.arange(count), [0.7548776662, 0.5698402910])) % 1  # Roberts' R2
+    drawn = np.empty((len(cells), count, 3))
+    for place, cell in enumerate(cells):
+        rows, columns = np.nonzero(owners == cell)
+        pixels = np.stack([rows, columns], axis=1)
+        pixels = pixels[z_order_of_cells(pixels)]
+        power = np.cumsum(luminance[pixels[:, 0] // split, pixels[:, 1] // split])
+        chosen = np.minimum(np.searchsorted(power, levels * power[-1]), len(power) - 1)
+        theta, phi = (np.pi / (height * split) * (pixels[chosen] + jitter)).T
+        drawn[place] = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=1)
+    return drawn
+
+
+def _split(height: int, count: int) -> int:
+    """Pieces that rows of a map are split into: an eighth of a cell's angular radius 2/√Q."""
+    return int(np.ceil(4 * np.pi * np.sqrt(count) / height))
 
 
 @functools.lru_cache(maxsize=4)

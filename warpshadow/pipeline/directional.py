@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis
+from warpshadow.assets.cells import draw_in_cells
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import cell_radius, fibonacci
@@ -22,6 +23,7 @@ from warpshadow.stages.flats.passing import flat_coverage, past_coverage
 from warpshadow.stages.kept_cells import KeptRows, cell_transfer, light_cells
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.own_shadows.gather import gather_own, multiply_transmittances
+from warpshadow.stages.own_shadows.sun_cells import SunCells, find_sun_cells, trace_sun_cells
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.shading import shade_cells
 from warpshadow.stages.sides import split_sides
@@ -37,6 +39,7 @@ class Cells(NamedTuple):
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, direction]
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     narrow: Narrow | None = None  # cells that a sun is in
+    sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
 
 
 class Directional(SphereMethod):
@@ -57,7 +60,9 @@ class Directional(SphereMethod):
         cells = light.cells(self._directions)
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         narrow = find_narrow(power, cells.directions, cells.spreads, softness)
-        return Cells(cells.directions, self._on_device(cells.radiance), cells.spreads, narrow)
+        draw = functools.partial(draw_in_cells, light.radiance, self._directions)
+        sun = find_sun_cells(power, draw) if self.own_shadows.wants_rays else None
+        return Cells(cells.directions, self._on_device(cells.radiance), cells.spreads, narrow, sun)
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return wp.array(coefficients[None], dtype=wp.vec3, device=self.assembly.device)
@@ -68,12 +73,13 @@ class Directional(SphereMethod):
 
     def look_up(self, bodies: tuple[int, ...], rotations: wp.array, taken: Cells) -> dict[int, OwnLookup]:
         """What receivers of some bodies look up of these. Differentiable: rotations."""
-        return self.own_shadows.lookups(bodies, rotations, taken.directions, taken.spreads)
+        has_sun = taken.sun is not None
+        return self.own_shadows.lookups(bodies, rotations, taken.directions, taken.spreads, has_sun=has_sun)
 
     def see(self, group: Group, taken: Cells) -> Seen:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
         points, normals, centers, radii, kept_rows = group[:5]
-        past_own = self._past_own(group)
+        past_own = self._past_own(group, taken)
         if not (radii.shape[1] and points.size):
             if past_own is not None:
                 return Seen(past_own, past_own)
@@ -118,13 +124,23 @@ class Directional(SphereMethod):
             covered = put_narrow(covered, narrow, places)
         return seen._replace(past_all=past_coverage(past_solid, covered), past_solid=past_solid)
 
-    def _past_own(self, group: Group) -> wp.array | None:
-        """What receivers see past their own body."""
+    def _past_own(self, group: Group, taken: Cells) -> wp.array | None:
+        """What receivers see past their own body: looked up, and of a sun by rays where these are asked for."""
         if group.own_shadow is None or not group.points.size:
             return None
         assert group.places is not None and isinstance(group.own_shadow, OwnLookup)
-        rows, lookup, supports = group.own_shadow
-        return gather_own(group.normals, group.places, lookup, supports, rows)
+        rows, lookup, supports, rays = group.own_shadow
+        past_own = gather_own(group.normals, group.places, lookup, supports, rows)
+        if rays is None or taken.sun is None:
+            return past_own
+        if past_own.requires_grad:
+            raise ValueError(
+                'self_shadows: got "rays" where a rotation or a camera has a gradient, which rays under a sun do not '
+                'have, expected "traced" or "spheres"'
+            )
+        assert group.body is not None
+        of_sun = trace_sun_cells(rays[0], group.places, rays[1], group.body, taken.sun)
+        return put_narrow(past_own, of_sun, taken.sun.places)
 
     def transfer(self, seen: Seen, group: Group, taken: Cells) -> wp.array:
         """Transfer vectors; the transmittance as it is where kept cells hold known light."""

@@ -4,6 +4,7 @@ What a rigid body blocks of its own light does not change in its own frame. So r
 beside the spheres that are fitted to the mesh. Other bodies' spheres block their shares of what it leaves.
 """
 
+import functools
 import hashlib
 import json
 import weakref
@@ -25,19 +26,21 @@ from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.own_shadows.buried import find_buried, find_lenders
 from warpshadow.stages.own_shadows.lobes import Turned, find_turned, project_rows
 from warpshadow.stages.own_shadows.lookup import Lookup, Supports, find_lookups, find_supports
-from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, cuts_of, find_sites
+from warpshadow.stages.own_shadows.sites import Places, Sites, SiteTable, find_sites, longest_edge
+from warpshadow.stages.own_shadows.sun_cells import RaySites
 from warpshadow.stages.own_shadows.trace import RAYS, RUN, OwnRows, ray_count, trace_rows
 from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers import Receivers, Span
 
-VERSION = 3
+VERSION = 4
 """Part of the key of cached rows: raise it whenever they would come out differently."""
 
 
 Found = TypeVar("Found")
 
-_OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, int, str], object]] = weakref.WeakKeyDictionary()
-"""What was found of each mesh that is in memory, for all renderers: what, cuts, device."""
+_OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]] = weakref.WeakKeyDictionary()
+"""What was found of each mesh that is in memory, for all renderers: what, whether samples receive, device."""
 
 
 class Blocking(NamedTuple):
@@ -59,6 +62,7 @@ class OwnLookup(NamedTuple):
     rows: OwnRows
     lookup: Lookup
     supports: Supports
+    rays: tuple[RaySites, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
 
     @property
     def turned(self) -> wp.array:
@@ -106,13 +110,27 @@ class OwnShadows:
         scene = self._assembly.scene
         if not scene.bodies[body].casts_shadow:
             return "it casts no shadow"
-        if (scene.bodies[body].self_shadows or scene.visibility.self_shadows) == "spheres":
+        if self._how(body) == "spheres":
             return 'self_shadows = "spheres"'
         if geometry is not None and body in geometry.deformed:
             return "its shape is free"
         if geometry is not None and geometry.rotations is None:
             return "geometry has no rotations; placed(…) makes one that has them"
         return ""
+
+    @property
+    def wants_rays(self) -> bool:
+        """Whether receivers of some body send rays to sun cells."""
+        return any(map(self._sends_rays, range(len(self._samples_receive))))
+
+    def _sends_rays(self, body: int) -> bool:
+        """Whether receivers of a body do: those that are pixels. Between vertices an edge would be too sharp."""
+        return self._how(body) == "rays" and bool(self._samples_receive[body])
+
+    def _how(self, body: int) -> str:
+        """What shadows a body casts on itself."""
+        scene = self._assembly.scene
+        return scene.bodies[body].self_shadows or scene.visibility.self_shadows
 
     # ------------------------------------------------------------------------------------------ where
 
@@ -121,22 +139,22 @@ class OwnShadows:
         if body not in self._sites:
             mesh, device = self._assembly.scene.bodies[body].mesh, self._assembly.device
             faces = mesh.surface.faces
-            cuts = cuts_of(len(faces)) if self._samples_receive[body] else 1
 
             def find() -> Sites:
                 used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
                 positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
                 points = wp.array(positions[None], dtype=wp.vec3, device=device)
                 normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
-                return find_sites(positions, normals, faces, cuts)
+                longest = longest_edge(positions, faces, samples_receive=bool(self._samples_receive[body]))
+                return find_sites(positions, normals, faces, longest)
 
-            self._sites[body] = self._of_mesh(body, "sites", cuts, find)
+            self._sites[body] = self._of_mesh(body, "sites", find)
         return self._sites[body]
 
-    def _of_mesh(self, body: int, what: str, cuts: int, find: Callable[[], Found]) -> Found:
+    def _of_mesh(self, body: int, what: str, find: Callable[[], Found]) -> Found:
         """What is found of the mesh of a body once, by whichever renderer asks for it first."""
         kept: dict = _OF_MESHES.setdefault(self._assembly.scene.bodies[body].mesh, {})
-        key = what, cuts, self._assembly.device.alias
+        key = what, bool(self._samples_receive[body]), self._assembly.device.alias
         if key not in kept:
             kept[key] = find()
         return kept[key]
@@ -165,24 +183,52 @@ class OwnShadows:
                 int(assembly.first_face[body]),
                 int(assembly.first_face[-1]),
                 len(sites.positions),
-                wp.array(sites.corners, dtype=wp.int32, device=assembly.device),
-                sites.cuts,
+                wp.array(sites.pieces, dtype=wp.vec4i, device=assembly.device),
             )
         return self._tables[body]
 
     # ------------------------------------------------------------------------------------------ what
 
     def lookups(
-        self, bodies: tuple[int, ...], rotations: wp.array, directions: np.ndarray, spreads: np.ndarray | None
+        self,
+        bodies: tuple[int, ...],
+        rotations: wp.array,
+        directions: np.ndarray,
+        spreads: np.ndarray | None,
+        *,
+        has_sun: bool = False,
     ) -> dict[int, OwnLookup]:
-        """What receivers of bodies look up of them for cells, as for find_supports. Differentiable: rotations."""
+        """What receivers of bodies look up of them for cells, as for find_supports. Differentiable: rotations.
+
+        Args:
+            bodies, rotations, directions, spreads: What is looked up.
+            has_sun: Whether there are sun cells, to which receivers of some bodies send rays.
+        """
         found = {}
         for body in bodies:
             if not self._assembly.is_flat[body]:
                 rows = self.rows(body)
                 supports = find_supports(directions, spreads, rows.ray_count, rotations.device)
-                found[body] = OwnLookup(rows, find_lookups(rotations, body, supports), supports)
+                rays = (self._ray_sites(body), rotations) if has_sun and self._sends_rays(body) else None
+                found[body] = OwnLookup(rows, find_lookups(rotations, body, supports), supports, rays)
         return found
+
+    def _ray_sites(self, body: int) -> RaySites:
+        """Where rays for a sun start."""
+        normals, positions = self._normals(body), self.sites(body).positions
+
+        def find() -> RaySites:
+            places = np.tile(positions, (len(normals) // len(positions), 1))
+            at = (wp.array(values, dtype=wp.vec3, device=self._assembly.device) for values in (places, normals))
+            return RaySites(self._tree(body), *at)
+
+        return self._of_mesh(body, "ray sites", find)
+
+    def _tree(self, body: int) -> FaceTree:
+        """The hierarchy of a body's faces."""
+        faces = self._assembly.scene.bodies[body].mesh.surface.faces
+        build = functools.partial(build_face_tree, self.sites(body).positions, faces, self._assembly.device)
+        return self._of_mesh(body, "tree", build)
 
     def turned_lobes(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, OwnLobes]:
         """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
@@ -212,7 +258,7 @@ class OwnShadows:
     def rows(self, body: int) -> OwnRows:
         """What the sites of a body see past it: in memory, on disk, or traced."""
         if body not in self._rows:
-            self._rows[body] = self._of_mesh(body, "rows", self.sites(body).cuts, lambda: self._find_rows(body))
+            self._rows[body] = self._of_mesh(body, "rows", lambda: self._find_rows(body))
         return self._rows[body]
 
     def _find_rows(self, body: int) -> OwnRows:
@@ -225,9 +271,9 @@ class OwnShadows:
                 f"body {body} ({called!r}): {len(sites.positions):,} points have {count} rays each for the body's "
                 f"shadow on itself, in place of {RAYS}, which would take too much memory",
             )
-        numbers = [VERSION, count, sites.cuts, bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
+        numbers = [VERSION, count, len(sites.positions), bool(self._assembly.is_two_sided[body]), len(mesh.positions)]
         key = hashlib.sha256(json.dumps(numbers).encode())
-        key.update(sites.positions[: len(mesh.positions)].tobytes())
+        key.update(sites.positions.tobytes())
         key.update(np.asarray(faces, np.int32).tobytes())
 
         def read(stored: Mapping[str, np.ndarray]) -> OwnRows:
@@ -243,7 +289,7 @@ class OwnShadows:
             normals = self._normals(body)
             places = np.tile(sites.positions, (len(normals) // len(sites.normals), 1))
             with unrecorded():
-                rows = trace_rows(whole, places, normals, count, progress=self._progress)
+                rows = trace_rows(self._tree(body), places, normals, count, progress=self._progress)
                 is_buried = find_buried(whole, places, normals, len(sites.positions), rows)
                 return rows.lent(find_lenders(sites, is_buried))
 

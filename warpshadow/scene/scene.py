@@ -53,7 +53,7 @@ Bounces = int | Literal["all"]
 
 RECEIVERS = (AUTO, "vertex", "pixel")
 
-SELF_SHADOWS = ("traced", "spheres")
+SELF_SHADOWS = ("traced", "rays", "spheres")
 
 SCENE = "a Scene; load_scene(path) reads one"
 """What functions that take a scene say they expect."""
@@ -87,7 +87,9 @@ class Visibility:
         merging: τ: half-angle under which four neighboring spheres of 512 or more are seen as one, in radii of a cell
             ("directional") or of a cell for each coefficient ("log-sh"); 0 for never.
         self_shadows: What shadows a body casts on itself: those of its mesh, "traced" once by rays wherever its shape
-            is not free, or those of its "spheres". Bodies may say otherwise.
+            is not free, or those of its "spheres". "rays" are as "traced", but under "directional" pixels send rays
+            to the brightest cells in every image: a sun's edge has no teeth, and rotations and cameras have no
+            gradient. Pictures that are made once have that under a sun. Bodies may say otherwise.
         order: Number of SH bands, 2 to 8: of "log-sh", of the light that "none" shades with, and of free light by
             "ray-traced".
         log: Logarithm of one cap of "log-sh": "eigen" or "cap".
@@ -174,9 +176,9 @@ class Body:
             of few faces needs to receive a shadow. "auto" leaves it to each renderer: by pixel where its cameras see
             faces of more than 16 pixels on average, or 5% of the body's pixels show faces longer than 16 pixels (in
             images larger than 256 × 256, 1/4096 of the pixels, at most 400, and four times the root of that). Pictures
-            that are made once, as by :func:`warpshadow.render`, show flat bodies by pixel.
-        self_shadows: What shadows it casts on itself, "traced" or of its "spheres", as for :class:`Visibility`; None
-            for what the scene's visibility says.
+            that are made once, as by :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
+        self_shadows: What shadows it casts on itself, "traced", by "rays" or of its "spheres", as for
+            :class:`Visibility`; None for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.
         shadow_catcher: Whether it stands for what a photograph shows: :func:`warpshadow.insert` does not draw it, and
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the

@@ -8,6 +8,7 @@ import warpshadow as ws
 from warpshadow.stages.own_shadows.buried import find_buried, find_lenders
 from warpshadow.stages.own_shadows.sites import find_sites
 from warpshadow.stages.own_shadows.trace import LEAST_RAYS, trace_rows
+from warpshadow.stages.ray_packets import build_face_tree
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -25,7 +26,7 @@ def buried_of(points, faces, normals, sides, device) -> np.ndarray:
         wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device)
     )
     places, facing = np.tile(points, (len(sides), 1)), np.concatenate([side * normals for side in sides])
-    rows = trace_rows(mesh, places, facing, LEAST_RAYS)
+    rows = trace_rows(build_face_tree(points, faces, device), places, facing, LEAST_RAYS)
     return find_buried(mesh, places, facing, len(points), rows)
 
 
@@ -48,27 +49,23 @@ def test_a_dark_room_is_not_buried(device):
     assert not buried_of(room.positions, inward, -room.positions, (1,), device).any()
 
 
-@pytest.mark.parametrize("cuts", [1, 3])
-def test_buried_sites_borrow_from_the_nearest_beside_them(cuts):
-    positions = np.array([(0, 0, 0), (1, 0, 0), (0, 1.5, 0), (1.2, 1, 0.5)], np.float32)
-    sites = find_sites(positions, np.tile(np.float32([[0, 0, 1]]), (4, 1)), np.array([(0, 1, 2), (3, 2, 1)]), cuts)
-    count = len(sites.positions)
-    beside = {site: set() for site in range(count)}
-    for corners in sites.corners:  # sites of a lattice are beside each other where their steps are
-        lattice = [(i, j) for j in range(cuts + 1) for i in range(cuts + 1 - j)]
-        for site, (i, j) in zip(corners, lattice, strict=True):
-            for other, (k, m) in zip(corners, lattice, strict=True):
-                if (k - i, m - j) in {(1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)}:
-                    beside[site].add(other)
-    is_buried = np.random.default_rng(cuts).random(2 * count) < 0.6
-    is_buried[:count][sorted({0, *beside[0]})] = True  # one has none beside it
+def test_buried_sites_borrow_from_the_nearest_along_edges_over_many_rings():
+    count, step = 12, np.array([0.5, 0.02, 0])
+    rail = np.concatenate([np.arange(count)[:, None] * step, np.arange(count)[:, None] * step + [0, 0.1, 0]])
+    near, far = np.arange(count - 1), np.arange(count - 1) + count
+    faces = np.concatenate([np.stack([near, near + 1, far], 1), np.stack([far, near + 1, far + 1], 1)])
+    island = np.array([(9, 9, 9), (10, 9, 9), (9, 10, 9)])  # all of it is buried
+    points = np.concatenate([rail, island]).astype(np.float32)
+    sites = find_sites(points, np.tile(np.float32([[0, 0, 1]]), (len(points), 1)), [*faces, (24, 25, 26)])
+    is_buried = np.zeros(2 * len(points), bool)
+    is_buried[[*range(4), *range(count, count + 4), 24, 25, 26]] = True
+    is_buried[len(points) + 7] = True
     lenders = find_lenders(sites, is_buried)
-    for row, lender in enumerate(lenders):
-        first, site = row - row % count, row % count
-        able = [other for other in beside[site] if not is_buried[first + other]]
-        if not is_buried[row] or not able:
-            assert lender == row
-        else:
-            distances = {other: np.linalg.norm(sites.positions[site] - sites.positions[other]) for other in able}
-            assert lender - first in able
-            assert distances[lender - first] == min(distances.values())
+    expected = np.arange(2 * len(points))
+    expected[:4] = 4  # four rings away; not across to the other rail, which is longer
+    expected[count : count + 4] = 4 + count
+    expected[3 + count] = 4  # the diagonal is shorter than the edge
+    expected[len(points) + 7] = len(points) + 7 + count
+    np.testing.assert_array_equal(lenders[24:], expected[24:])
+    assert set(lenders[:4]) <= {4, 4 + count} and set(lenders[count : count + 4]) <= {4, 4 + count}
+    np.testing.assert_array_equal(lenders[4:count], expected[4:count])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.own_shadows.sites import Sites, SiteTable, cuts_of, find_sites
+import warpshadow as ws
+from warpshadow.stages.own_shadows.sites import Sites, SiteTable, find_sites, longest_edge
 from warpshadow.stages.rasterize import Fragments
 
 # Interpolated float32 positions of size 1.
@@ -20,8 +21,8 @@ FACES = np.array([(0, 1, 2), (3, 2, 1)])
 
 
 def table_of(sites: Sites, device, *, first_vertex=0, vertex_count=4, first_face=0, face_count=2) -> SiteTable:
-    corners = wp.array(sites.corners, dtype=wp.int32, device=device)
-    return SiteTable(first_vertex, vertex_count, first_face, face_count, len(sites.positions), corners, sites.cuts)
+    pieces = wp.array(sites.pieces, dtype=wp.vec4i, device=device)
+    return SiteTable(first_vertex, vertex_count, first_face, face_count, len(sites.positions), pieces)
 
 
 def seen_at(faces, barycentrics, device, requires_grad=False) -> Fragments:
@@ -31,17 +32,36 @@ def seen_at(faces, barycentrics, device, requires_grad=False) -> Fragments:
     )
 
 
-@pytest.mark.parametrize("cuts", [1, 2, 3, 5])
-def test_faces_share_the_sites_of_their_common_edge_and_vertices_come_first(cuts):
-    sites = find_sites(POSITIONS, NORMALS, FACES, cuts)
-    assert len(sites.positions) == (cuts + 1) ** 2
+@pytest.mark.parametrize(("longest", "least"), [(np.inf, 4), (0.7, 8), (0.12, 120)])
+def test_no_edge_is_long_and_faces_share_the_sites_of_their_common_edge(longest, least):
+    sites = find_sites(POSITIONS, NORMALS, FACES, longest)
     np.testing.assert_array_equal(sites.positions[:4], POSITIONS)
     np.testing.assert_allclose(np.linalg.norm(sites.normals, axis=1), 1, atol=FLOAT32)
+    assert least <= len(sites.positions) < 3 * least
+    ends, counts = np.unique(np.sort(sites.edges, axis=1), axis=0, return_counts=True)
+    assert np.linalg.norm(sites.positions[ends[:, 0]] - sites.positions[ends[:, 1]], axis=1).max() <= longest
+    # Euler: pieces that agree at all edges are a disc
+    assert len(sites.positions) - len(ends) + counts.sum() // 3 == 1
 
 
-@pytest.mark.parametrize("cuts", [1, 2, 3, 5])
-def test_sites_interpolate_positions_where_samples_see_a_face(device, cuts):
-    sites = find_sites(POSITIONS, NORMALS, FACES, cuts)
+def test_a_long_rail_is_cut_and_the_small_faces_beside_it_are_not():
+    ball, rail = ws.icosphere(1.0, 5), np.array([(2, 0, 0), (6, 0, 0), (2, 0.01, 0), (6, 0.01, 0)])
+    points = np.concatenate([ball.positions, rail]).astype(np.float32)
+    faces = np.concatenate([ball.faces, FACES + len(ball.positions)])
+    for samples_receive in (False, True):
+        longest = longest_edge(points, faces, samples_receive=samples_receive)
+        new = find_sites(points, np.tile(NORMALS[:1], (len(points), 1)), faces, longest).positions[len(points) :]
+        assert 20 < len(new) < 1000 and (new[:, 0] > 2).all()
+
+
+def test_where_sites_would_be_too_many_edges_stay_longer(monkeypatch):
+    monkeypatch.setattr("warpshadow.stages.own_shadows.sites._MOST_SITES", 60)
+    assert 30 < len(find_sites(POSITIONS, NORMALS, FACES, 0.05).positions) <= 60
+
+
+@pytest.mark.parametrize("longest", [np.inf, 0.7, 0.12])
+def test_sites_interpolate_positions_where_samples_see_a_face(device, longest):
+    sites = find_sites(POSITIONS, NORMALS, FACES, longest)
     rng = np.random.default_rng(0)
     faces = rng.integers(0, 2, 300)
     barycentrics = rng.dirichlet([1, 1, 1], 300).astype(np.float32)
@@ -55,20 +75,21 @@ def test_sites_interpolate_positions_where_samples_see_a_face(device, cuts):
 
 
 def test_vertices_and_backs_of_a_body_among_others_have_its_own_numbers(device):
-    sites = find_sites(POSITIONS, NORMALS, FACES, 2)
+    sites = find_sites(POSITIONS, NORMALS, FACES, 0.9)
+    site_count = len(sites.positions)
     table = table_of(sites, device, first_vertex=10, vertex_count=100, first_face=7, face_count=50)
     rows, weights = table.of_vertices(wp.array([10, 13, 112], dtype=wp.int32, device=device))
-    np.testing.assert_array_equal(rows.numpy()[0], [[0] * 3, [3] * 3, [9 + 2] * 3])
+    np.testing.assert_array_equal(rows.numpy()[0], [[0] * 3, [3] * 3, [site_count + 2] * 3])
     np.testing.assert_array_equal(weights.numpy()[0, :, 0], 1)
     front, back = table.of_samples(seen_at([7, 57, -1], [(0.2, 0.3, 0.5)] * 3, device)).rows.numpy()[0, :2]
-    np.testing.assert_array_equal(back, front + 9)
+    np.testing.assert_array_equal(back, front + site_count)
 
 
 def test_gradients_to_barycentrics_are_central_differences(device, verified_tape):
-    table = table_of(find_sites(POSITIONS, NORMALS, FACES, 3), device)
+    table = table_of(find_sites(POSITIONS, NORMALS, FACES, 0.4), device)
     rng = np.random.default_rng(1)
     faces, barycentrics = rng.integers(0, 2, 50), rng.dirichlet([1, 1, 1], 50)
-    values = rng.normal(size=16)  # of each site
+    values = rng.normal(size=100)  # of each site
     seen = seen_at(faces, barycentrics, device, requires_grad=True)
     with wp.Tape() as tape:
         places = table.of_samples(seen)
@@ -83,8 +104,3 @@ def test_gradients_to_barycentrics_are_central_differences(device, verified_tape
     products = (seen.barycentrics.grad.numpy()[0] * step).sum(axis=1)
     same_piece = np.abs(products - (ends[0] - ends[1]) / 2) < GRADIENT * np.abs(step).max() * 50
     assert same_piece.mean() > 0.95  # the others cross from one small face to the next
-
-
-@pytest.mark.parametrize(("faces", "cuts"), [(1, 100), (968, 4), (10_000, 1), (12_200, 1)])
-def test_coarse_meshes_are_cut(faces, cuts):
-    assert cuts_of(faces) == cuts

@@ -2,18 +2,20 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.own_shadows import trace
 from warpshadow.stages.own_shadows.trace import LEAST_RAYS, MOST_MEMORY, RAYS, RUN, ray_count, trace_rows
+from warpshadow.stages.ray_packets import build_face_tree
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 COUNT = 1024
 # Of so many rays some pass so near to an edge that float32 and float64 differ.
 NEAR_EDGES = 2e-3
+# Of rays below the horizon, some pass an edge on another side than the ray does that is nearest to the mirrored one.
+NEAREST = 0.03
 
 
 def corner() -> tuple[np.ndarray, np.ndarray]:
@@ -46,14 +48,11 @@ def bits_of(rows: trace.OwnRows) -> np.ndarray:
 
 def traced(device, progress=False):
     points, faces = corner()
-    mesh = wp.Mesh(
-        wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device)
-    )
     sites = points[faces].mean(axis=1)
     edges = points[faces[:, 1:]] - points[faces[:, :1]]
     normals = np.cross(edges[:, 0], edges[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return sites, normals, trace_rows(mesh, sites, normals, COUNT, progress=progress)
+    return sites, normals, trace_rows(build_face_tree(points, faces, device), sites, normals, COUNT, progress=progress)
 
 
 def test_bits_are_what_rays_meet_also_mirrored_ones(device):
@@ -66,8 +65,10 @@ def test_bits_are_what_rays_meet_also_mirrored_ones(device):
     for site, normal, bits in zip(sites, normals, bits_of(rows), strict=True):
         cosines = directions @ normal
         is_kept = cosines > -lowest
-        expected = twin(points, faces, site.astype(np.float64), normal.astype(np.float64), directions)
-        assert (bits != (expected & is_kept)).mean() < NEAR_EDGES
+        expected = twin(points, faces, site.astype(np.float64), normal.astype(np.float64), directions) & is_kept
+        is_mirrored = cosines <= -np.sin(2 * cell_radius(COUNT))
+        assert (bits != expected)[~is_mirrored].mean() < NEAR_EDGES
+        assert (bits != expected)[is_mirrored].mean() < NEAREST
         blocked += (~expected & (cosines > 0)).sum()
         below = is_kept & (cosines < 0)
         assert below.any() and bits[below].any()
@@ -87,11 +88,8 @@ def test_cells_are_means_of_their_bits_weighted_with_cosines(device):
 
 def test_a_convex_body_blocks_none_of_its_own_light(device):
     mesh = ws.icosphere(1.0, 2)
-    whole = wp.Mesh(
-        wp.array(mesh.positions, dtype=wp.vec3, device=device),
-        wp.array(mesh.faces.ravel(), dtype=wp.int32, device=device),
-    )
-    rows = trace_rows(whole, mesh.positions, mesh.positions, COUNT)
+    tree = build_face_tree(mesh.positions, mesh.faces, device)
+    rows = trace_rows(tree, mesh.positions, mesh.positions, COUNT)
     cosines = mesh.positions @ fibonacci(COUNT).T
     assert bits_of(rows)[cosines > 1e-3].all()
 

@@ -1,7 +1,7 @@
 """Buried sites: points of a body that lie inside another part of it, as the root of a handle does in a cup.
 
 They are dark, but faces lead from them to where light is, and would darken it. So a buried site sees what the nearest
-site beside it sees that is not buried, as texels of light maps do.
+site sees that is not buried, along edges, as texels of light maps do.
 """
 
 import numpy as np
@@ -72,22 +72,27 @@ def find_buried(mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, site_cou
 
 
 def find_lenders(sites: Sites, is_buried: np.ndarray) -> np.ndarray:
-    """Find of which row each row has what it sees: of its own, or of the nearest beside it if it is buried.
+    """Find of which row each row has what it sees: of its own, or of the nearest along edges if it is buried.
 
     Args:
         sites: The sites.
         is_buried: Bool of shape [row]: the sites, and their backs if they have any.
 
     Returns:
-        Numbers of rows, int of shape [row]. A buried row with none beside it keeps its own.
+        Numbers of rows, int of shape [row]. A buried row from which no way leads to another kind keeps its own.
     """
-    lenders = np.arange(len(is_buried))
-    site_count = len(sites.positions)
-    pairs = np.concatenate([sites.edges, sites.edges[:, ::-1]])
-    lengths = np.linalg.norm(sites.positions[pairs[:, 0]] - sites.positions[pairs[:, 1]], axis=1)
-    pairs = pairs[np.argsort(-lengths, kind="stable")]  # of several, the last is assigned
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    lenders, site_count = np.arange(len(is_buried)), len(sites.positions)
+    ends = np.unique(np.sort(sites.edges, axis=1), axis=0)
+    lengths = np.linalg.norm(sites.positions[ends[:, 0]] - sites.positions[ends[:, 1]], axis=1)
+    graph = csr_matrix((np.maximum(lengths, 1e-12), ends.T), (site_count, site_count))  # 0 is no edge
     for first in range(0, len(is_buried), site_count):
-        buried, lender = (pairs + first).T
-        lends = is_buried[buried] & ~is_buried[lender]
-        lenders[buried[lends]] = lender[lends]
+        buried = is_buried[first : first + site_count]
+        if buried.any() and not buried.all():
+            open_sites = np.flatnonzero(~buried)
+            *_, nearest_open = dijkstra(graph, False, open_sites, return_predecessors=True, min_only=True)
+            lends = buried & (nearest_open >= 0)
+            lenders[first : first + site_count][lends] = first + nearest_open[lends]
     return lenders

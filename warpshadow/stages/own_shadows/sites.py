@@ -1,8 +1,10 @@
 """Sites: the points of a body where its visibility of itself is known, and where receivers lie among them.
 
-Sites are the body's vertices. Where faces are few and large, each is also cut evenly into n² small ones, and their
-corners are sites, too: what a sample sees is interpolated between the three nearest. The first sites are the vertices;
-then come those on edges, then those inside faces. The backs of all sites of an open body follow.
+Sites are the body's vertices and, where edges are long, points between them: light changes along a rail that has no
+vertex between its ends. Faces are cut at the middle of their longest edge, and so are their pieces, until no edge is
+longer than is wanted (Rivara 1984). An edge is cut by its length alone, so faces beside it agree. What a sample sees is
+interpolated between the corners of its piece. The first sites are the vertices; the backs of all sites of an open body
+follow.
 """
 
 from typing import NamedTuple
@@ -10,12 +12,27 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import differentiable, launch
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.sides import split_side
 
-SMALL_FACES = 10_000
+_SMALL_FACES = 10_000
 """Faces that a body is cut into at least, so that what lies between sites is seen: 507 vertices alone lose 3.5%."""
+
+_LONG = 1.2
+"""Longest edge where samples receive, in edges of a body that is cut evenly into so many faces."""
+
+_LONG_BETWEEN_VERTICES = 4.0
+"""The same where only vertices receive: sites between them are there for vertices that are buried …"""
+
+_SLENDER = 3.0
+"""… and only on edges that are longer than a third of all edges by such a factor: those of slivers."""
+
+_MOST_SITES = 2**14
+"""Sites of a body at most, as long as it has fewer than half as many vertices."""
+
+_FEWER = 1.3
+"""How much longer edges may be at each try to have fewer sites."""
 
 
 class Places(NamedTuple):
@@ -35,67 +52,86 @@ class Sites(NamedTuple):
     Args:
         positions: Shape [site, 3], float32.
         normals: Unit normals [site, 3], float32.
-        corners: Site of each point of the lattice of a face, int32 of shape [face, (n + 1)(n + 2) / 2]: point (i, j),
-            i steps of n towards its second corner and j towards its third, is number j (n + 1) − j (j − 1) / 2 + i.
-        cuts: n.
+        pieces: Faces, and then the pieces that they are cut into, int32 of shape [piece, 4]: three sites and a link,
+            −1 for a piece that is whole. Otherwise the link is 3 p + k: the edge across from corner k is cut, and its
+            middle takes the place of corner k + 2 in piece p, and of corner k + 1 in piece p + 1, modulo 3.
     """
 
     positions: np.ndarray
     normals: np.ndarray
-    corners: np.ndarray
-    cuts: int
+    pieces: np.ndarray
 
     @property
     def edges(self) -> np.ndarray:
         """Pairs of sites that are next to each other on a face, int of shape [pair, 2]; some stand there twice."""
-        steps = [(i, j) for j in range(self.cuts) for i in range(self.cuts - j)]
-        near, along_u, along_v = (
-            self.corners[:, [_point_number(i + di, j + dj, self.cuts) for i, j in steps]].ravel()
-            for di, dj in ((0, 0), (1, 0), (0, 1))
-        )
-        return np.concatenate(
-            [np.stack(pair, axis=1) for pair in ((near, along_u), (along_u, along_v), (along_v, near))]
-        )
+        whole = self.pieces[self.pieces[:, 3] < 0]
+        return np.concatenate([whole[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
-def cuts_of(face_count: int) -> int:
-    """Pieces n that edges are cut into, so that faces make up at least :data:`SMALL_FACES`."""
-    return int(np.ceil(np.sqrt(SMALL_FACES / face_count)))
+def longest_edge(positions: np.ndarray, faces: np.ndarray, *, samples_receive: bool) -> float:
+    """Longest edge that a body's pieces should have, where samples or only vertices of it are receivers."""
+    corners = np.asarray(positions, np.float64)[faces]
+    sides = corners - np.roll(corners, 1, axis=1)
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
+    even = np.sqrt(4 / np.sqrt(3) * area / _SMALL_FACES)
+    if samples_receive:
+        return float(_LONG * even)
+    return float(max(_LONG_BETWEEN_VERTICES * even, _SLENDER * np.quantile(np.linalg.norm(sides, axis=2), 1 / 3)))
 
 
-def find_sites(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray, cuts: int = 1) -> Sites:
+def find_sites(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray, longest: float = np.inf) -> Sites:
     """Find the sites of a mesh.
 
     Args:
         positions: Vertices [vertex, 3].
         normals: Their unit normals [vertex, 3]; between them normals are interpolated.
         faces: Indices of vertices [face, 3].
-        cuts: Pieces n that each edge is cut into; 1 for the vertices alone.
+        longest: Length beyond which edges are cut; it is raised where sites would be too many.
     """
-    lattice = np.array([(cuts - i - j, i, j) for j in range(cuts + 1) for i in range(cuts + 1 - j)])
-    faces = np.asarray(faces, np.int64)
-    # a point is told by its vertices, in order, and what each weighs; shared ones are so found on both faces
-    shape = len(faces), *lattice.shape
-    own_weights = np.broadcast_to(lattice, shape)
-    own_vertices = np.where(own_weights > 0, faces[:, None], -1)
-    order = np.argsort(own_vertices, axis=2)
-    own_vertices, own_weights = (np.take_along_axis(values, order, axis=2) for values in (own_vertices, own_weights))
-    corner_count = (own_weights > 0).sum(axis=2)
-    keys = np.concatenate([corner_count[..., None], own_vertices, own_weights], axis=2).reshape(-1, 7)
-    is_inner = corner_count.ravel() > 1
-    unique, numbers = np.unique(keys[is_inner], axis=0, return_inverse=True)
-    corners = np.empty(len(keys), np.int32)
-    corners[~is_inner] = keys[~is_inner, 1:4].max(axis=1)
-    corners[is_inner] = len(positions) + numbers.ravel()
-    vertices, weights = np.maximum(unique[:, 1:4], 0), unique[:, 4:, None] / cuts
-    found = [(values[vertices] * weights).sum(axis=1) for values in (positions, normals)]
-    lengths = np.linalg.norm(found[1], axis=1, keepdims=True)
-    found[1] = found[1] / np.maximum(lengths, 1e-30)
-    points, directions = (
-        np.concatenate([values, new]).astype(np.float32)
-        for values, new in zip((positions, normals), found, strict=True)
-    )
-    return Sites(points, directions, corners.reshape(len(faces), -1), cuts)
+    most = max(_MOST_SITES, 2 * len(positions))
+    while (found := _cut(positions, normals, faces, longest, most)) is None:
+        longest *= _FEWER
+    points, directions, pieces = found
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
+    directions[: len(normals)] = normals
+    return Sites(points.astype(np.float32), directions.astype(np.float32), pieces.astype(np.int32))
+
+
+def _cut(
+    positions: np.ndarray, normals: np.ndarray, faces: np.ndarray, longest: float, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Points, their normals of any length, and pieces; None for more than ``most`` points."""
+    points, directions = (np.asarray(values, np.float64) for values in (positions, normals))
+    pieces = np.concatenate([faces, np.full((len(faces), 1), -1)], axis=1).astype(np.int64)
+    whole, known, middles = np.arange(len(faces)), np.empty(0, np.int64), np.empty(0, np.int64)
+    while True:
+        corners = pieces[whole, :3]
+        ends = np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2)  # of the edge across
+        lengths = np.linalg.norm(points[ends[..., 0]] - points[ends[..., 1]], axis=2)
+        is_long = lengths.max(axis=1, initial=0) > longest
+        whole, across = whole[is_long], np.argmax(lengths[is_long], axis=1)
+        if not len(whole):
+            return points, directions, pieces
+        number = np.arange(len(whole))
+        ends = np.sort(ends[is_long][number, across], axis=1)
+        keys, edge = np.unique(ends[:, 0] << 32 | ends[:, 1], return_inverse=True)
+        new = np.setdiff1d(keys, known, assume_unique=True)
+        first, second = new >> 32, new & 0xFFFFFFFF
+        middles = np.concatenate([middles, len(points) + np.arange(len(new))])
+        points, directions = (
+            np.concatenate([values, (values[first] + values[second]) / 2]) for values in (points, directions)
+        )
+        if len(points) > most:
+            return None
+        known = np.concatenate([known, new])
+        order = np.argsort(known)
+        known, middles = known[order], middles[order]
+        middle = middles[np.searchsorted(known, keys)][edge.ravel()]
+        parts = np.repeat(pieces[whole], 2, axis=0)
+        parts[2 * number, (across + 2) % 3] = parts[2 * number + 1, (across + 1) % 3] = middle
+        pieces[whole, 3] = 3 * (len(pieces) + 2 * number) + across
+        whole = len(pieces) + np.arange(len(parts))
+        pieces = np.concatenate([pieces, parts])
 
 
 @wp.kernel(enable_backward=False)
@@ -118,12 +154,31 @@ def _place_vertices(
 
 
 @wp.func
-def _point_number(i: int, j: int, cuts: int):
-    """Number of a point of a face's lattice."""
-    return j * (cuts + 1) - j * (j - 1) // 2 + i
+def _find_piece(pieces: wp.array(dtype=wp.vec4i), face: int, barycentrics: wp.vec3):
+    """The corners of the piece of a face that a point is on, and the matrix from its barycentrics to those on it."""
+    piece = pieces[face]
+    weights = barycentrics
+    matrix = wp.identity(n=3, dtype=wp.float32)
+    while piece[3] >= 0:
+        across = piece[3] % 3
+        nearer = (across + 1) % 3
+        farther = (across + 2) % 3
+        number = piece[3] // 3
+        if weights[nearer] < weights[farther]:
+            swapped = nearer
+            nearer = farther
+            farther = swapped
+            number += 1
+        weights[nearer] = weights[nearer] - weights[farther]
+        weights[farther] = 2.0 * weights[farther]
+        for k in range(3):
+            matrix[nearer, k] = matrix[nearer, k] - matrix[farther, k]
+            matrix[farther, k] = 2.0 * matrix[farther, k]
+        piece = pieces[number]
+    return wp.vec3i(piece[0], piece[1], piece[2]), weights, matrix
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _place_samples(
     # in
     sides: wp.array2d(dtype=wp.int32),
@@ -131,40 +186,38 @@ def _place_samples(
     face_count: int,
     first_face: int,
     site_count: int,
-    corners: wp.array2d(dtype=wp.int32),
-    cuts: int,
+    pieces: wp.array(dtype=wp.vec4i),
     # out
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver at a sample's point; −1 for none."""
     batch, receiver = wp.tid()
-    side = sides[batch, receiver]
-    face, is_back = split_side(wp.max(side, first_face), face_count)
-    face -= first_face
-    b = barycentrics[batch, receiver]
-    u = wp.clamp(float(cuts) * b[1], 0.0, float(cuts))
-    v = wp.clamp(float(cuts) * b[2], 0.0, float(cuts))
-    i = wp.min(int(u), cuts - 1)
-    j = wp.min(int(v), cuts - 1 - i)
-    u -= float(i)
-    v -= float(j)
-    # of the two small faces between four points, the far one has the far corner in place of the near one
-    near = _point_number(i, j, cuts)
-    along_u = _point_number(i + 1, j, cuts)
-    along_v = _point_number(i, j + 1, cuts)
-    w = wp.vec3(1.0 - u - v, u, v)
-    if u + v > 1.0 and i + j < cuts - 1:
-        near = _point_number(i + 1, j + 1, cuts)
-        swapped = along_u
-        along_u = along_v
-        along_v = swapped
-        w = wp.vec3(u + v - 1.0, 1.0 - u, 1.0 - v)
+    face, is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
+    corners, found, _matrix = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
     shift = wp.where(is_back, site_count, 0)
-    rows[batch, receiver] = wp.vec3i(
-        corners[face, near] + shift, corners[face, along_u] + shift, corners[face, along_v] + shift
-    )
-    weights[batch, receiver] = w
+    rows[batch, receiver] = corners + wp.vec3i(shift, shift, shift)
+    weights[batch, receiver] = found
+
+
+@wp.kernel(enable_backward=False)
+def _place_samples_adjoint(
+    # in
+    sides: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    face_count: int,
+    first_face: int,
+    pieces: wp.array(dtype=wp.vec4i),
+    adj_weights: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_barycentrics: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver: its weights are M b on a piece, so  b̄ += Mᵀ w̄."""
+    batch, receiver = wp.tid()
+    face, _is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
+    _corners, _found, matrix = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
+    adj = wp.transpose(matrix) * adj_weights[batch, receiver]
+    adj_barycentrics[batch, receiver] = adj_barycentrics[batch, receiver] + adj
 
 
 class SiteTable(NamedTuple):
@@ -174,7 +227,7 @@ class SiteTable(NamedTuple):
         first_vertex, vertex_count: Of the body's vertices among all, and how many all are.
         first_face, face_count: Likewise of its faces.
         site_count: Number of its sites; their backs follow.
-        corners, cuts: As in :class:`Sites`.
+        pieces: As in :class:`Sites`, vec4i.
     """
 
     first_vertex: int
@@ -182,8 +235,7 @@ class SiteTable(NamedTuple):
     first_face: int
     face_count: int
     site_count: int
-    corners: wp.array
-    cuts: int
+    pieces: wp.array
 
     def of_vertices(self, vertices: wp.array) -> Places:
         """Places of vertices and their backs, int32 of shape [receiver], numbered among all: batch 1."""
@@ -196,9 +248,17 @@ class SiteTable(NamedTuple):
         """Places of what samples see: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
         batch_count, count = seen.face_ids.shape
         places = _empty_places(batch_count, count, seen.face_ids.device)
-        counts = [self.face_count, self.first_face, self.site_count]
-        inputs = [seen.face_ids, seen.barycentrics, *counts, self.corners, self.cuts]
-        launch(_place_samples, places.rows.shape, inputs=inputs, outputs=list(places))
+        inputs = [seen.face_ids, seen.barycentrics, self.face_count, self.first_face]
+
+        def place(weights: wp.array) -> None:
+            outputs = [places.rows, weights]
+            launch(_place_samples, weights.shape, inputs=[*inputs, self.site_count, self.pieces], outputs=outputs)
+
+        def adjoint(adj: wp.array) -> None:
+            outputs = [seen.barycentrics.grad]
+            launch(_place_samples_adjoint, adj.shape, inputs=[*inputs, self.pieces, adj], outputs=outputs)
+
+        differentiable(place, adjoint, result=places.weights, variables=[seen.barycentrics])
         return places
 
 

@@ -1,12 +1,8 @@
 """A body's visibility of itself, traced once in its own frame: a bit for each ray, and means over compact cells.
 
 Rays leave in D Fibonacci directions. Each run of 8 of them is a coarse cell, which keeps the share of its rays that
-escape, weighted with their cosines. A ray below the horizon of its site takes the fate of the ray mirrored at the
-tangent plane: so a cell at the horizon, half of which is below, is as open as its upper half.
-
-Of each bundle of 4 rays, the one in the middle is traced first, the probe. The others are traced if the 9 probes in and
-around the bundle differ; else they take their fate. Two fifths of the rays so find the edges of shadows: of a bunny
-0.03% of the bits differ. Rods less than 3° wide, which pass between probes, lose a few percent of their shadows.
+escape, weighted with their cosines. A ray below the horizon of its site takes the fate of the ray that is nearest to it
+mirrored at the tangent plane: so a cell at the horizon, half of which is below, is as open as its upper half.
 
 A site takes D/8 bytes of bits and D/8 bytes of cells, 1 kB with 4096 rays; its back takes as much. Of a body whose
 sites would so take more than :data:`MOST_MEMORY`, fewer rays are traced.
@@ -18,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
-from warpshadow.maths.directions import BUNDLE, cell_radius, fibonacci
-from warpshadow.stages.ray_tracing import RAY_COST, find_blocker, is_met, parts
+from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
+from warpshadow.stages.ray_tracing import parts
 
 RAYS = 4096
 """Rays of a site, if memory allows."""
@@ -37,8 +35,14 @@ MOST_MEMORY = 2**28
 _MIRRORED = 3.5
 """Angle below the horizon to which rays are mirrored, in radii of a coarse cell: no lookup reaches farther."""
 
-_PROBES = 9
-"""Probes that must agree: a bundle's own and those next to it."""
+_LEVEL = 2.0
+"""Angle below the horizon, in radii of a ray's cell, to which mirrored rays are traced: none above may be near."""
+
+_GRID = 128
+"""Rows of the map of directions, each 1.4° high, that has the nearest ray."""
+
+_RAY_COST = 30.0
+"""Nanoseconds that a ray takes."""
 
 
 class OwnRows(NamedTuple):
@@ -71,85 +75,82 @@ def ray_count(row_count: int) -> int:
     return count
 
 
-class _Pass(NamedTuple):
-    """Bundles of rays that are traced unless probes agree.
-
-    Args:
-        members: Rays of each bundle, first its probe if that is known: int32 of shape [bundle, 4].
-        probes: Those that must agree, int32 of shape [bundle, 9]; none in the first pass.
-        known: Members whose fate is known before.
-    """
-
-    members: np.ndarray
-    probes: np.ndarray
-    known: int
-
-
-@functools.cache
-def _passes(count: int) -> tuple[_Pass, _Pass]:
-    """Find the probes, and then what is between them."""
-    directions, members = fibonacci(count), np.arange(count).reshape(-1, BUNDLE)
-    cosines = np.einsum("bmx,bx->bm", directions[members], directions[members].sum(axis=1))
-    members = np.take_along_axis(members, np.argsort(-cosines, axis=1), axis=1)
-    probes = members[:, 0]
-    nearest = np.argpartition(-directions[probes] @ directions[probes].T, _PROBES - 1, axis=1)[:, :_PROBES]
-    first = probes.reshape(-1, BUNDLE)
-    return _Pass(first, np.empty((len(first), 0), int), 0), _Pass(members, probes[nearest], 1)
-
-
 @wp.func
 def _bit(bits: wp.array2d(dtype=wp.uint32), row: int, ray: int):
     """Whether a ray escapes, 1 or 0."""
     return int((bits[row, ray // 32] >> wp.uint32(ray % 32)) & wp.uint32(1))
 
 
-@wp.kernel(enable_backward=False)
-def _trace_pass(
-    first_row: int,
-    worker: int,
-    # in
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    lowest: float,
-    members: wp.array2d(dtype=wp.int32),
-    probes: wp.array2d(dtype=wp.int32),
-    known: int,
-    # out
-    bits: wp.array2d(dtype=wp.uint32),
-):
-    """A thread owns a row, whose bits are zero before the first pass."""
-    row = first_row + wp.tid()
-    point = points[row]
-    normal = normals[row]
-    last = int(-1)
-    for bundle in range(members.shape[0]):
-        count = int(0)
-        open_count = int(0)
-        for k in range(probes.shape[1]):
-            probe = probes[bundle, k]
-            if wp.dot(normal, directions[probe]) > -lowest:
-                count += 1
-                open_count += _bit(bits, row, probe)
-        is_open = count > 0 and open_count == count
-        is_blocked = count > 0 and open_count == 0
-        if not is_blocked:
-            for k in range(known, members.shape[1]):
-                ray = members[bundle, k]
-                toward = directions[ray]
-                cosine = wp.dot(normal, toward)
-                if cosine > -lowest:
-                    blocker = int(-1)
-                    if not is_open:
-                        up = toward - 2.0 * wp.min(cosine, 0.0) * normal
-                        blocker = last  # the likeliest
-                        if last < 0 or not is_met(mesh, last, point, normal, up):
-                            blocker = find_blocker(mesh, point, normal, up)
-                    if blocker < 0:
-                        bits[row, ray // 32] = bits[row, ray // 32] | (wp.uint32(1) << wp.uint32(ray % 32))
-                    else:
-                        last = blocker
+@functools.cache
+def _nearest_rays(count: int) -> np.ndarray:
+    """The ray that is nearest to each direction of a map, int32 of shape [row, column]: by polar angle and azimuth."""
+    from scipy.spatial import KDTree
+
+    angles = np.pi / _GRID * (np.arange(2 * _GRID) + 0.5)
+    polar, azimuth = np.broadcast_arrays(angles[:_GRID, None], angles - np.pi)
+    radius = np.sin(polar)
+    towards = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.cos(polar)], axis=2)
+    return KDTree(fibonacci(count)).query(towards)[1].astype(np.int32)
+
+
+@functools.cache
+def _make_trace() -> wp.Kernel:
+    Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
+    find_open, along, is_any_above = make_find_open(), fn.along, fn.is_any_above
+
+    @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+    def trace_row(
+        first_row: int,
+        worker: int,
+        # in
+        tree: FaceTree,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        directions: wp.array2d(dtype=Lane),
+        lowest: float,
+        level: float,
+        nearest: wp.array2d(dtype=wp.int32),
+        # out
+        bits: wp.array2d(dtype=wp.uint32),
+    ):
+        """A thread owns a row, whose bits are zero before."""
+        row = first_row + wp.tid()
+        normal = normals[row]
+        last = int(-1)
+        for packet in range(directions.shape[0]):
+            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = along(normal, toward)
+            if is_any_above(cosine, -level):
+                wanted = int(0)
+                for lane in range(PACKET):
+                    if cosine[lane] > -level:
+                        wanted = wanted | (1 << lane)
+                    cosine[lane] = 2.0 * wp.min(cosine[lane], 0.0)
+                toward.x -= normal[0] * cosine
+                toward.y -= normal[1] * cosine
+                toward.z -= normal[2] * cosine
+                at = points[row]
+                found = find_open(
+                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, at, normal, toward, wanted, last
+                )
+                last = found[1]
+                word = PACKET * packet // 32
+                bits[row, word] = bits[row, word] | (wp.uint32(found[0]) << wp.uint32(PACKET * packet % 32))
+        for packet in range(directions.shape[0]):
+            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = along(normal, toward)
+            if is_any_above(cosine, -lowest):
+                for lane in range(PACKET):
+                    if cosine[lane] > -lowest and cosine[lane] <= -level:
+                        up = wp.vec3(toward.x[lane], toward.y[lane], toward.z[lane]) - 2.0 * cosine[lane] * normal
+                        size = float(nearest.shape[0]) / wp.pi
+                        i = wp.min(int(size * wp.acos(wp.clamp(up[2], -1.0, 1.0))), nearest.shape[0] - 1)
+                        j = wp.clamp(int(size * (wp.atan2(up[1], up[0]) + wp.pi)), 0, nearest.shape[1] - 1)
+                        ray = PACKET * packet + lane
+                        is_open = wp.uint32(_bit(bits, row, nearest[i, j]))
+                        bits[row, ray // 32] = bits[row, ray // 32] | (is_open << wp.uint32(ray % 32))
+
+    return trace_row
 
 
 @wp.kernel(enable_backward=False)
@@ -178,12 +179,12 @@ def _average(
 
 
 def trace_rows(
-    mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, count: int = RAYS, *, progress: bool = False
+    tree: FaceTree, points: np.ndarray, normals: np.ndarray, count: int = RAYS, *, progress: bool = False
 ) -> OwnRows:
     """Trace what points on a mesh see past it.
 
     Args:
-        mesh: The mesh, in the frame of the points.
+        tree: The mesh, in the frame of the points.
         points: Sites, [row, 3].
         normals: Unit normals [row, 3].
         count: Rays of a site, from :func:`ray_count`.
@@ -191,21 +192,21 @@ def trace_rows(
 
     Differentiable: no.
     """
-    device, row_count = mesh.points.device, len(points)
+    device, row_count = tree.corners.device, len(points)
     places, facing = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals))
     directions = wp.array(fibonacci(count), dtype=wp.vec3, device=device)
-    passes = [
-        (*(wp.array(rays, dtype=wp.int32, device=device) for rays in (step.members, step.probes)), step.known)
-        for step in _passes(count)
-    ]
+    lanes = fibonacci(count).reshape(-1, PACKET, 3).swapaxes(1, 2)
+    packets = wp.array(lanes, dtype=lane_type(PACKET), device=device)
     rows = OwnRows(
         wp.zeros((row_count, count // 32), dtype=wp.uint32, device=device),
         wp.empty((row_count, count // RUN), dtype=wp.uint8, device=device),
     )
     lowest = float(np.sin(min(_MIRRORED * cell_radius(count // RUN), np.pi / 2)))
-    for part in parts(row_count, 2**21 // count, progress, "tracing own shadows"):
-        at, cost = (places[part], facing[part], directions, lowest), RAY_COST * count / 8
-        for step in passes:
-            launch(_trace_pass, len(at[0]), inputs=[mesh.id, *at, *step], outputs=[rows.bits[part]], cost=cost)
+    level = float(np.sin(min(_LEVEL * cell_radius(count), np.pi / 2)))
+    nearest = wp.array(_nearest_rays(count), dtype=wp.int32, device=device)
+    for part in parts(row_count, 2**22 // count, progress, "tracing own shadows"):
+        inputs = [tree, places[part], facing[part], packets, lowest, level, nearest]
+        size = part.stop - part.start
+        launch(_make_trace(), size, inputs=inputs, outputs=[rows.bits[part]], cost=_RAY_COST * count)
     launch(_average, rows.cells.shape, inputs=[facing, directions, lowest, rows.bits], outputs=[rows.cells])
     return rows

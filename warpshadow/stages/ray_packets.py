@@ -1,0 +1,219 @@
+"""Packets: sixteen rays from one receiver, that go through a hierarchy of a mesh's faces together.
+
+A thread visits a box, or a face, once for all rays of a packet, each of which has a lane
+(:mod:`warpshadow.device.lanes`). As all start at one point, a face is the same three planes for each: a lane takes
+three dot products. What they meet is what single rays meet (:mod:`.ray_tracing`). On a bunny of 12 200 faces 16 of 4096
+even directions take 2.5 µs; they visit 66 boxes and 24 faces.
+
+The hierarchy is a complete binary tree of boxes, numbered as a heap: box i is that of boxes 2i and 2i + 1, and box 1 of
+all. It splits faces at the median along the longest extent of their middles.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.lanes import vectors_type
+from warpshadow.maths.directions import CHUNK
+
+PACKET = CHUNK
+"""Rays of a packet."""
+
+_LEAF = 4
+"""Faces of a leaf at most."""
+
+_ROUNDING, _UPRIGHT, _RAISE = 2.0**-21, 1.0e-3, 1.0e-4
+
+_SLACK = 2.0**-20
+"""How far boxes reach beyond their faces, as a part of the largest coordinate: points lie on faces to rounding."""
+
+
+@wp.struct
+class FaceTree:
+    """A mesh's faces and the boxes around them."""
+
+    corners: wp.array2d(dtype=wp.vec3)  # [face, 3], by leaves
+    lowers: wp.array(dtype=wp.vec3)  # [box]; box 0 is none
+    uppers: wp.array(dtype=wp.vec3)  # [box]
+    leaf_count: int
+
+
+def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceLike = None) -> FaceTree:
+    """Build the hierarchy of a mesh.
+
+    Args:
+        positions: Vertices [vertex, 3].
+        faces: Indices of vertices [face, 3].
+        device: Where rays are traced.
+    """
+    corners = np.asarray(positions, np.float32)[np.asarray(faces)]
+    face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)
+    middles, order = (corners.min(axis=1) + corners.max(axis=1)) / 2, np.arange(face_count)
+    for level in range(depth):
+        bounds = _bounds(face_count, level)
+        node = np.repeat(np.arange(1 << level), np.diff(bounds))
+        low, high = (ends.reduceat(middles[order], bounds[:-1]) for ends in (np.minimum, np.maximum))
+        along = np.argmax(high - low, axis=1)[node]
+        order = order[np.lexsort((middles[order, along], node))]
+    corners, leaf_count = corners[order], 1 << depth
+    lowers, uppers = np.zeros((2, 2 * leaf_count, 3), np.float32)
+    if face_count:
+        starts = _bounds(face_count, depth)[:-1]
+        slack = np.float32(_SLACK * np.abs(corners).max())
+        lowers[leaf_count:] = np.minimum.reduceat(corners.min(axis=1), starts) - slack
+        uppers[leaf_count:] = np.maximum.reduceat(corners.max(axis=1), starts) + slack
+    for level in reversed(range(depth)):
+        box, below = slice(1 << level, 2 << level), slice(2 << level, 4 << level)
+        lowers[box] = lowers[below].reshape(-1, 2, 3).min(axis=1)
+        uppers[box] = uppers[below].reshape(-1, 2, 3).max(axis=1)
+    tree = FaceTree()
+    tree.corners, tree.lowers, tree.uppers = (
+        wp.array(values, dtype=wp.vec3, device=device) for values in (corners.reshape(-1, 3, 3), lowers, uppers)
+    )
+    tree.leaf_count = leaf_count
+    return tree
+
+
+def _bounds(count: int, level: int) -> np.ndarray:
+    """Where the boxes of a level have their first faces, and the end of the last: each has as many, but for one."""
+    return np.arange((1 << level) + 1) * count >> level
+
+
+@functools.cache
+def make_find_open() -> wp.Function:
+    """Make the kernel function that sends a packet through a tree."""
+    Vectors = vectors_type(PACKET)
+
+    # In plain Warp, which copies lanes at every call, it takes eight times as long.
+    # A face that the receiver lies on is moved down as seen_from has it.
+    @wp.func_native(f"""
+    const int face_count = corners.shape[0];
+    float x[{PACKET}], y[{PACKET}], z[{PACKET}], a[{PACKET}], b[{PACKET}], c[{PACKET}], open[{PACKET}];
+    for (int lane = 0; lane < {PACKET}; ++lane) {{
+        x[lane] = toward.x.c[lane];
+        y[lane] = toward.y.c[lane];
+        z[lane] = toward.z.c[lane];
+        a[lane] = 1.0f / (x[lane] == 0.0f ? 1.0e-20f : x[lane]);
+        b[lane] = 1.0f / (y[lane] == 0.0f ? 1.0e-20f : y[lane]);
+        c[lane] = 1.0f / (z[lane] == 0.0f ? 1.0e-20f : z[lane]);
+        open[lane] = (wanted >> lane) & 1 ? 1.0f : 0.0f;
+    }}
+    bool is_left = wanted != 0;
+    auto meet = [&](int face) {{
+        const wp::vec3 *corner = &wp::index(corners, face, 0);
+        const float top = wp::max(wp::dot(normal, corner[0] - point),
+                                  wp::max(wp::dot(normal, corner[1] - point), wp::dot(normal, corner[2] - point)));
+        if (top <= 0.0f)
+            return;
+        wp::vec3d p, q, r;
+        for (int k = 0; k < 3; ++k) {{
+            p[k] = (double)(corner[0][k]) - point[k];
+            q[k] = (double)(corner[1][k]) - point[k];
+            r[k] = (double)(corner[2][k]) - point[k];
+        }}
+        wp::vec3d across = wp::cross(q - p, r - p);
+        double drop = wp::dot(across, p), size = 0.0;
+        for (int k = 0; k < 3; ++k)
+            size += wp::abs(across[k]) * wp::max(wp::max(wp::abs(corner[0][k]), wp::abs(corner[1][k])),
+                                                 wp::max(wp::abs(corner[2][k]), wp::abs(point[k])));
+        if (wp::abs(drop) <= {_ROUNDING} * size) {{
+            const double length = wp::length(across);
+            const double upward = across[0] * normal[0] + across[1] * normal[1] + across[2] * normal[2];
+            const double height = upward < -{_UPRIGHT} * length ? -{_RAISE} : {_RAISE};
+            const wp::vec3d move = wp::mul(across, (drop / length + height * wp::sqrt(length)) / length);
+            p -= move;
+            q -= move;
+            r -= move;
+            drop = wp::dot(across, p);
+        }}
+        if (!(drop < 0.0 || drop > 0.0))
+            return;
+        if (drop > 0.0) {{
+            const wp::vec3d swapped = q;
+            q = r;
+            r = swapped;
+        }}
+        const wp::vec3 u(wp::cross(r, q)), v(wp::cross(p, r)), w(wp::cross(q, p));
+        bool is_left_now = false, is_blocked = false;
+        for (int lane = 0; lane < {PACKET}; ++lane) {{
+            const float e = u[0] * x[lane] + u[1] * y[lane] + u[2] * z[lane];
+            const float f = v[0] * x[lane] + v[1] * y[lane] + v[2] * z[lane];
+            const float g = w[0] * x[lane] + w[1] * y[lane] + w[2] * z[lane];
+            const bool is_met = (e >= 0.0f) & (f >= 0.0f) & (g >= 0.0f) & (e + f + g > 0.0f);
+            is_blocked |= is_met & (open[lane] > 0.0f);
+            open[lane] = is_met ? 0.0f : open[lane];
+            is_left_now |= open[lane] > 0.0f;
+        }}
+        is_left = is_left_now;
+        if (is_blocked)
+            last = face;
+    }};
+    if (last >= 0 && is_left)
+        meet(last);
+    for (int box = is_left ? 1 : 0; box > 0;) {{
+        const wp::vec3 lower = wp::index(lowers, box) - point, upper = wp::index(uppers, box) - point;
+        float top = 0.0f;
+        for (int k = 0; k < 3; ++k)
+            top += normal[k] * (normal[k] > 0.0f ? upper[k] : lower[k]);
+        bool is_met = false;
+        if (top >= 0.0f)
+            for (int lane = 0; lane < {PACKET}; ++lane) {{
+                const float x0 = lower[0] * a[lane], x1 = upper[0] * a[lane];
+                const float y0 = lower[1] * b[lane], y1 = upper[1] * b[lane];
+                const float z0 = lower[2] * c[lane], z1 = upper[2] * c[lane];
+                const float x2 = x0 < x1 ? x0 : x1, x3 = x0 < x1 ? x1 : x0;
+                const float y2 = y0 < y1 ? y0 : y1, y3 = y0 < y1 ? y1 : y0;
+                const float z2 = z0 < z1 ? z0 : z1, z3 = z0 < z1 ? z1 : z0;
+                const float xy2 = x2 > y2 ? x2 : y2, xy3 = x3 < y3 ? x3 : y3;
+                const float near = xy2 > z2 ? xy2 : z2, far = xy3 < z3 ? xy3 : z3;
+                is_met |= (near <= far) & (far >= 0.0f) & (open[lane] > 0.0f);
+            }}
+        if (is_met && box >= leaf_count) {{
+            const long long leaf = box - leaf_count;
+            const long long end = (leaf + 1) * face_count / leaf_count;
+            for (long long face = leaf * face_count / leaf_count; face < end && is_left; ++face)
+                meet((int)face);
+            if (!is_left)
+                break;
+        }}
+        if (is_met && box < leaf_count)
+            box *= 2;
+        else {{
+            for (++box; box % 2 == 0;)
+                box /= 2;
+            if (box == 1)
+                break;
+        }}
+    }}
+    unsigned found = 0;
+    for (int lane = 0; lane < {PACKET}; ++lane)
+        found |= open[lane] > 0.0f ? 1u << lane : 0u;
+    return wp::vec_t<2, int>((int)found, last);
+    """)
+    def find_open(  # type: ignore[empty-body]
+        corners: wp.array2d(dtype=wp.vec3),
+        lowers: wp.array(dtype=wp.vec3),
+        uppers: wp.array(dtype=wp.vec3),
+        leaf_count: int,
+        point: wp.vec3,
+        normal: wp.vec3,
+        toward: Vectors,
+        wanted: wp.int32,
+        last: int,
+    ) -> wp.vec2i:
+        """Find which rays of a packet meet no face.
+
+        Args:
+            corners, lowers, uppers, leaf_count: The faces, a :class:`FaceTree`.
+            point, normal: The receiver; no wanted ray goes below its horizon.
+            toward: Directions of the rays.
+            wanted: Bits of the rays that are asked for.
+            last: A face that is likely to block them, −1 for none.
+
+        Returns:
+            Bits of those that escape; and a face that blocked some, or ``last``.
+        """
+        ...
+
+    return find_open
