@@ -77,6 +77,47 @@ def test_images_are_nearer_to_rays_than_with_spheres(receivers):
     assert errors[0] < 0.6 * errors[1] and errors[0] < 0.06
 
 
+def test_a_suns_shadow_is_as_rays_have_it_where_pixels_send_them():
+    light = ws.synthetic_sky((0.3, 1, -0.5), height=128, sun_radius=2)
+    scenes = [scene_of("pixel", light=light, self_shadows=how, directions=128) for how in ("traced", "rays")]
+    truth = ws.render(dataclasses.replace(scenes[0], visibility=ws.Visibility(method="ray-traced", samples=512)))
+    covered = truth[..., 3] == 1
+    errors = [np.linalg.norm((Renderer(scene).render() - truth)[covered]) for scene in scenes]
+    assert errors[1] < 0.6 * errors[0]
+    np.testing.assert_array_equal(ws.render(scenes[0]), Renderer(scenes[1]).render())  # stills are so
+
+
+def test_gradients_of_rotations_are_refused_where_pixels_send_rays():
+    light = ws.synthetic_sky((-0.6, 0.6, 0.3), height=64, sun_radius=2)
+    renderer = Renderer(scene_of("pixel", light=light, self_shadows="rays", directions=128))
+    with wp.Tape():
+        poses = turned(renderer, (0, 0, 0), True)
+        with pytest.raises(ValueError, match='self_shadows: got "rays" where a rotation or a camera has a gradient'):
+            renderer.shade(view=renderer.view(renderer.placed(poses)))
+
+
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_a_rail_between_posts_is_not_black(receivers):
+    """Its vertices lie in the posts: it has sites between them, which lend what they see."""
+    ends, corners = np.array([-1.0, 1.0]), np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * 0.06
+    rail = np.concatenate([np.insert(corners, 0, end, axis=1) for end in ends])
+    sides = [(k, (k + 1) % 4, k + 4) for k in range(4)] + [((k + 1) % 4, (k + 1) % 4 + 4, k + 4) for k in range(4)]
+    faces = np.array([*sides, (0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7)])
+    posts = [ws.icosphere(0.3, 3).positions + (end, 0, 0) for end in ends]
+    count = len(posts[0])
+    all_faces = [faces, *(ws.icosphere(0.3, 3).faces + 8 + k * count for k in range(2))]
+    mesh = ws.Mesh(np.concatenate([rail, *posts]), np.concatenate(all_faces))
+    scene = dataclasses.replace(scene_of(receivers), bodies=(ws.Body(mesh, blockers=1, receivers=receivers),))
+    image, truth = (
+        Renderer(each).render()
+        for each in (scene, dataclasses.replace(scene, visibility=ws.Visibility(method="ray-traced", samples=256)))
+    )
+    rail = (slice(14, 18), slice(13, 19))
+    assert truth[rail][..., 3].max() == 1
+    # at its vertices it has the light of its darker ends
+    assert abs(image[rail].mean() / truth[rail].mean() - 1) < (0.35 if receivers == "vertex" else 0.2)
+
+
 @pytest.mark.parametrize("receivers", ["vertex", "pixel"])
 def test_what_is_buried_in_another_part_darkens_nothing(receivers):
     scene = scene_of(receivers)
@@ -168,7 +209,7 @@ def test_rows_are_traced_once_and_kept_on_disk(monkeypatch):
     monkeypatch.setattr(own_shadows, "trace_rows", None)
     moved = dataclasses.replace(scene.bodies[0], translation=(0.1, 0, 0), scale=0.5)
     ws.render(dataclasses.replace(scene, bodies=(moved,)))
-    np.testing.assert_array_equal(ws.render(scene), first)
+    np.testing.assert_array_equal(Renderer(scene).render(), first)
 
 
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
@@ -225,7 +266,7 @@ def test_torch_carries_rotations_and_what_is_deformed():
     geometry = renderer.placed(rotation_matrices(angles) @ rotations, translations, scales)
     assert geometry.rotations.requires_grad and geometry.rotations.shape == (1, 3, 3)
     image = renderer(geometry=geometry)
-    np.testing.assert_allclose(image.detach().numpy(), ws.render(scene), atol=1e-4)
+    np.testing.assert_allclose(image.detach().numpy(), Renderer(scene).render(), atol=1e-4)
     image.square().sum().backward()
     assert torch.isfinite(angles.grad).all() and angles.grad.any()
     rest = renderer.deformed(0, torch.tensor(scene.bodies[0].mesh.positions))

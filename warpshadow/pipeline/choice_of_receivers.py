@@ -36,10 +36,14 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.color import LUMINANCE
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
-from warpshadow.scene.scene import AUTO, Body, Scene
+from warpshadow.scene.scene import AUTO, Scene
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.visibility.narrow import find_narrow
 
 LARGE_FACE = 16.0
 """Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels …"""
@@ -113,16 +117,33 @@ def with_receivers(scene: Scene, choices: Sequence[Choice]) -> Scene:
 def for_picture(scene: Scene) -> Scene:
     """The scene, for a picture that is made once: flat bodies that leave their receivers open are shaded by pixel.
 
-    Interpolation between the vertices of a ground makes shadows' edges jagged.
+    Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun so are all other bodies,
+    and where their shadows on themselves are "traced", a sun's are found by "rays", as nobody asks for a gradient:
+    edges are as clean as of ``ray-traced``. Measured at 768 × 768 pixels, error of the image:
+
+        body, sun of 1° radius       at vertices       by pixel, looked up    by pixel and rays
+        spot, 2930 vertices          3.4%, 0.13 s      2.0%, 0.31 s           1.2%, 0.35 s
+        bear, 1986 vertices          7.3%, 0.11 s      3.6%, 0.20 s           1.9%, 0.34 s
     """
-    if not any(map(_is_open_flat, scene.bodies)):
+    visibility, has_sun = scene.visibility, _has_sun(scene)
+    if has_sun and visibility.self_shadows == "traced":
+        scene = dataclasses.replace(scene, visibility=dataclasses.replace(visibility, self_shadows="rays"))
+    wanted = [body.receivers == AUTO and (has_sun or body.mesh.is_flat) for body in scene.bodies]
+    if not any(wanted):
         return scene
-    bodies = (dataclasses.replace(body, receivers="pixel") if _is_open_flat(body) else body for body in scene.bodies)
+    bodies = (
+        dataclasses.replace(body, receivers="pixel") if is_wanted else body
+        for body, is_wanted in zip(scene.bodies, wanted, strict=True)
+    )
     return dataclasses.replace(scene, bodies=tuple(bodies))
 
 
-def _is_open_flat(body: Body) -> bool:
-    return body.receivers == AUTO and body.mesh.is_flat
+def _has_sun(scene: Scene) -> bool:
+    """Whether the directional method is to find shadows of a sun."""
+    if scene.visibility.method != "directional" or not isinstance(scene.light, EnvironmentMap):
+        return False
+    cells = scene.light.cells(fibonacci(scene.visibility.directions))
+    return find_narrow(cells.radiance @ LUMINANCE, cells.directions, cells.spreads) is not None
 
 
 def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:
