@@ -49,7 +49,7 @@ ON_GROUND = ws.Camera.look_at((1.6, 0.6, -0.5), (1.35, 0.0, -0.4), fov_y=50, siz
 
 
 def scene_of(method: str, camera: ws.Camera, **visibility) -> ws.Scene:
-    ground = ws.Body(ws.plane(6.0, 48), albedo=(0.3, 0.5, 0.6), blockers=0)
+    ground = ws.Body(ws.plane(6.0, 48), albedo=(0.3, 0.5, 0.6), blockers=0, receivers="vertex")
     sky = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
     return ws.Scene((blob(), ground), sky, camera, ws.Visibility.of({"method": method} | visibility))
 

@@ -46,7 +46,7 @@ def small_scene(*, size: tuple[int, int] = (24, 24)) -> ws.Scene:
         blockers=ws.Spheres([[-0.3, 0, 0], [0.3, 0, 0]], [0.8, 0.7]),
         translation=(0, 1, 0),
     )
-    ground = ws.Body(ws.plane(8.0, 16), albedo=(0.6, 0.5, 0.4), blockers=0)
+    ground = ws.Body(ws.plane(8.0, 16), albedo=(0.6, 0.5, 0.4), blockers=0, receivers="vertex")
     camera = ws.Camera.look_at((0, 3, 5), (0, 0.4, 0), size=size)
     light = np.zeros((4, 3))
     light[:2] = [[3, 3, 3], [1, 1, 0.5]]

@@ -21,7 +21,7 @@ def scene_of(view: int = 0, *, segments: int = 16) -> ws.Scene:
         blockers=ws.Spheres([[-0.3, 0, 0], [0.3, 0, 0]], [0.8, 0.7]),
         translation=(0, 1, 0),
     )
-    ground = ws.Body(ws.plane(8.0, segments), albedo=(0.6, 0.5, 0.4), blockers=0)
+    ground = ws.Body(ws.plane(8.0, segments), albedo=(0.6, 0.5, 0.4), blockers=0, receivers="vertex")
     camera = ws.Camera.look_at((3 * view, 3, 5), (0, 0.4, 0), size=(24, 16))
     light = np.zeros((9, 3))
     light[:2] = [[3, 3, 3], [1, 1, 0.5]]

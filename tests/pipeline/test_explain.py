@@ -54,7 +54,7 @@ def scene_of(method: str = "directional", *, still_blocks: bool = True, size: in
         for spheres, place in ((UNIT_SPHERE, (-0.7, 0.8, 0.4)), (UNIT_SPHERE if still_blocks else 0, (0.6, 0.6, 0)))
     ]
     texture = np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3))
-    ground = ws.Body(ws.plane(5.0, 16), texture=texture, blockers=0)
+    ground = ws.Body(ws.plane(5.0, 16), texture=texture, blockers=0, receivers="vertex")
     sky = ws.synthetic_sky((-0.6, 0.6, 0.3), height=32, sun_radius=8)
     camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.5, 0), size=(size, size))
     rays = {"samples": 256} if method == "ray-traced" else {}
@@ -487,6 +487,8 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return "shading" if "_light_cells" in key else "transfer"
     if module == "stages.film":
         return "averaging" if "average" in key else "radiance"
+    if module in ("stages.sample_receivers", "stages.quadtree"):
+        return "receivers"
     same = {f"stages.{name}": name for name in ("receivers", "shading", "sides", "normals")}
     return {"stages.project": "clip positions", "stages.slopes": "radiance", **same}[module]
 

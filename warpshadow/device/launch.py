@@ -86,6 +86,13 @@ def varies(values: Iterable[Any]) -> bool:
     return any(isinstance(value, wp.array) and value.requires_grad for value in values)
 
 
+def detached(array: wp.array) -> wp.array:
+    """The same array without a gradient."""
+    same = array.reshape(array.shape)
+    same.requires_grad = False
+    return same
+
+
 def _require_gradient(output: wp.array, kernel: wp.Kernel) -> None:
     is_real = scalar_type(output.dtype) in (wp.float32, wp.float64)
     if output.requires_grad or not is_real:

@@ -112,6 +112,14 @@ class SphereMethod(Method):
         """Shading of a group in known light."""
         raise NotImplementedError
 
+    def sharp_share(self, group: Group) -> np.ndarray | None:
+        """Light of the scene whose shadows are sharpest, as a group gets it, over all light if nothing blocked any.
+
+        Returns:
+            Shape [batch, receiver]; None where no shadow is sharp.
+        """
+        return None
+
     def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """Rows of what static bodies block, of known light or of any."""
         raise NotImplementedError

@@ -10,7 +10,8 @@ from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.cells import draw_in_cells
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.device.tape import unrecorded
+from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Seen
@@ -162,6 +163,52 @@ class Directional(SphereMethod):
         assert seen.past_all is not None and taken.coefficients is not None
         given = seen.past_all, group.normals, taken.directions, taken.coefficients
         return shade_cells(*given, most=LARGEST_COEFFICIENT)
+
+    @functools.cached_property
+    def _sharpest(self) -> tuple[np.ndarray, wp.array, float, wp.array]:
+        """Cells of the scene's light whose shadows are sharpest: narrow ones, or else the brightest.
+
+        Returns:
+            Directions [16, 3], their light in channel 0, with which 16 cells are lit as all are, their radius in radii
+            of 16 cells, and the light of all cells [direction].
+        """
+        with unrecorded():
+            taken = self.taken_from(self.light.value())
+        assert taken.coefficients is not None
+        power = taken.coefficients.numpy()[0] @ LUMINANCE
+        directions, light = np.empty((CHUNK, 3)), np.zeros(CHUNK)
+        if taken.narrow is None:
+            chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
+            directions, light = taken.directions[chosen], power[chosen]
+            scale = cell_radius(len(power)) / cell_radius(CHUNK)
+        else:
+            directions, places, scale = taken.narrow
+            light[places[places >= 0]] = power[places >= 0]
+        light = light[:, None] * [CHUNK / len(power), 0, 0]
+        return directions, wp.array(light[None], dtype=wp.vec3, device=self.assembly.device), scale, power
+
+    def sharp_share(self, group: Group) -> np.ndarray | None:
+        """Light of the sharpest cells, over all light if nothing blocked any."""
+        directions, light, scale, power = self._sharpest
+        points, normals, centers, radii = group[:4]
+        if not radii.shape[1] and group.flats is None:
+            return None
+        if radii.shape[1]:
+            passing = directional.transmittance(points, normals, centers, radii, directions, **self._scales(scale))
+        else:
+            passing = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
+        if group.flats is not None:
+            flats, radius = group.flats, scale * cell_radius(CHUNK)
+            lifted, fronts = group.among(flats.frames, flats.flats, flats.skip)
+            given = lifted, flats.frames, flats.flats, directions
+            covered = flat_coverage(*given, radius=radius, facing=normals, fronts=fronts, skip=flats.skip)
+            passing = passing if covered is None else past_coverage(passing, covered)
+        lit = shade_cells(passing, normals, directions, light, most=LARGEST_COEFFICIENT).numpy()[..., 0]
+        facing, towards = normals.numpy(), self.taken_if_free.directions
+        along = facing[:, :1]  # of all points of a plane, or the opposite
+        whole = [4 / len(power) * np.maximum(sign * along @ towards.T, 0) @ power for sign in (1, -1)]  # [batch, 1]
+        unblocked = np.where((facing * along).sum(axis=2) > 0, *whole)
+        return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
     def kept_rows(self, static: Static, light: Source | None, blocking: Blocking) -> Rows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""

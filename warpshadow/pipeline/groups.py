@@ -125,7 +125,7 @@ class Grouping:
             frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · flat]; None without any.
             corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]; None without flats.
         """
-        groups = list(self._that_move(receivers, spheres, own_shadows, frames, corners))
+        groups = list(self._that_move(call, receivers, spheres, own_shadows, frames, corners))
         if self._static is None or not len(receivers.on_static):
             return groups
         on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
@@ -135,6 +135,7 @@ class Grouping:
 
     def _that_move(
         self,
+        call: Call,
         receivers: Receivers,
         spheres: tuple[wp.array, wp.array],
         own_shadows: dict[int, Any],
@@ -149,8 +150,13 @@ class Grouping:
         if not receivers.spans:
             flats = self._flats_around(frames)
             yield Group(receivers.points, receivers.normals, *blocking, flats=flats, as_spheres=as_spheres)
+        pose_count = len(self._points.vertices.value(call))
         for span in receivers.spans:
-            points, normals = (cut(array, span.first, span.end) for array in (receivers.points, receivers.normals))
+            facing = receivers.points, receivers.normals
+            assert receivers.vertices is not None
+            if span.first < receivers.vertices.size and pose_count == 1:  # all cameras see the same vertices
+                facing = receivers.points[:1], receivers.normals[:1]
+            points, normals = (cut(array, span.first, span.end) for array in facing)
             is_traced = span.body in self._points.blocking.traced
             skip = self._assembly.spheres_among(bodies, span.body) if is_traced else (0, 0)
             others = none if skip == (0, blocking[1].shape[1]) else blocking
@@ -167,6 +173,18 @@ class Grouping:
             if as_spheres is not None:
                 group = group._replace(as_spheres=as_spheres.part(slice(span.first, span.end)))
             yield group
+
+    def around(
+        self,
+        points: wp.array,
+        normals: wp.array,
+        body: int,
+        spheres: tuple[wp.array, wp.array],
+        frames: wp.array | None,
+    ) -> Group:
+        """Points of a flat body, and what blocks their light."""
+        blocking = self._assembly.spheres_of(self._solid(range(len(self._assembly.scene.bodies))), spheres)
+        return Group(points, normals, *blocking, flats=self._flats_around(frames, but=body))
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
         """Those of some bodies that block by their spheres."""

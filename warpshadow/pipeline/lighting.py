@@ -151,8 +151,14 @@ class Method:
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
-        """Bodies on which every sample is a receiver, bool of shape [body]."""
-        return np.array([self.lights_samples or body.receivers == "pixel" for body in self.assembly.scene.bodies])
+        """Bodies on which samples are receivers, bool of shape [body]."""
+        return np.array([self.lights_samples or body.receivers != "vertex" for body in self.assembly.scene.bodies])
+
+    @functools.cached_property
+    def is_adaptive(self) -> np.ndarray:
+        """Flat bodies on which samples interpolate between receivers, bool of shape [body]."""
+        adaptive = np.array([body.receivers == "adaptive" for body in self.assembly.scene.bodies])
+        return adaptive & self.assembly.is_flat & (not self.lights_samples)
 
     @functools.cached_property
     def can_receive(self) -> np.ndarray:

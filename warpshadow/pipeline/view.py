@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.adaptive import find_squares
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Node, Source
 from warpshadow.pipeline.own_shadows import Blocking
@@ -69,12 +70,14 @@ class View(LitPoints):
         self._camera, self._across, self._pose_count = camera, method.assembly.scene.supersampling, counts[0]
         self._size = self._across * camera.width, self._across * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
-        normals, receivers = self._wire(method, vertices, cameras, static)
+        normals, receivers = self._wire(method, vertices, spheres, cameras, static)
         super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, blocking, stands)
         self.surfaces = SeenSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
         self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
-    def _wire(self, method: Method, vertices: Source, cameras: Source, static: Static | None) -> tuple[Node, Node]:
+    def _wire(
+        self, method: Method, vertices: Source, spheres: Source, cameras: Source, static: Static | None
+    ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         assembly, samples, corners = method.assembly, self._samples, self._vertices
         faces, two_sided = assembly.faces, assembly.two_sided_faces
@@ -98,31 +101,55 @@ class View(LitPoints):
         # receivers at vertices move with these alone; those of samples move with what a sample sees, too
         seen = sides if method.samples_receive.any() else Fixed(sides)
         words = functools.partial(receiver_words, self)
-        receivers = Node("receivers", self._receive, vertices, normals, seen, Fixed(silhouettes), items=words)
+        given = [vertices, normals, seen, Fixed(silhouettes)]
+        if method.is_adaptive.any():
+            given.append(Fixed(spheres))
+        receivers = Node("receivers", self._receive, *given, items=words)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
 
     def _receive(
-        self, positions: wp.array, normals: wp.array, fragments: Fragments, silhouettes: Silhouettes
+        self,
+        positions: wp.array,
+        normals: wp.array,
+        fragments: Fragments,
+        silhouettes: Silhouettes,
+        spheres: tuple[wp.array, wp.array] | None = None,
     ) -> Receivers:
         """Receivers at the vertices that are seen, or at all where that cannot be read without waiting."""
-        assembly, method = self.assembly, self.method
+        assembly, method, quadtree = self.assembly, self.method, None
         has_backs = fragments.sides is not None
-        keeps_vertex = method.can_receive[: 1 + has_backs]
+        keeps_vertex, wants_samples = method.can_receive[: 1 + has_backs], method.samples_receive
         is_static = None if self.static is None else self.static.has_vertex
         apart = self._apart
         bodies = None if apart is None else apart[assembly.body_of_vertex]
         if is_readable(assembly.device):
+            by_rows = method.is_adaptive & self._has_kept_shadows
+            if by_rows.any():
+                keeps_vertex = keeps_vertex | by_rows[assembly.body_of_vertex]
+                wants_samples = wants_samples & ~by_rows
             keeps_vertex = keeps_vertex & seen_vertices(fragments, silhouettes, keeps_vertex.shape[1])
             numbering = number_receivers(assembly.faces, keeps_vertex, is_static, assembly.vertex_order, bodies)
+            if spheres is not None and (is_adaptive := method.is_adaptive & ~by_rows).any():
+                seen = positions, normals, fragments, spheres
+                quadtree = find_squares(self, *seen, is_adaptive, self._across)
         elif is_static is None:
             numbering = method.numbering(self.blocking, has_backs)
         else:
             numbering = number_receivers(assembly.faces, keeps_vertex, is_static, bodies=bodies)
-        wants_samples = method.samples_receive[assembly.body_of_face]
         bodies = None if apart is None else apart[assembly.body_of_face]
-        given = positions, normals, assembly.faces, fragments, numbering, wants_samples
-        return find_receivers(*given, bodies=bodies, across=self._across)
+        given = positions, normals, assembly.faces, fragments, numbering, wants_samples[assembly.body_of_face]
+        return find_receivers(*given, bodies=bodies, across=self._across, quadtree=quadtree)
+
+    @functools.cached_property
+    def _has_kept_shadows(self) -> np.ndarray:
+        """Static bodies on which shadows of others are kept at vertices, bool of shape [body]."""
+        static, count = self.static, len(self.assembly.scene.bodies)
+        found = np.zeros(count, bool)
+        if static is not None:
+            casting = [body for body in static.bodies if self.assembly.scene.bodies[body].casts_shadow]
+            found[[body for body in static.bodies if set(casting) - {body}]] = True
+        return found
 
     def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""

@@ -51,7 +51,7 @@ MOST_BOUNCES = 16
 Bounces = int | Literal["all"]
 """How often light bounces."""
 
-RECEIVERS = (AUTO, "vertex", "pixel")
+RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
 
 SELF_SHADOWS = ("traced", "rays", "spheres")
 
@@ -173,10 +173,13 @@ class Body:
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
-            of few faces needs to receive a shadow. "auto" leaves it to each renderer: by pixel where its cameras see
-            faces of more than 16 pixels on average, or 5% of the body's pixels show faces longer than 16 pixels (in
-            images larger than 256 × 256, 1/4096 of the pixels, at most 400, and four times the root of that). Pictures
-            that are made once, as by :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
+            of few faces needs to receive a shadow; or "adaptive": on a flat body at some pixels, close to each other
+            where shadows have edges, between which it is interpolated (by pixel on other bodies, and on a GPU). "auto"
+            leaves it to each renderer: flat bodies of faces of more than 4 pixels are adaptive, with directional
+            visibility on a CPU. Else it is by pixel where its cameras see faces of more than 16 pixels on average, or
+            5% of the body's pixels show faces longer than 16 pixels (in images larger than 256 × 256, 1/4096 of the
+            pixels, at most 400, and four times the root of that). Pictures that are made once, as by
+            :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
         self_shadows: What shadows it casts on itself, "traced", by "rays" or of its "spheres", as for
             :class:`Visibility`; None for what the scene's visibility says.
         name: What it is called wherever a body is asked for; by default as its mesh, so as the mesh's file.

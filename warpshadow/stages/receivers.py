@@ -1,45 +1,37 @@
 """Receivers: the points at which light is evaluated, and how the samples of an image get theirs from them.
 
-Receivers are vertices of visible faces, or for some bodies the points that pixels show: samples of a pixel that see the
-same face share one, at the mean of their points. (With four samples a pixel that is 1.1 to 1.5 receivers a pixel, where
-faces have 400 to 10 pixels.) The back of a face (:mod:`warpshadow.stages.sides`) has receivers of its own, at the same
-points, with opposite normals.
+Receivers are vertices of visible faces, or for some bodies points that samples see
+(:mod:`warpshadow.stages.sample_receivers`). The back of a face (:mod:`warpshadow.stages.sides`) has receivers of its
+own, at the same points, with opposite normals.
 """
 
-import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
-
-
-class Span(NamedTuple):
-    """Receivers of one body that follow each other; of body −1 are those of all that share what blocks them."""
-
-    body: int
-    first: int
-    end: int
 
 
 class Receivers(NamedTuple):
     """Receivers of every instance.
 
     The first receivers are vertices of static bodies: they have indices, but no points and normals here. A sample of a
-    pixel with a receiver r of its own sees a face (r, r, r), which follows the mesh's faces.
+    pixel with a receiver r of its own sees a face (r, r, r), which follows the mesh's faces; after these come the
+    triangles of receivers in which samples interpolate.
     """
 
     points: wp.array  # [batch, receiver − on static] vec3
     normals: wp.array  # [batch, receiver − on static] vec3
-    faces: wp.array  # [face or side + own] vec3i, indices of receivers
+    faces: wp.array  # [face or side + own + triangle] vec3i, indices of receivers
     of_vertices: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
@@ -58,15 +50,14 @@ def _gather(
     positions: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    sides: wp.array2d(dtype=wp.int32),
-    means: wp.array2d(dtype=wp.vec3),
     vertices: wp.array(dtype=wp.int32),
-    samples: wp.array2d(dtype=wp.int32),
+    seen_sides: wp.array2d(dtype=wp.int32),
+    seen_barycentrics: wp.array2d(dtype=wp.vec3),
     # out
     points: wp.array2d(dtype=wp.vec3),
     point_normals: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver: a vertex, or what samples share, named by the first of them, −1 for none."""
+    """A thread owns a receiver: a vertex, or what samples see, −1 for nothing."""
     batch, receiver = wp.tid()
     instance = instance_in(batch, positions.shape[0])
     own = receiver - vertices.shape[0]
@@ -75,118 +66,12 @@ def _gather(
         points[batch, receiver] = positions[instance, vertex]
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normals[instance, vertex]
     else:
-        side = int(0)
-        weights = wp.vec3(1.0, 0.0, 0.0)
-        view = instance_in(batch, sides.shape[0])
-        sample = samples[view, own]
-        if sample >= 0:
-            side = sides[view, sample]
-            weights = means[view, sample]
-        face, is_back = split_side(side, faces.shape[0])
+        view = instance_in(batch, seen_sides.shape[0])
+        weights = seen_barycentrics[view, own]
+        face, is_back = split_side(wp.max(seen_sides[view, own], 0), faces.shape[0])
         points[batch, receiver] = at_point(positions[instance], faces[face], weights)
         normal = wp.normalize(at_point(normals[instance], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
-
-
-@wp.kernel
-def _gather_seen(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    means: wp.array2d(dtype=wp.vec3),
-    samples: wp.array2d(dtype=wp.int32),
-    # out
-    seen_sides: wp.array2d(dtype=wp.int32),
-    seen_barycentrics: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a receiver that samples share, named by the first of them, −1 for none."""
-    view, own = wp.tid()
-    sample = samples[view, own]
-    if sample >= 0:
-        seen_sides[view, own] = sides[view, sample]
-        seen_barycentrics[view, own] = means[view, sample]
-    else:
-        seen_sides[view, own] = -1
-        seen_barycentrics[view, own] = wp.vec3(1.0, 0.0, 0.0)
-
-
-@wp.kernel(enable_backward=False)
-def _find_sharing(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    wants_samples: wp.array(dtype=wp.bool),
-    width: int,
-    across: int,
-    run: int,
-    # out
-    firsts: wp.array2d(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-):
-    """A thread owns a run of pixels; counts are zero before."""
-    view, thread = wp.tid()
-    pixels = width // across
-    for pixel in range(thread * run, (thread + 1) * run):
-        corner = (pixel // pixels * width + pixel % pixels) * across
-        for i in range(across * across):
-            sample = corner + i // across * width + i % across
-            side = sides[view, sample]
-            first = int(-1)
-            if side >= 0 and wants_samples[wp.max(side, 0) % wants_samples.shape[0]]:
-                first = sample
-                for k in range(i):
-                    other = corner + k // across * width + k % across
-                    if first == sample and sides[view, other] == side:
-                        first = other
-                counts[view, first] = counts[view, first] + 1
-            firsts[view, sample] = first
-
-
-@wp.kernel
-def _share(
-    # in
-    firsts: wp.array2d(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-    barycentrics: wp.array2d(dtype=wp.vec3),
-    # out
-    means: wp.array2d(dtype=wp.vec3),
-    weights: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a sample; means are zero before, and stand at the first sample that shares a receiver.
-
-    All of the weight of those that do is on the first corner.
-    """
-    view, sample = wp.tid()
-    first = firsts[view, sample]
-    if first >= 0:
-        wp.atomic_add(means, view, first, barycentrics[view, sample] / float(counts[view, first]))
-        weights[view, sample] = wp.vec3(1.0, 0.0, 0.0)
-    else:
-        weights[view, sample] = barycentrics[view, sample]
-
-
-@wp.kernel(enable_backward=False)
-def _see_own(
-    # in
-    sides: wp.array2d(dtype=wp.int32),
-    firsts: wp.array2d(dtype=wp.int32),
-    numbers: wp.array2d(dtype=wp.int32),
-    rooms: wp.array(dtype=wp.int32),
-    side_count: int,
-    # out
-    own_sides: wp.array2d(dtype=wp.int32),
-    samples: wp.array2d(dtype=wp.int32),
-):
-    """A thread owns a sample. Receivers have numbers, or else a room each in those of their face's body."""
-    view, sample = wp.tid()
-    side = sides[view, sample]
-    first = firsts[view, sample]
-    if first >= 0:
-        number = rooms[side % rooms.shape[0]] * sides.shape[1] + first
-        if numbers:
-            number = numbers[view, first]
-        if first == sample:
-            samples[view, number] = sample
-        side = side_count + number
-    own_sides[view, sample] = side
 
 
 @wp.kernel(enable_backward=False)
@@ -198,7 +83,7 @@ def _add_faces(
     with_own: wp.array(dtype=wp.vec3i),
 ):
     """A thread owns a face: of the mesh, or of an own receiver."""
-    face = wp.tid()
+    face = wp.tid()  # with_own may have more
     own = receiver_count + face - faces.shape[0]
     corners = wp.vec3i(own, own, own)
     if own < receiver_count:
@@ -267,15 +152,8 @@ def number_receivers(
         on_static,
         wp.array(corners, dtype=wp.vec3i, device=device),
         wp.array(of_vertices, dtype=wp.int32, device=device),
-        () if bodies is None else _spans(bodies[vertices]),
+        () if bodies is None else spans_of(bodies[vertices]),
     )
-
-
-def _spans(bodies: np.ndarray) -> tuple[Span, ...]:
-    """Runs of the same body."""
-    changes = np.flatnonzero(np.diff(bodies)) + 1
-    bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
-    return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
 def find_receivers(
@@ -287,6 +165,7 @@ def find_receivers(
     wants_samples: np.ndarray,
     bodies: np.ndarray | None = None,
     across: int = 1,
+    quadtree: Quadtree | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -301,6 +180,7 @@ def find_receivers(
         bodies: Body of each face, −1 for those that need not be told apart, shape [face]; None where all share what
             blocks them, as for :func:`number_receivers`.
         across: Samples of a pixel across and down: those that see the same face share a receiver.
+        quadtree: Squares in which samples of faces that want them interpolate; None for none.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
@@ -312,35 +192,43 @@ def find_receivers(
     vertices, on_static, receiver_faces, of_vertices, spans = numbering
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
-    own, own_count = _Own(receiver_fragments), 0
-    batch_count = len(positions)
+    batch_count, seen = len(positions), None
     if wants_samples.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
-        side_count = len(receiver_faces)
+        side_count, receiver_count = len(receiver_faces), numbering.receiver_count
         keys = np.zeros(len(faces), int) if bodies is None else bodies
-        own, own_spans = _find_own(receiver_fragments, side_count, wants_samples, keys, across, numbering.moving_count)
-        spans += own_spans
-        own_count = own.samples.shape[1]
-        all_faces = wp.empty(side_count + own_count, dtype=wp.vec3i, device=device)
-        inputs = [receiver_faces, numbering.receiver_count]
-        launch(_add_faces, all_faces.shape, inputs=inputs, outputs=[all_faces])
+        own = find_sample_receivers(receiver_fragments, side_count, wants_samples, keys, across, quadtree)
+        receiver_fragments, seen = own.fragments, own.seen
+        moving_count = numbering.moving_count
+        spans += tuple(Span(body, moving_count + first, moving_count + end) for body, first, end in own.spans)
+        count = side_count + seen.face_ids.shape[1]
+        all_faces = wp.empty(count + len(own.triangles), dtype=wp.vec3i, device=device)
+        launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
+        if len(own.triangles):
+            wp.copy(all_faces[count:], wp.array(receiver_count + own.triangles, dtype=wp.vec3i, device=device))
         receiver_faces = all_faces
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
     vertices = of_vertices if vertices is None else vertices
-    points, point_normals = (
-        wp.empty((batch_count, vertices.size + own_count), dtype=wp.vec3, device=device) for _ in range(2)
-    )
-    launch(
-        _gather,
-        points.shape,
-        inputs=[positions, normals, faces, rows(sides), own.means, vertices, own.samples],
-        outputs=[points, point_normals],
-    )
-    found = Receivers(points, point_normals, receiver_faces, of_vertices, own.fragments, on_static)
+    points = _points(batch_count, positions, normals, faces, vertices, seen)
+    found = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
     if bodies is None:
         return found
-    return found._replace(spans=spans, vertices=vertices, seen=_seen(sides, own) if own_count else None)
+    return found._replace(spans=spans, vertices=vertices, seen=seen if seen and seen.face_ids.size else None)
+
+
+def _points(
+    count: int, positions: wp.array, normals: wp.array, faces: wp.array, vertices: wp.array, seen: Fragments | None
+) -> tuple[wp.array, wp.array]:
+    """Points and normals of vertices and of what is seen, for a number of instances. Differentiable: all but faces."""
+    device = positions.device
+    if seen is None:
+        seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
+    shape = count, vertices.size + seen.face_ids.shape[1]
+    points, point_normals = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
+    inputs = [positions, normals, faces, vertices, seen.face_ids, seen.barycentrics]
+    launch(_gather, shape, inputs=inputs, outputs=[points, point_normals])
+    return points, point_normals
 
 
 def receivers_on_faces(
@@ -364,27 +252,22 @@ def receivers_on_faces(
 
     Differentiable: positions, normals.
     """
-    device, count = positions.device, len(sides)
-    points, point_normals = (wp.empty((len(positions), count), dtype=wp.vec3, device=device) for _ in range(2))
-    none, every = (constant(np.arange(number), wp.int32, device) for number in (0, count))
+    device = positions.device
     seen = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
-    launch(
-        _gather,
-        points.shape,
-        inputs=[positions, normals, faces, seen.face_ids, seen.barycentrics, none, every.reshape((1, count))],
-        outputs=[points, point_normals],
-    )
-    spans = () if bodies is None else _spans(bodies)
-    return Receivers(points, point_normals, faces, none, seen, spans=spans, vertices=none, seen=seen)
+    points = points_seen(positions, normals, faces, seen)
+    none = constant(np.empty(0, int), wp.int32, device)
+    spans = () if bodies is None else spans_of(bodies)
+    return Receivers(*points, faces, none, seen, spans=spans, vertices=none, seen=seen)
 
 
-def _seen(sides: wp.array, own: "_Own") -> Fragments:
-    """What own receivers see: sides and barycentrics [batch, own]. Differentiable: barycentrics."""
-    shape = own.samples.shape
-    seen = Fragments(*(wp.empty(shape, dtype=dtype, device=sides.device) for dtype in (wp.int32, wp.vec3)))
-    inputs = [rows(sides), own.means, own.samples]
-    launch(_gather_seen, shape, inputs=inputs, outputs=[seen.face_ids, seen.barycentrics])
-    return seen
+def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: Fragments) -> tuple[wp.array, wp.array]:
+    """Points and normals of what is seen, sides and barycentrics [view, receiver]: vec3 of shape [batch, receiver].
+
+    Differentiable: positions, normals, barycentrics.
+    """
+    count = common_batch({"positions": positions, "seen": seen.face_ids})
+    none = constant(np.empty(0, int), wp.int32, positions.device)
+    return _points(count, positions, normals, faces, none, seen)
 
 
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
@@ -414,66 +297,3 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         takes_part[side, faces[is_seen[side * face_count : (side + 1) * face_count]]] = True
     takes_part[side_of_edge[edges >= 0], edges[edges >= 0]] = True
     return takes_part
-
-
-class _Own(NamedTuple):
-    """Receivers that samples have of their own."""
-
-    fragments: Fragments  # of faces of their own, which follow the mesh's
-    samples: Any = None  # [view, receiver] int32, the first sample of each, −1 for none
-    means: wp.array | None = None  # [view, sample] vec3, at the first samples: mean barycentrics
-
-
-def _find_own(
-    fragments: Fragments, side_count: int, wants_samples: np.ndarray, bodies: np.ndarray, across: int, first: int
-) -> tuple[_Own, tuple[Span, ...]]:
-    """Let samples of a pixel that see the same side share a receiver. Differentiable: barycentrics.
-
-    Receivers come body by body. While a graph is captured nobody knows how many there are, and each body has room for
-    one at every sample.
-
-    Args:
-        side_count: Faces that receivers at vertices have.
-        wants_samples, bodies: Of faces.
-        across: Samples of a pixel across and down.
-        first: What the receivers in the spans of bodies, which are returned, too, are counted from.
-    """
-    shape, device = fragments.face_ids.shape, fragments.face_ids.device
-    sides, sample_count = rows(fragments.face_ids), shape[1] * shape[2]
-    firsts, own_sides = (wp.empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
-    counts = wp.zeros(sides.shape, dtype=wp.int32, device=device)
-    run = run_length(device, shape[2] // across)
-    inputs = [sides, constant(wants_samples, wp.bool, device), shape[2], across, run]
-    launch(_find_sharing, (shape[0], sample_count // across**2 // run), inputs=inputs, outputs=[firsts, counts])
-    names = np.unique(bodies[wants_samples])
-    rooms = constant(np.searchsorted(names, bodies), wp.int32, device)
-    if device.is_capturing:
-        numbers, ends = None, sample_count * np.arange(len(names) + 1)
-        samples = wp.full((shape[0], int(ends[-1])), -1, dtype=wp.int32, device=device)
-    else:
-        is_first = firsts.numpy() == np.arange(sample_count)
-        numbers_of, columns, ends = np.zeros(sides.shape, int), [], [0]
-        bodies_seen = bodies[sides.numpy() % len(bodies)]
-        for name in names:
-            is_bodys = is_first & (bodies_seen == name)
-            numbers_of[is_bodys] = ends[-1] + (np.cumsum(is_bodys, axis=1) - 1)[is_bodys]
-            columns.append(_ragged(is_bodys))
-            ends.append(ends[-1] + columns[-1].shape[1])
-        samples = wp.array(np.concatenate(columns, axis=1), dtype=wp.int32, device=device)
-        numbers = wp.array(numbers_of, dtype=wp.int32, device=device)
-    inputs = [sides, firsts, numbers, rooms, side_count]
-    launch(_see_own, sides.shape, inputs=inputs, outputs=[own_sides, samples])
-    means, weights = (wp.zeros(sides.shape, dtype=wp.vec3, device=device) for _ in range(2))
-    launch(_share, sides.shape, inputs=[firsts, counts, rows(fragments.barycentrics)], outputs=[means, weights])
-    own = _Own(Fragments(own_sides.reshape(shape), weights.reshape(shape)), samples, means)
-    starts = zip(names, *(first + np.array(bounds) for bounds in (ends[:-1], ends[1:])), strict=True)
-    return own, tuple(Span(int(name), int(start), int(end)) for name, start, end in starts if end > start)
-
-
-def _ragged(chosen: np.ndarray) -> np.ndarray:
-    """Columns that are chosen in each row, −1 after the last: [row, most of a row]."""
-    counts = chosen.sum(axis=1)
-    columns = np.full((len(chosen), counts.max()), -1)
-    row, column = np.nonzero(chosen)
-    columns[row, np.concatenate([np.arange(count) for count in counts])] = column
-    return columns

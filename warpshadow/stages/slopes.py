@@ -17,7 +17,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import detached, launch
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
@@ -78,6 +78,7 @@ def _pull(
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     edge_colors: wp.array3d(dtype=wp.vec4),
+    first_own: int,
     run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
     # out
@@ -101,8 +102,8 @@ def _pull(
             receivers = wp.vec3i()
             if face >= 0:
                 receivers = receiver_faces[receiver_face_ids[view, sample]]
-            # A sample that is a receiver itself has the gradient of its point instead.
-            if receivers[0] != receivers[1] and wp.length_sq(adj_color) > 0.0:
+            # A sample with receivers that samples see has the gradient of their points instead.
+            if face >= 0 and receiver_face_ids[view, sample] < first_own and wp.length_sq(adj_color) > 0.0:
                 adj_light = wp.cw_mul(adj_color, albedo[reflecting, sample])
                 here = light[lit, sample]
                 color = samples[batch, sample]
@@ -174,9 +175,9 @@ def moving_radiance(
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
 
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
-    samples that are receivers themselves, whose gradient is that of their points.
+    samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points.
     """
-    fragments = replace(fragments, barycentrics=_constant(fragments.barycentrics))
+    fragments = replace(fragments, barycentrics=detached(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
     if not clip_positions.requires_grad:
@@ -184,7 +185,7 @@ def moving_radiance(
     samples.requires_grad = True
 
     def adjoint() -> None:
-        light = interpolate(fragments, faces, _constant(shading))
+        light = interpolate(fragments, faces, detached(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
             _pull,
@@ -201,6 +202,7 @@ def moving_radiance(
                 silhouettes.entries,
                 silhouettes.edges,
                 edge_colors,
+                len(silhouettes.faces) * (1 if silhouettes.fragments.sides is None else 2),
                 run,
                 rows(samples.grad),
             ],
@@ -209,10 +211,3 @@ def moving_radiance(
 
     record_adjoint(adjoint, [samples, clip_positions])
     return samples, edge_colors
-
-
-def _constant(array: wp.array) -> wp.array:
-    """The same array without a gradient."""
-    constant = array.reshape(array.shape)
-    constant.requires_grad = False
-    return constant

@@ -133,9 +133,9 @@ class PointSample:
         """Find where light is evaluated.
 
         Args:
-            of_bodies: "vertex" or "pixel" for each body: whether its points are interpolated or receivers themselves.
+            of_bodies: Receivers of each body: at "vertex" points are interpolated, else they are receivers themselves.
         """
-        is_own = np.array([receivers == "pixel" for receivers in of_bodies])[self.bodies]
+        is_own = np.array([receivers != "vertex" for receivers in of_bodies])[self.bodies]
         of_receivers, weights, corners = places_of_receivers(self._vertices, self._weights, is_own)
         points, normals = (
             np.einsum("pk,pkc->pc", weights, values[self._vertices[of_receivers]])

@@ -94,7 +94,7 @@ class _Stage:
         sides, vertices, barycentrics = seen_on_faces(self._view, seen[:: scene.supersampling**2])  # one a pixel
         assembly = self._renderer.assembly
         bodies = assembly.body_of_face[sides % len(assembly.body_of_face)]
-        samples_receive = np.array([body.receivers == "pixel" for body in self._renderer.scene.bodies])
+        samples_receive = np.array([body.receivers != "vertex" for body in self._renderer.scene.bodies])
         at, weights, _ = places_of_receivers(vertices, barycentrics, samples_receive[bodies])
         corners = self._renderer.geometry().positions.numpy()[0][vertices[at] % assembly.first_vertex[-1]]
         chosen = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))

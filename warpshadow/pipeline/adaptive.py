@@ -1,0 +1,94 @@
+"""Adaptive receivers: on flat bodies, close to each other where shadows have edges, far apart elsewhere.
+
+Edges of shadows are sharp where light comes from few cells: a sun's, or else the brightest. Only these cells are found
+at the probes of a quadtree (:mod:`warpshadow.stages.quadtree`), an eighth of all cells at a quarter of the pixels.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import detached
+from warpshadow.device.tape import unrecorded
+from warpshadow.pipeline.by_spheres import SphereMethod
+from warpshadow.pipeline.groups import Grouping
+from warpshadow.pipeline.lighting import LitPoints
+from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.receivers import points_seen
+from warpshadow.stages.sample_receivers import see_samples
+
+
+def find_squares(
+    points: LitPoints,
+    positions: wp.array,
+    normals: wp.array,
+    fragments: Fragments,
+    spheres: tuple[wp.array, wp.array],
+    is_adaptive: np.ndarray,
+    across: int,
+) -> Quadtree:
+    """Find the squares of images in which the samples of some bodies interpolate.
+
+    Args:
+        points: Has what blocks their light.
+        positions, normals: Of the vertices, vec3 of shape [batch, vertex].
+        fragments: What samples see.
+        spheres: Centers and radii of all spheres.
+        is_adaptive: The bodies, which are flat, bool of shape [body].
+        across: Samples of a pixel across and down.
+    """
+    assembly, method = points.assembly, points.method
+    assert isinstance(method, SphereMethod)
+    sides = fragments.face_ids if fragments.sides is None else fragments.sides
+    keys = _keys(is_adaptive.tobytes(), assembly.first_face.tobytes())
+    row, column = probe_grid(sides.shape[1:], across)
+    places = _by_tiles(len(row), len(column))
+    probes = (row[:, None] * sides.shape[2] + column).ravel()[places]
+    probe_keys = np.append(keys, -1)[sides.numpy().reshape(len(sides), -1)[:, probes]]
+    body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
+    shares = np.zeros(probe_keys.shape, np.float32)
+    flats = points.blocking.flats
+    with unrecorded():
+        bare = detached(spheres[0]), detached(spheres[1])
+        frames = method.flats.frames(flats, detached(positions)) if flats else None
+        grouping = Grouping(points, method.flats)
+        for body in np.flatnonzero(is_adaptive).tolist():
+            columns = _ragged(body_of_probe == body)
+            if not columns.shape[1]:
+                continue
+            samples = np.where(columns < 0, -1, probes[columns])
+            seen = see_samples(fragments, samples)
+            facing = points_seen(detached(positions), detached(normals), assembly.faces, seen)
+            group = grouping.around(*facing, body, bare, frames)
+            parts = [method.sharp_share(part) for part in group.parts()]
+            known = [part for part in parts if part is not None]
+            if known:
+                view, place = np.nonzero(columns >= 0)
+                shares[view, places[columns[view, place]]] = np.concatenate(known, axis=1)[view, place]
+    return find_quadtree(sides, keys, shares.reshape(len(shares), len(row), len(column)), across)
+
+
+@functools.lru_cache(maxsize=16)
+def _keys(is_adaptive: bytes, first_face: bytes) -> np.ndarray:
+    """For each side of the bodies' faces, from the front and then from behind, which body's it is; −1 for others."""
+    adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
+    bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive)), -1), np.diff(starts))
+    return np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)])
+
+
+@functools.lru_cache(maxsize=16)
+def _by_tiles(height: int, width: int) -> np.ndarray:
+    """The probes of a grid by tiles of 4 × 4: light is found fastest where neighbors follow each other."""
+    row, column = np.divmod(np.arange(height * width), width)
+    return np.lexsort((column // 4, row // 4))
+
+
+def _ragged(chosen: np.ndarray) -> np.ndarray:
+    """Columns that are chosen in each row, −1 after the last: [row, most of a row]."""
+    row, column = np.nonzero(chosen)
+    counts = np.bincount(row, minlength=len(chosen))
+    columns = np.full((len(chosen), counts.max(initial=0)), -1)
+    columns[row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)] = column
+    return columns

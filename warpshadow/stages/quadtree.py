@@ -1,0 +1,228 @@
+"""Quadtree: receivers at the corners of squares of the image, which are small where light changes quickly.
+
+On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. So its receivers are
+what the corners of squares of 4 × 4 pixels see, and squares are cut into four, and these again, where what samples get
+by interpolation is not what they would see themselves (Ward's irradiance caching, in the image). That is told by
+*probes*, the corners of squares of 2 × 2 pixels, at which somebody knows the light well enough. In a square of corners
+a b / c d are two triangles a b c and d c b, in which samples interpolate linearly.
+
+A square holds if its corners see one side of one body. Samples within it that see another side, or whose pixel is no
+part of a square that holds, have no part in it: they are receivers themselves.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import rows
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+
+LARGEST = 4
+"""Pixels of the side of the largest squares."""
+
+PROBE = 2
+"""Pixels between probes."""
+
+TOLERANCE = 0.02
+"""Error of interpolation at which a square is cut, as a part of the light where nothing blocks any."""
+
+
+class Quadtree(NamedTuple):
+    """Squares that hold."""
+
+    sizes: wp.array  # [view, row, column] int32, side of the square that a pixel is in [pixels], 0 for none
+    numbers: wp.array  # [view, row, column] int32, number of the square, at its first pixel
+    corners: np.ndarray  # [square, 4] a b c d of each: view · samples + sample
+    is_corner: np.ndarray  # [view, sample] bool
+    keys: wp.array  # [side] int32, the same for the sides that share squares; −1 for those that are in none
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Corners of the triangles, [2 · square, 3]: a square's first is left of its diagonal b c, above it."""
+        return self.corners[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
+
+
+def probe_grid(size: tuple[int, int], across: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the samples that are probes; the last may stand there twice.
+
+    Args:
+        size: Height and width of the image [samples].
+        across: Samples of a pixel across and down.
+    """
+    counts = (PROBE * -(-length // (across * LARGEST)) + 1 for length in size)
+    rows_, columns = (
+        np.minimum(PROBE * across * np.arange(count), length - 1) for count, length in zip(counts, size, strict=True)
+    )
+    return rows_, columns
+
+
+@wp.func
+def sample_at(row: int, column: int, across: int, height: int, width: int):
+    """The sample at the upper left of a pixel; beyond the image's end the last."""
+    return wp.min(row * across, height - 1) * width + wp.min(column * across, width - 1)
+
+
+@wp.func
+def _key_at(sides: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int32), sample: int):
+    side = sides[sample]
+    key = int(-1)
+    if side >= 0:
+        key = keys[side]
+    return key
+
+
+@wp.func
+def _has_key(keys: wp.array2d(dtype=wp.int32), row: int, column: int, key: int):
+    """Whether there is a probe at a place, and it has a key."""
+    if row < 0 or column < 0 or row >= keys.shape[0] or column >= keys.shape[1]:
+        return False
+    return keys[row, column] == key
+
+
+@wp.func
+def _bend(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
+    """Error of linear interpolation over a distance of probes beside a probe: an eighth of the second difference."""
+    key = keys[row, column]
+    bend = float(0.0)
+    for way in range(2):
+        i = 1 - way
+        if _has_key(keys, row - i, column - way, key) and _has_key(keys, row + i, column + way, key):
+            second = shares[row - i, column - way] - 2.0 * shares[row, column] + shares[row + i, column + way]
+            bend = wp.max(bend, wp.abs(second) / 8.0)
+    return bend
+
+
+@wp.func
+def _gap(
+    shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), key: int, at: wp.vec2i, a: wp.vec2i, b: wp.vec2i
+):
+    """What interpolation between two probes misses at a third."""
+    gap = float(0.0)
+    if keys[at[0], at[1]] == key:
+        gap = wp.abs(shares[at[0], at[1]] - 0.5 * (shares[a[0], a[1]] + shares[b[0], b[1]]))
+    return gap
+
+
+@wp.kernel(enable_backward=False)
+def _cut_squares(
+    # in
+    sides: wp.array2d(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    probe_keys: wp.array3d(dtype=wp.int32),
+    probe_shares: wp.array3d(dtype=float),
+    across: int,
+    height: int,
+    width: int,
+    tolerance: float,
+    # out
+    sizes: wp.array3d(dtype=wp.int32),
+):
+    """A thread owns a row of the largest squares: pixels get the side of the square that holds there, 0 for none."""
+    view, i = wp.tid()
+    seen = sides[view]
+    near = probe_keys[view]
+    shares = probe_shares[view]
+    for j in range(near.shape[1] / 2):
+        row = 2 * i
+        column = 2 * j
+        key = near[row, column]
+        holds = key >= 0 and near[row, column + 2] == key and near[row + 2, column] == key
+        if holds and near[row + 2, column + 2] == key:
+            a = wp.vec2i(row, column)
+            b = wp.vec2i(row, column + 2)
+            c = wp.vec2i(row + 2, column)
+            d = wp.vec2i(row + 2, column + 2)
+            gap = _gap(shares, near, key, wp.vec2i(row + 1, column + 1), b, c)
+            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row, column + 1), a, b))
+            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 1, column), a, c))
+            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 1, column + 2), b, d))
+            gap = wp.max(gap, _gap(shares, near, key, wp.vec2i(row + 2, column + 1), c, d))
+            holds = gap <= tolerance
+        else:
+            holds = False
+        for quarter in range(4):
+            size = int(4)
+            top = row + quarter / 2
+            left = column + quarter % 2
+            if not holds:
+                key = near[top, left]
+                is_one = key >= 0 and near[top, left + 1] == key and near[top + 1, left] == key
+                size = 1
+                if is_one and near[top + 1, left + 1] == key:
+                    low = wp.min(shares[top, left], shares[top, left + 1])
+                    low = wp.min(low, wp.min(shares[top + 1, left], shares[top + 1, left + 1]))
+                    high = wp.max(shares[top, left], shares[top, left + 1])
+                    high = wp.max(high, wp.max(shares[top + 1, left], shares[top + 1, left + 1]))
+                    bend = float(0.0)
+                    if high - low > tolerance:
+                        for corner in range(4):
+                            bend = wp.max(bend, _bend(shares, near, top + corner / 2, left + corner % 2))
+                    if bend <= tolerance:
+                        size = 2
+            for pixel in range(4):
+                y = 2 * top + pixel / 2
+                x = 2 * left + pixel % 2
+                if y < sizes.shape[1] and x < sizes.shape[2]:
+                    own = size
+                    if size == 1:
+                        key = _key_at(seen, keys, sample_at(y, x, across, height, width))
+                        for corner in range(1, 4):
+                            other = sample_at(y + corner / 2, x + corner % 2, across, height, width)
+                            if key < 0 or _key_at(seen, keys, other) != key:
+                                own = 0
+                    sizes[view, y, x] = own
+
+
+def find_quadtree(
+    sides: wp.array, keys: np.ndarray, probe_shares: np.ndarray, across: int, *, tolerance: float = TOLERANCE
+) -> Quadtree:
+    """Find the squares in which samples interpolate.
+
+    Args:
+        sides: Side that each sample sees, −1 for none, int32 of shape [view, height, width].
+        keys: For each side a number that those share that lie in one plane, −1 for those that have no squares.
+        probe_shares: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
+            [view, row, column]; anything where they see no side that has squares.
+        across: Samples of a pixel across and down.
+        tolerance: Error of interpolation at which a square is cut, in the unit of the shares.
+    """
+    device, (view_count, height, width) = sides.device, sides.shape
+    flat, shape = rows(sides), (view_count, height // across, width // across)
+    keys_there = constant(keys, wp.int32, device)
+    sizes = wp.empty(shape, dtype=wp.int32, device=device)
+    probe_keys = keys_of(sides, keys, across)
+    inputs = [
+        flat,
+        keys_there,
+        wp.array(probe_keys, dtype=wp.int32, device=device),
+        wp.array(probe_shares, dtype=wp.float32, device=device),
+    ]
+    launch(
+        _cut_squares,
+        (view_count, probe_keys.shape[1] // 2),
+        inputs=[*inputs, across, height, width, tolerance],
+        outputs=[sizes],
+    )
+    found = sizes.numpy()
+    row, column = np.arange(shape[1])[:, None], np.arange(shape[2])
+    is_first = found == 1
+    for size in (2, LARGEST):
+        is_first |= (found == size) & (row % size == 0) & (column % size == 0)
+    view, row, column = np.nonzero(is_first)
+    numbers = np.zeros(shape, np.int32)
+    numbers[is_first] = np.arange(len(view))
+    ends = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * found[is_first][:, None, None]
+    rows_ = np.minimum((row[:, None] + ends[..., 0]) * across, height - 1)
+    columns = np.minimum((column[:, None] + ends[..., 1]) * across, width - 1)
+    corners = (view[:, None] * height + rows_) * width + columns
+    is_corner = np.zeros(flat.shape, bool)
+    is_corner.ravel()[corners] = True
+    return Quadtree(sizes, wp.array(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
+
+
+def keys_of(sides: wp.array, keys: np.ndarray, across: int) -> np.ndarray:
+    """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
+    row, column = probe_grid(sides.shape[1:], across)
+    return np.append(keys, -1)[sides.numpy()[:, row[:, None], column]]
