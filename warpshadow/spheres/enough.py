@@ -15,7 +15,7 @@ TRIED = (8, 32, 128, 512)
 MOST_SPHERES = 2 * TRIED[-1]
 
 _STEPS, _STEPS_MORE = 40, 1 / 8
-"""Steps of a short fit, and how many more a sphere. With 40 for all, 512 spheres were no better than 128."""
+"""Steps of a short fit, and how many more a sphere. With 40 for all, 512 spheres of a table were no better than 256."""
 
 _JUDGES = 1024
 

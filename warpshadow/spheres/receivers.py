@@ -15,7 +15,7 @@ BUNDLE = 16
 """Directions of a receiver's hemisphere that are near each other, which a sphere reaches or misses together."""
 
 LEAST_LIGHT = 0.01
-"""Lights of the metric that count less than this, next to the strongest, are left out: 27 of 128 are in."""
+"""Lights of the metric that count less than this, next to the strongest, are left out: 28 of 128 are in."""
 
 _RAY_COST = 500.0
 """Nanoseconds that a ray takes."""
