@@ -242,7 +242,7 @@ def sphere_light(points, normals, centers, radii, exitance, passing, unblocked, 
     """
     shares = blocked_shares(points, centers, radii, directions) if shares is None else shares
     distance2 = ((centers - points[:, None]) ** 2).sum(axis=-1)
-    weights = shares / (distance2 + radii**2 / 16)[:, :, None]
+    weights = shares / ((distance2 + radii**2 / 16) ** 2)[:, :, None]
     sums = np.einsum("vsq,sqc->vqc", weights, exitance)
     is_met = sums[..., 3:] > 0
     mean = np.where(is_met, sums[..., :3] / np.where(is_met, sums[..., 3:], 1), 0)

@@ -318,4 +318,4 @@ def test_spheres_that_are_left_out_are_as_those_of_no_radius(skip, device, monke
     expected, expected_gradients = gradients(values, weights, 16, device, **options)
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
     for ours, wanted in zip(got_gradients, expected_gradients, strict=True):
-        np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())  # measured 2e-4
+        assert np.linalg.norm(ours - wanted) <= ADJOINT * np.linalg.norm(wanted)

@@ -20,7 +20,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, Outgoing, SeenCells, StandIns, see_cells
+from warpshadow.pipeline.bounces.gathering import (
+    ALL_FLAT,
+    Gathering,
+    Outgoing,
+    SeenCells,
+    ShownPatches,
+    StandIns,
+    see_cells,
+)
 from warpshadow.pipeline.bounces.kept import KeptBounces
 from warpshadow.pipeline.bounces.own_factors import OwnFactors
 from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
@@ -107,9 +115,8 @@ class Sources(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     seen: SeenParts  # what they see
-    spheres: Source  # that stand in for bodies
     frames: Node  # of flat bodies
-    shown: Node  # what patches show of their area towards cells
+    shown: Node  # patches as receivers see them
 
 
 class Radiosity(Node):
@@ -125,7 +132,7 @@ class Radiosity(Node):
         albedo: Node,
         sources: Sources,
     ):
-        _, spheres, frames, shown = sources
+        _, frames, shown = sources
         self._count, self._stand_ins, self._own_factors, self._gathering = count, stand_ins, own_factors, gathering
         senders = stand_ins.senders
         words = f"{len(senders.areas):,} patches"
@@ -133,16 +140,16 @@ class Radiosity(Node):
         self._reflect = Node("radiosity", patch_radiosity, albedo, lit, items=words, keeps=False)
         self._own = Node("own light of patches", patch_radiosity, albedo, lit, items=words, idle=idle, keeps=False)
         beside = self._reflect, self._own, *gathering.stages
-        super().__init__("", None, lit, albedo, shown, spheres, frames, beside=beside)
+        super().__init__("", None, lit, albedo, shown, frames, beside=beside)
 
     def compute(self, call: Call) -> Outgoing:
         """Reflect direct light, then light that has bounced once, and so on; what bodies send themselves for longer."""
-        lit, albedo, shown, spheres, frames = self.values(call)
+        lit, albedo, shown, frames = self.values(call)
         senders, count = self._stand_ins.senders, self._count
         between = None if self._own.idle else self._own_factors.between_patches(senders, [part.group for part in lit])
 
         def sent(radiosity: wp.array) -> Outgoing:
-            return Outgoing(self._stand_ins, radiosity, shown, spheres, frames)
+            return Outgoing(self._stand_ins, radiosity, shown, frames)
 
         def past_own(radiosity: wp.array | None) -> wp.array:
             """What patches send of the light of the sky and of others."""
@@ -245,14 +252,14 @@ class SphereBounces:
         """Sources among the bodies among which points are."""
         senders, flats, spheres = stand_ins.senders, stand_ins.flats, points.spheres
 
-        def show(sources: Receivers, seen: list[SeenPart], *given: Any) -> wp.array:
+        def show(sources: Receivers, seen: list[SeenPart], *given: Any) -> ShownPatches:
             return stand_ins.shown(sources, [part.cells for part in seen], *given)
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.kept("sources", senders, lambda: make(items=_words(senders)))
         seen = see(self._at(sources, points, points.materials, stand_ins.spheres_of_sources), where=_OF_SOURCES)
         frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
-        return Sources(seen, spheres, frames, Node("", show, sources, seen, spheres, frames))
+        return Sources(seen, frames, Node("", show, sources, seen, spheres, frames))
 
     def _radiosity(self, sources: Sources, taken: Node, stand_ins: StandIns, materials: Materials) -> Radiosity:
         """What patches send in the light in which sources are."""

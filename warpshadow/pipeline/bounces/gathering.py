@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import common_batch, cut, expand, expand_rows
+from warpshadow.device.batch import common_batch, concatenate, cut, expand, expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bounces.own_factors import OwnFactors
@@ -29,6 +29,7 @@ from warpshadow.stages.bounces.flat_light import flat_light
 from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.bounces.stand_ins import place_stand_ins
 from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
 from warpshadow.stages.flats.prepared import FlatBody, Flats
 from warpshadow.stages.receivers import Receivers
@@ -94,6 +95,15 @@ class PlacedFlats(NamedTuple):
     number: dict[int | None, int]  # of each among them, by the number of the body
 
 
+class ShownPatches(NamedTuple):
+    """Patches as receivers see them, by the spheres that stand in for those of bodies that are not flat."""
+
+    areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]
+    centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
+    radii: wp.array  # likewise, 0 for patches of flat bodies
+    clusters: Clusters
+
+
 class StandIns:
     """What stands in for bodies that send light: flats for those in a plane, spheres for all others.
 
@@ -129,36 +139,48 @@ class StandIns:
         return solid_bodies(self.assembly)
 
     @functools.cached_property
-    def patches_of_spheres(self) -> tuple[np.ndarray, np.ndarray]:
-        """The patches that each sphere stands in for: where they begin, and numbers."""
-        return patches_of_nodes(*self._nearest, merging=self.merging)
+    def dark(self) -> list[int]:
+        """Those of them that send nothing: the spheres by which they block stand in for them."""
+        return [body for body in self.solid if body not in self.senders.bodies]
+
+    def span_of(self, body: int | None) -> tuple[int, int]:
+        """Where the stand-ins of a body begin and end."""
+        first = self.senders.first
+        if body in self.senders.bodies:
+            place = self.senders.bodies.index(body)
+            return int(first[place]), int(first[place + 1])
+        begin, end = self.assembly.spheres_among(self.dark, body)
+        return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
     @functools.cached_property
-    def _nearest(self) -> tuple[np.ndarray, np.ndarray]:
-        """For each patch the nearest sphere of its body, and for each sphere the nearest patch; −1 for none."""
+    def patches_of_nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The patches of each stand-in, and of those that they merge into: where they begin, and numbers."""
+        count = int(self.assembly.sphere_counts[self.dark].sum())
+        numbers = np.arange(len(self.senders.areas))
+        return patches_of_nodes(numbers, np.full(len(numbers) + count, -1), merging=self.merging)
+
+    @functools.cached_property
+    def _blockers(self) -> tuple[np.ndarray, np.ndarray]:
+        """The sphere of its body beside each patch, −1 for none, and the radius of its stand-in in that sphere's."""
         rest, first_sphere, senders = self.assembly.rest, self.assembly.first_sphere, self.senders
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
-        spheres, start = np.full(len(senders.areas), -1, np.int32), 0
-        nearest = [np.empty(0, int)]
-        for other in self.solid:
-            of_body = slice(*first_sphere[other : other + 2])
-            count = len(radii[of_body])
-            of_spheres = np.full(count, -1)
-            if count and other in senders.bodies:
-                place = senders.bodies.index(other)
-                patches, first = senders.patches[place], senders.first[place]
-                nearest_spheres = patches.nearest_spheres(centers[of_body], radii[of_body])
-                spheres[first : senders.first[place + 1]] = start + nearest_spheres
-                gaps = np.linalg.norm(centers[of_body][:, None] - patches.centers, axis=2)
-                of_spheres = first + gaps.argmin(axis=1)
-            nearest.append(of_spheres)
-            start += count
-        return spheres, np.concatenate(nearest)
+        numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)
+        start = 0
+        for body in self.solid:
+            of_body = slice(*first_sphere[body : body + 2])
+            if len(radii[of_body]) and body in senders.bodies:
+                place = senders.bodies.index(body)
+                patches, own = senders.patches[place], slice(*senders.first[place : place + 2])
+                nearest = patches.nearest_spheres(centers[of_body], radii[of_body])
+                numbers[own] = start + nearest
+                ratios[own] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
+            start += len(radii[of_body])
+        return numbers, ratios
 
     @functools.cached_property
     def spheres_of_sources(self) -> np.ndarray:
         """The sphere that stands in for each source, among those of bodies that are not flat; −1 for none."""
-        return self._nearest[0][self.senders.patch_of_source]
+        return self._blockers[0][self.senders.patch_of_source]
 
     def shown(
         self,
@@ -166,8 +188,8 @@ class StandIns:
         cells: list[SeenCells],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
-    ) -> wp.array:
-        """What patches show of their area towards cells, [batch, patch, cell].
+    ) -> ShownPatches:
+        """Patches as receivers see them.
 
         Args:
             sources: Where they are lit.
@@ -176,8 +198,8 @@ class StandIns:
             frames: Where flat bodies are.
         """
         normals, flats, senders = sources.normals, self.flats, self.senders
+        centers, radii = self.assembly.spheres_of(self.solid, spheres)
         if flats is not None:
-            centers, radii = self.assembly.spheres_of(self.solid, spheres)
             numbers, points, device = self.spheres_of_sources, sources.points, normals.device
             of_sources = SpheresOfPoints(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_sources, frames, flats.all)
@@ -189,7 +211,13 @@ class StandIns:
         passing = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
         passing = passing.reshape((len(passing), len(senders.sides), len(directions)))
-        return shown_areas(normals, passing, senders.mean, directions)
+        placed = place_stand_ins(sources, senders.mean, radii, *self._blockers)
+        if self.dark:
+            others = self.assembly.spheres_of(self.dark, spheres)
+            counts = [len(senders.areas), others[1].shape[1]]
+            placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
+        areas = shown_areas(normals, passing, senders.mean, directions)
+        return ShownPatches(areas, *placed, find_clusters(*placed, self.merging))
 
 
 class Outgoing:
@@ -198,8 +226,7 @@ class Outgoing:
     Args:
         stand_ins: What stands in for the bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
-        shown: Part of the area of each patch that it shows towards each cell, [batch, patch, cell].
-        spheres: Centers and radii of all spheres.
+        shown: The patches as receivers see them.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · flat].
     """
 
@@ -207,12 +234,11 @@ class Outgoing:
         self,
         stand_ins: StandIns,
         radiosity: wp.array,
-        shown: wp.array,
-        spheres: tuple[wp.array, wp.array],
+        shown: ShownPatches,
         frames: wp.array,
     ):
         self.stand_ins, self.senders, self.radiosity = stand_ins, stand_ins.senders, radiosity
-        self._shown, self._spheres, self.frames = shown, spheres, frames
+        self.shown, self.frames = shown, frames
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -220,12 +246,10 @@ class Outgoing:
         return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
 
     @functools.cached_property
-    def of_spheres(self) -> tuple[wp.array, wp.array, wp.array, Clusters]:
-        """Centers and radii of the spheres that stand in for bodies, what they send towards cells, and clusters."""
+    def exitance(self) -> wp.array:
+        """What stand-ins of patches send towards cells, vec4 of shape [batch, node, cell]."""
         stand_ins = self.stand_ins
-        centers, radii = stand_ins.assembly.spheres_of(stand_ins.solid, self._spheres)
-        given = self.radiosity, self._shown, self.senders.areas, *stand_ins.patches_of_spheres
-        return centers, radii, sphere_exitance(*given), find_clusters(centers, radii, stand_ins.merging)
+        return sphere_exitance(self.radiosity, self.shown.areas, self.senders.areas, *stand_ins.patches_of_nodes)
 
 
 class Gathering:
@@ -292,15 +316,13 @@ class Gathering:
         return flat_light(*given, cells.directions, fronts=fronts, skip=skip)
 
     def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
-        stand_ins = outgoing.stand_ins
-        skip = stand_ins.assembly.spheres_among(stand_ins.solid, group.body)
-        if skip == (0, int(stand_ins.assembly.sphere_counts[stand_ins.solid].sum())):
+        if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        own_centers, own_radii, exitance, clusters = outgoing.of_spheres
-        count = common_batch({"geometry": group.points, "light": exitance})
-        spheres = own_centers, own_radii
-        points, normals, centers, radii = (expand(a, count) for a in (group.points, group.normals, *spheres))
-        given = (
+        shown, exitance = outgoing.shown, outgoing.exitance
+        count = common_batch({"geometry": group.points, "light": exitance, "stand-ins": shown.radii})
+        points, normals = expand(group.points, count), expand(group.normals, count)
+        centers, radii = expand(shown.centers, count), expand(shown.radii, count)
+        return sphere_light(
             points,
             normals,
             centers,
@@ -309,9 +331,8 @@ class Gathering:
             expand_rows(cells.past_solid, count),
             cells.past_own,
             cells.directions,
+            softness=self._visibility.softness,
+            merging=self._visibility.merging,
+            skip=outgoing.stand_ins.span_of(group.body),
+            clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,
         )
-        options: dict[str, Any] = {"skip": skip}
-        if radii is own_radii and centers is own_centers:
-            options["clusters"] = clusters
-        visibility = self._visibility
-        return sphere_light(*given, softness=visibility.softness, merging=visibility.merging, **options)

@@ -45,7 +45,9 @@ def patches_of_nodes(
     Returns:
         Where the patches of each node begin, and the end, int32 of shape [node + 1]; and these patches, int32.
     """
-    lists = [np.flatnonzero(spheres == sphere) for sphere in range(len(nearest))]
+    order = np.argsort(spheres, kind="stable")
+    ends = np.searchsorted(spheres[order], np.arange(len(nearest) + 1))
+    lists = [order[first:end] for first, end in zip(ends[:-1], ends[1:], strict=True)]
     lists = [own if len(own) or patch < 0 else np.array([patch]) for own, patch in zip(lists, nearest, strict=True)]
     for quad in range(merged_count(len(nearest), merging)):
         lists.append(np.concatenate(lists[QUAD * quad : QUAD * (quad + 1)]))
