@@ -175,3 +175,16 @@ def test_vertices_of_no_face_do_not_change_the_grids_of_other_bodies():
     with_stray = dataclasses.replace(scene, bodies=(dataclasses.replace(ball, mesh=stray), floor))
     found = [SceneFlats(Assembly(each)).others(1)[0] for each in (scene, with_stray)]
     np.testing.assert_array_equal(*found)
+
+
+def test_the_edge_of_a_plate_in_a_sun_is_as_soft_as_the_sun():
+    """With the whole cell of the sun for an edge it is 2.9 times as soft, and the image 3.5% off; 1.2% so."""
+    plate = ws.Body(ws.plane(1.0, 1), translation=(0, 0.7, 0), rotation=(0, 20, 0))
+    sun = ws.synthetic_sky((0.5, 0.6, 0.4), sun_radius=2, sun_strength=3, height=128)
+    camera = ws.Camera.look_at((0, 4, 0.1), (-0.6, 0, -0.5), fov_y=40, size=(48, 48))
+    scene = ws.Scene([ws.Body(ws.plane(6.0, 1), receivers="pixel"), plate], sun, camera)
+    image, truth = (
+        ws.render(scene),
+        ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=1024))),
+    )
+    assert np.sqrt(np.mean((image - truth)[..., :3] ** 2)) < 0.02 * truth[..., :3].mean()

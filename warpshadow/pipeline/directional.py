@@ -120,7 +120,8 @@ class Directional(SphereMethod):
             return seen
         if taken.narrow is not None:
             directions, places, scale = taken.narrow
-            narrow = cover(directions, radius=scale * cell_radius(len(directions)))
+            # a plane has its own edges: they need no room for the rest of a cell, as spheres do not
+            narrow = cover(directions, radius=self.visibility.softness * scale * cell_radius(len(directions)))
             assert narrow is not None
             covered = put_narrow(covered, narrow, places)
         return seen._replace(past_all=past_coverage(past_solid, covered), past_solid=past_solid)
