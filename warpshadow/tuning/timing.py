@@ -86,7 +86,8 @@ class _Stage:
     """
 
     def __init__(self, scene: Scene, device: wp.DeviceLike):
-        self.scene = replace(scene, visibility=scene.visibility.by("none"))
+        shadowed = Renderer(scene, device=device)
+        self.scene = replace(shadowed.scene, visibility=scene.visibility.by("none"))
         self._renderer = Renderer(self.scene, device=device)
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
@@ -100,7 +101,9 @@ class _Stage:
         chosen = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
         chosen = chosen[np.argsort(bodies[at[chosen]], kind="stable")]  # as on_faces wants them
         self._sample = sides[at[chosen]], weights[chosen]
-        self.extrapolation = self._view.receivers.points.shape[1] / len(chosen)
+        is_adaptive = any(body.receivers == "adaptive" for body in shadowed.scene.bodies)
+        found = (shadowed.view() if is_adaptive else self._view).receivers  # adaptive ones are where shadows end
+        self.extrapolation = found.points.shape[1] / len(chosen)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""
