@@ -202,7 +202,7 @@ def random_batch(renderer: TorchRenderer, count: int) -> dict[str, torch.Tensor]
     return {
         "turns": 0.3 * torch.randn(count, 2, 3, generator=generator),
         "shifts": 0.1 * torch.randn(count, 2, 3, generator=generator),
-        "clip_matrices": camera + 0.02 * torch.randn(count, 4, 4, generator=generator) * (camera != 0),
+        "clip_matrices": camera * (1 + 0.01 * torch.randn(count, 4, 4, generator=generator)),
         "light": torch.rand(count, basis_size, 3, generator=generator),
         "albedo": torch.rand(count, 1, 3, generator=generator),
         "textures": torch.rand(count, 5, 4, 3, generator=generator),
