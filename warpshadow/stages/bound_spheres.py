@@ -5,7 +5,8 @@ A center moves by the weighted mean of how its vertices move, and a radius grows
     c' = c + Σ w_v (x'_v − x_v)        r' = r (Σ a_v |x'_v − c'|² / Σ a_v |x_v − c|²)^½
 
 where a_v falls off with the distance, and w are the moving least squares weights of it (Σ w_v = 1, Σ w_v x_v = c;
-Schaefer et al. 2006): so spheres follow any affine map, rotations and stretches among them, as if they were its points.
+Schaefer et al. 2006): so centers follow any affine map, rotations and stretches among them, as if they were its points,
+to within the ridge that keeps weights small (Σ w_v x_v is c to 0.2% of the distances).
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ by interpolation is not what they would see themselves (Ward's irradiance cachin
 *probes*, the corners of squares of 2 × 2 pixels, at which somebody knows the light well enough. In a square of corners
 a b / c d are two triangles a b c and d c b, in which samples interpolate linearly.
 
-A square holds if its corners see one side of one body. Samples within it that see another side, or whose pixel is no
-part of a square that holds, have no part in it: they are receivers themselves.
+A square holds if its corners see one side of one body, and, if it is larger than a pixel, samples within it would be
+off by less than the tolerance. Samples within it that see another side, or whose pixel is no part of a square that
+holds, have no part in it: they are receivers themselves.
 """
 
 from typing import NamedTuple

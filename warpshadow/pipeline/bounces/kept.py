@@ -1,9 +1,9 @@
 """Bounces where geometry does not move: rays once, then small matrices in each iteration, by any method that lights.
 
 Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
-With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces,
+With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
 
-    B = a (M S + M F B),  M the mean over sources,        starting from B = a M S,
+    B = a (M S + M F B),  M the mean over sources outside of other bodies,        starting from B = a M S,
 
 and what receivers get of it, F B. Light that a body sends to itself may go on for longer than that.
 Receivers of an image are many: F is found at some of them, and interpolated.
@@ -11,9 +11,8 @@ Receivers of an image are many: F is found at some of them, and interpolated.
 Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
 even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
 white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
-in means over the sources of a patch nor as nodes.
-It is linear in light: of free light among bodies whose colors are known all of it is one matrix, which is kept.
-Differentiable in light and albedo.
+in means over the sources of a patch nor as nodes. The radiosity is linear in light: of free light among bodies whose
+colors are known all of it is one matrix, which is kept. Differentiable in light and albedo.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ OWN_BOUNCES = 8
 """How often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then."""
 
 _COUNTED = 6
-"""Bounces among patches before the tail; the receivers find one more. In a white room that is open in front the energy
-among patches is then 1.0% too low, with four bounces 8.6%, and at an albedo of 0.9 0.3% and 3.6%."""
+"""Terms of the sum over bounces among patches, direct light being the first, before the tail; receivers find one bounce
+more. In a white room that is open in front the energy among patches is then 1.0% too low, with four bounces 8.6%, and at an albedo of 0.9 0.3% and 3.6%."""
 
 
 def after_bounces(
@@ -30,10 +30,11 @@ def after_bounces(
 
     Args:
         bounces: How often light bounces.
-        light: Takes the radiosity of patches, or None for direct light alone, to what they get past their own bodies.
-        reflect: Takes that and the radiosity, None for none, to what patches send of it and of their own body's light.
+        light: Of the radiosity of patches, or of direct light for None: what patches reflect of the light of others.
+        reflect: Adds to that what they reflect of their own body's light, given the radiosity, None for none.
         areas: Of patches, shape [patch].
-        own_bounces: How often a body's light for itself goes on after the others; 0 where there is none.
+        own_bounces: How often a body's light for itself goes on: after the last of a number of bounces, and
+            after each of "all"; 0 where there is none.
     """
     past = light(None)
     radiosity = reflect(past, None)

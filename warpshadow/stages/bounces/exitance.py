@@ -1,6 +1,7 @@
 """Exitance of spheres: the light that the patches of a body send, told by the spheres that stand in for it.
 
-A patch p belongs to a sphere near it. Towards a receiver that sees the sphere in direction ω, its patches send
+Each patch p has a sphere of its own; several share one only where spheres are merged. Towards a receiver that sees the
+sphere in direction ω, its patches send
 
     E_j(ω) = Σ_p A_p (g_p + 0.01) B_p / Σ_p A_p (g_p + 0.01)
 

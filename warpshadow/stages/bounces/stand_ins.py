@@ -1,12 +1,12 @@
 """Stand-ins: the spheres that receivers see in place of the patches of bodies that are not flat.
 
-A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: that around a square patch, so that
-neighbors overlap, bulging out of the body by half of that. As bodies grow, so does it, by the radius of the sphere
-that blocks light beside it.
+A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
+patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
+sphere that blocks light beside it.
 
-Before, that sphere, with all patches around it, stood in for them. Bounced light at the foot of a ball was then that of
-the ball's whole side, where a receiver sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact
-of a ball with a ground 6.0, 1.7 and 1.3 times that of paths; by these 1.36, 0.96 and 0.94 times.
+If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
+whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
+ground by 6.0, 1.7 and 1.3 times the light of paths; with a sphere for each patch it is 1.36, 0.96 and 0.94 times.
 """
 
 import numpy as np

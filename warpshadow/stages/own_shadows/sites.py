@@ -17,10 +17,11 @@ from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.sides import split_side
 
 _SMALL_FACES = 10_000
-"""Faces that a body is cut into at least, so that what lies between sites is seen: 507 vertices alone lose 3.5%."""
+"""Faces of the even cut by which edges are judged, so that what lies between sites is seen: 507 vertices alone lose
+3.5%."""
 
 _LONG = 1.2
-"""Longest edge where samples receive, in edges of a body that is cut evenly into so many faces."""
+"""Longest edge where samples receive, in edges of that even cut."""
 
 _LONG_BETWEEN_VERTICES = 4.0
 """The same where only vertices receive: sites between them are there for vertices that are buried …"""

@@ -1,11 +1,12 @@
 """Sun cells: what receivers of a body see past it of the brightest cells, by rays from each.
 
-Between sites the sharp edge of a sun's shadow is interpolated, and has teeth. So where nobody asks for a gradient, each
-receiver sends 16 rays ω_r, drawn from the light of the cell, as a packet in the frame of the body:
+Between sites the sharp edge of a sun's shadow is interpolated, and has teeth. With ``self_shadows = "rays"`` each
+receiver at a pixel, which then has no gradient to a rotation, sends 16 rays ω_r, drawn from the light of the cell, as a
+packet in the frame of the body:
 
     T_self = Σ_r V_r max(n·ω_r, 0) / Σ_r max(n·ω_r, 0)
 
-A receiver is where its sites have it.
+A receiver is put where the corners of its piece interpolate it to, in the frame of the body.
 """
 
 import functools
