@@ -16,14 +16,13 @@ import warp as wp
 
 from warpshadow.device.lanes import vectors_type
 from warpshadow.maths.directions import CHUNK
+from warpshadow.stages.ray_tracing import RAISE, ROUNDING, UPRIGHT
 
 PACKET = CHUNK
 """Rays of a packet."""
 
 _LEAF = 4
 """Faces of a leaf at most."""
-
-_ROUNDING, _UPRIGHT, _RAISE = 2.0**-21, 1.0e-3, 1.0e-4
 
 _SLACK = 2.0**-20
 """How far boxes reach beyond their faces, as a part of the largest coordinate: points lie on faces to rounding."""
@@ -117,10 +116,10 @@ def make_find_open() -> wp.Function:
         for (int k = 0; k < 3; ++k)
             size += wp::abs(across[k]) * wp::max(wp::max(wp::abs(corner[0][k]), wp::abs(corner[1][k])),
                                                  wp::max(wp::abs(corner[2][k]), wp::abs(point[k])));
-        if (wp::abs(drop) <= {_ROUNDING} * size) {{
+        if (wp::abs(drop) <= {ROUNDING} * size) {{
             const double length = wp::length(across);
             const double upward = across[0] * normal[0] + across[1] * normal[1] + across[2] * normal[2];
-            const double height = upward < -{_UPRIGHT} * length ? -{_RAISE} : {_RAISE};
+            const double height = upward < -{UPRIGHT} * length ? -{RAISE} : {RAISE};
             const wp::vec3d move = wp::mul(across, (drop / length + height * wp::sqrt(length)) / length);
             p -= move;
             q -= move;

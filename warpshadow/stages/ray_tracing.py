@@ -17,14 +17,14 @@ from warpshadow.stages.light_samples import CellSamples, LightSamples
 RAY_COST = 200.0
 """Nanoseconds that a ray takes."""
 
-_ROUNDING = 2.0**-21
+ROUNDING = 2.0**-21
 """How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
 
-_UPRIGHT = 1.0e-3
+UPRIGHT = 1.0e-3
 """Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
 in front of it then, whatever rounding says."""
 
-_RAISE = 1.0e-4
+RAISE = 1.0e-4
 """Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
 
 
@@ -46,11 +46,11 @@ def _seen_from(point: wp.vec3, normal: wp.vec3, corner_a: wp.vec3, corner_b: wp.
     drop = wp.dot(across, a)  # from the plane to the receiver, times |across|
     largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
     lies_on = bool(False)
-    if wp.abs(drop) <= wp.float64(_ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
+    if wp.abs(drop) <= wp.float64(ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
         length = wp.length(across)
         upward = wp.dot(across, wp.vec3d(normal))
-        lies_on = wp.abs(upward) >= wp.float64(_UPRIGHT) * length
-        height = wp.where(upward < wp.float64(-_UPRIGHT) * length, -_RAISE, _RAISE)
+        lies_on = wp.abs(upward) >= wp.float64(UPRIGHT) * length
+        height = wp.where(upward < wp.float64(-UPRIGHT) * length, -RAISE, RAISE)
         move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
         a -= move
         b -= move

@@ -15,7 +15,8 @@ OWN_BOUNCES = 8
 
 _COUNTED = 6
 """Terms of the sum over bounces among patches, direct light being the first, before the tail; receivers find one bounce
-more. In a white room that is open in front the energy among patches is then 1.0% too low, with four bounces 8.6%, and at an albedo of 0.9 0.3% and 3.6%."""
+more. In a white room that is open in front the energy among patches is then 1.0% too low, with four terms 8.6%, and at
+an albedo of 0.9 0.3% and 3.6%."""
 
 
 def after_bounces(
