@@ -138,7 +138,7 @@ class Renderer:
         if METHODS[self.assembly.scene.visibility.method].lights_samples:  # whatever the bodies say
             return [Choice(body.receivers, None) for body in self.assembly.scene.bodies]
         with unrecorded():
-            return choose_receivers(self.assembly, self.cameras)
+            return choose_receivers(self.assembly, self.cameras, is_light_free=self._arguments["basis"] is not None)
 
     @one_at_a_time
     def with_cameras(self: Own, cameras: Sequence[Camera]) -> Own:
