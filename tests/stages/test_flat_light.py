@@ -122,12 +122,15 @@ def twin_light(points, normals, transmittance, frames, grids, radiosity, directi
                 continue
             own = None if fronts is None else fronts[receiver]
             sides = met_sides(point, omega, radius, frames, grids, radiosity, skip, own)
-            for k, (_, t, width, light, _) in enumerate(sides):
+            sent, shares = np.zeros(3), 0.0
+            for k, (own_h, t, width, light, _) in enumerate(sides):
                 unhidden = 1.0
                 for j, (h, other_t, other_width, _, _) in enumerate(sides):
                     if j != k:
                         unhidden *= 1 - h * ramp((t - other_t) / (width + other_width + 1e-20))
-                result[receiver] += weight * unhidden * light
+                sent, shares = sent + unhidden * light, shares + unhidden * own_h
+            if shares > 0:
+                result[receiver] += weight * min(1.0, sum(side[0] for side in sides)) * sent / shares
     return result
 
 

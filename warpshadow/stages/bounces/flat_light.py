@@ -3,10 +3,15 @@
 Their patches are the texels of a grid; :mod:`warpshadow.stages.flats.cells` has what a cell meets of it: coverage h,
 distance t, mean cosine c′ and radiosity B.
 
-A flat is seen from both sides, and its back is black unless it has patches there. Of several flats the nearest takes
-the cell; where they are at about the same distance, the cell is divided:
+A flat is seen from both sides, and its back is black unless it has patches there. Flats send all that they block of a
+cell (:mod:`warpshadow.stages.flats.passing`). The nearest sends most of it; where they are at about the same distance,
+they share it:
 
-    I = 4/Q Σ_q max(n·ω_q, 0) T_q Σ_k h_k B_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
+    I = 4/Q Σ_q max(n·ω_q, 0) T_q min(1, Σ_k h_k) Σ_k s_k B_k / Σ_k s_k
+    s_k = h_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
+
+By Σ s_k B_k alone, cells in which walls meet send 1 − h_k h_j instead of all: on the floor of a room of five planes 2%
+of the hemisphere were missing in 512 cells, and after all bounces 13% of the light.
 
 Measured for 150 receivers on a ball over a ground with the shadow of a disc, 24² texels: I is off by 2.0% (relative L2)
 with 128 cells and 1.3% with 1024; in a prototype by 2.7 instead of 1.9% without mip levels.
@@ -51,6 +56,9 @@ from warpshadow.stages.sparse import multiply
 _CELL_COST = 15.0
 """Nanoseconds that a cell of a receiver takes, on average over those that meet a flat and those that do not."""
 
+_LEAST = wp.constant(1.0e-30)
+"""The least Σ s."""
+
 # Scratch of a receiver, vec3. What it is to each flat f, whose gradients have the same places:
 #     4 f        where it is along both axes, and its height
 #     4 f + 1    the axis u, of unit length; 4 f + 2 the axis v, and 4 f + 3 the normal
@@ -60,7 +68,7 @@ _CELL_COST = 15.0
 #     4 i        coverage, distance, and how much that varies over the cell
 #     4 i + 1    radiosity
 #     4 i + 2    coverage of the rectangle, what of that the mesh covers, and 1 / c′
-#     4 i + 3    place in the plane
+#     4 i + 3    place in the plane, and what of its light passes the sides in front of it
 _ROWS = 14
 
 
@@ -283,6 +291,24 @@ def _unhidden(i: int, but: int, cells: int, side_count: int, own: wp.array(dtype
 
 
 @wp.func
+def _mean_light(cells: int, side_count: int, own: wp.array(dtype=wp.vec3)):
+    """Find the mean radiosity of what a cell meets, by its weights s; also their sum, and that of coverages."""
+    light = wp.vec3()
+    weights = float(0.0)
+    covered = float(0.0)
+    for i in range(side_count):
+        coverage = own[cells + 4 * i][0]
+        if coverage > 0.0:
+            unhidden = _unhidden(i, i, cells, side_count, own)
+            own[cells + 4 * i + 3][2] = unhidden
+            light += (own[cells + 4 * i + 2][0] * unhidden) * own[cells + 4 * i + 1]
+            weights += coverage * unhidden
+            covered += coverage
+    weights = wp.max(weights, _LEAST)
+    return light / weights, weights, covered
+
+
+@wp.func
 def _unhidden_adjoint(
     i: int, adj_part: float, cells: int, side_count: int, own: wp.array(dtype=wp.vec3), adj_own: wp.array(dtype=wp.vec3)
 ):
@@ -332,10 +358,8 @@ def _light_receivers(
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, receiver, q]
         if _meet_sides(scene, directions[q], sent, weight, side_count, own):
-            for i in range(side_count):
-                if own[cells + 4 * i][0] > 0.0:
-                    share = own[cells + 4 * i + 2][0] * _unhidden(i, i, cells, side_count, own)
-                    total += (weight * share) * own[cells + 4 * i + 1]
+            mean, _, covered = _mean_light(cells, side_count, own)
+            total += (weight * wp.min(covered, 1.0)) * mean
     light[batch, receiver] = (4.0 / float(directions.shape[0])) * total
 
 
@@ -387,17 +411,21 @@ def _light_receivers_adjoint(
         passing = transmittance[batch, receiver, q]
         weight = cosine * passing
         if _meet_sides(scene, direction, sent, cosine, side_count, own):
+            mean, weights, covered = _mean_light(cells, side_count, own)
+            value = wp.dot(adj, mean)
+            total = wp.min(covered, 1.0) * value
+            factor = weight * wp.min(covered, 1.0) / weights
+            adj_covered = wp.where(covered < 1.0, weight * value, 0.0)
             for i in range(side_count):
-                adj_own[cells + 4 * i] = wp.vec3()
-            total = float(0.0)
+                adj_own[cells + 4 * i] = wp.vec3(adj_covered, 0.0, 0.0)
             for i in range(side_count):
-                if own[cells + 4 * i][0] > 0.0:
-                    share = own[cells + 4 * i + 2][0]
-                    value = share * wp.dot(adj, own[cells + 4 * i + 1])
-                    unhidden = _unhidden(i, i, cells, side_count, own)
-                    total += unhidden * value
-                    adj_own[cells + 4 * i + 1] = (weight * unhidden) * adj
-                    _unhidden_adjoint(i, weight * value, cells, side_count, own, adj_own)
+                coverage = own[cells + 4 * i][0]
+                if coverage > 0.0:
+                    unhidden = own[cells + 4 * i + 3][2]
+                    adj_unhidden = own[cells + 4 * i + 2][0] * wp.dot(adj, own[cells + 4 * i + 1]) - coverage * value
+                    adj_own[cells + 4 * i] = adj_own[cells + 4 * i] - wp.vec3(factor * unhidden * value, 0.0, 0.0)
+                    adj_own[cells + 4 * i + 1] = (factor * unhidden) * adj
+                    _unhidden_adjoint(i, factor * adj_unhidden, cells, side_count, own, adj_own)
             adj_normal += (passing * total) * direction
             if adj_transmittance:
                 adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + cosine * total
