@@ -16,7 +16,7 @@ skies = [ws.synthetic_sky(sun, sun_strength=2.0, sun_radius=10.0) for sun in ((0
 morning, evening = (torch.from_numpy(ws.Renderer(ws.Scene(bodies, sky, camera)).render()) for sky in skies)
 
 
-def fitted(draw, free, target, steps=200):
+def fitted(draw, free, target, steps=400):
     optimizer = torch.optim.Adam([free], lr=0.1)
     for _ in range(steps):
         optimizer.zero_grad()

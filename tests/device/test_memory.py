@@ -1,5 +1,6 @@
 """Memory: large arrays come in huge pages, where the system has them."""
 
+import mmap
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,8 @@ def flags_at(address: int) -> list[str]:
 @pytest.mark.skipif(not MAPPINGS.exists(), reason="Linux says what it was told about memory")
 @pytest.mark.parametrize("is_asked", [False, True])
 def test_huge_pages_are_asked_for(is_asked):
-    array = wp.empty(SIZE, dtype=wp.float32, device="cpu")  # so large that its memory is new
+    memory = np.frombuffer(mmap.mmap(-1, 4 * SIZE), np.float32)  # new: what others have freed may have been asked for
+    array = wp.array(memory, dtype=wp.float32, device="cpu", copy=False)
     if is_asked:
         in_huge_pages(array)
     assert ("hg" in flags_at(array.ptr + 2 * SIZE)) == is_asked
