@@ -2,9 +2,8 @@
 
 Flat bodies whose faces have more than 4 pixels are adaptive (:mod:`warpshadow.pipeline.adaptive`) where shadows may
 have edges, with directional visibility, where the light is known, and where arrays are readable, on a CPU: an image
-takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has about
-the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be: a
-light found with squares that followed the scene's was 10% off in another scene, in place of 6%.
+takes about 1.5 times as long as at the vertices of 64² quads, an iteration of a pose 1.2 times, and the ground has
+about the error that it has by pixel. Where a renderer has a basis, light is free, and nobody knows where edges will be.
 
 Between vertices light is interpolated, which shows where a face is large. Measured on a ground of 6 × 6 units under a
 sky with a sun, 256 × 256 pixels with 4 samples each, error of the image against rays, two cores:
