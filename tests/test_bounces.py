@@ -188,24 +188,37 @@ def test_bounces_add_ever_less_light():
     assert (gains[1:] < 0.5 * gains[:-1]).all()
 
 
-@pytest.mark.parametrize("is_kept", [False, True])
-def test_all_bounces_are_those_that_many_come_to(is_kept):
-    """In a room that is open in front, of albedo 0.8. At 0.7 "all" is 0.2% off and four bounces 4%."""
+def open_room(albedo, **options):
+    """Five planes of 2 × 2 around the origin, open in front, under a white sky."""
     walls = [((0, 0, 0), (0, -1, 0)), ((180, 0, 0), (0, 1, 0)), ((90, 0, 0), (0, 0, -1))]
     walls += [((0, 0, -90), (-1, 0, 0)), ((0, 0, 90), (1, 0, 0))]
     bodies = [
-        ws.Body(ws.plane(2.0, 8), albedo=(0.8, 0.8, 0.8), rotation=turn, translation=place, name=f"{place}")
+        ws.Body(ws.plane(2.0, 8), albedo=(albedo,) * 3, rotation=turn, translation=place, name=f"{place}", **options)
         for turn, place in walls
     ]
-    scene = ws.Scene(bodies, ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH)
-    camera, images = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=36, size=(24, 24)), []
+    camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=36, size=(24, 24))
+    return ws.Scene(bodies, ws.EnvironmentMap.constant(1.0, height=16), camera)
+
+
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_all_bounces_are_those_that_many_come_to(is_kept):
+    """In a room of albedo 0.8. At 0.7 "all" is 0.2% off and four bounces 4%."""
+    scene, images = open_room(0.8), []
     for bounces in (4, 16, "all"):
-        renderer = TorchRenderer(dataclasses.replace(scene, camera=camera, bounces=bounces))
-        albedo = [torch.full((1, 1, 3), 0.8) for _ in bodies] if is_kept else None
+        renderer = TorchRenderer(dataclasses.replace(scene, bounces=bounces))
+        albedo = [torch.full((1, 1, 3), 0.8) for _ in scene.bodies] if is_kept else None
         images.append(renderer(albedo=albedo).numpy()[..., :3])
     four, many, every = images
     assert relative_error(every, many) < 1e-2
     assert relative_error(four, many) > 3e-2
+
+
+def test_a_white_room_in_a_white_furnace_is_white():
+    """Measured 0.4% too dark, at worst 2.5%, in corners; by walls that send less than they block 14%, and 21%."""
+    scene = dataclasses.replace(open_room(1.0, receivers="vertex"), bounces="all")
+    shading = ws.Renderer(scene, progress=False).shade().numpy()
+    assert shading.mean() == pytest.approx(1, abs=0.005)
+    assert abs(shading - 1).max() < 0.03
 
 
 def test_a_black_body_hides_what_is_behind_it():

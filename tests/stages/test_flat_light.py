@@ -256,6 +256,21 @@ def test_light_is_that_of_the_formula(names, skip, two_sided, device):
         np.testing.assert_allclose(light[batch], setting.light(skip, batch), atol=FLOAT32)
 
 
+@pytest.mark.parametrize("skip", [None, 0])
+def test_white_flats_send_what_they_block(skip, device):
+    """Where cells are divided between flats without a remainder; a tenth of the light was missing without that."""
+    setting = Setting(device, two_sided=True)
+    points, normals, transmittance, vertices, radiosity = setting.arrays()
+    radiosity.fill_(1.0)
+    frames, flats = setting.flats.frames(vertices), setting.flats
+    light = flat_light(points, normals, transmittance, frames, radiosity, flats, DIRECTIONS, skip=skip).numpy()
+    passing = passing_flats(points, transmittance, frames, flats, DIRECTIONS, skip=skip).numpy()
+    weights = 4 / len(DIRECTIONS) * np.maximum(setting.normals @ DIRECTIONS.T, 0)
+    blocked = (weights * (setting.transmittance - passing)).sum(axis=2)
+    assert blocked.max() > 0.1
+    np.testing.assert_allclose(light[..., 0], blocked, atol=FLOAT32)
+
+
 @pytest.mark.parametrize("skip", [None, 1])
 def test_what_passes_is_that_of_the_formula(skip, device):
     setting = Setting(device, blocks=(True, False, True))

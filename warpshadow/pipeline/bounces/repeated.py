@@ -15,8 +15,9 @@ OWN_BOUNCES = 8
 
 _COUNTED = 6
 """Terms of the sum over bounces among patches, direct light being the first, before the tail; receivers find one bounce
-more. In a white room that is open in front the energy among patches is then 1.0% too low, with four terms 8.6%, and at
-an albedo of 0.9 0.3% and 3.6%."""
+more. In a white room that is open in front the energy among patches is then 0.1% too low, with four terms 2.0%, and at
+an albedo of 0.9 0.01% and 0.9%. In a white room with a window it is 0.7% and 13% too low; with two bodies in it 13% and
+37%, for light stays between them and the floor."""
 
 
 def after_bounces(

@@ -11,7 +11,7 @@ they share it:
     s_k = h_k Π_{j≠k} (1 − h_j S((t_k − t_j) / (t_k ρ/c′_k + t_j ρ/c′_j)))
 
 By Σ s_k B_k alone, cells in which walls meet send 1 − h_k h_j instead of all: on the floor of a room of five planes 2%
-of the hemisphere were missing in 512 cells, and after all bounces 13% of the light.
+of the hemisphere were missing in 512 cells, and of the light after all bounces 8% (in 128 cells 14%).
 
 Measured for 150 receivers on a ball over a ground with the shadow of a disc, 24² texels: I is off by 2.0% (relative L2)
 with 128 cells and 1.3% with 1024; in a prototype by 2.7 instead of 1.9% without mip levels.
