@@ -160,7 +160,9 @@ def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun, wherever it stands among the cells."""
     if scene.visibility.method != "directional" or not isinstance(scene.light, EnvironmentMap):
         return False
-    return scene.light.statistics()["brightest_percent_share"] > SUN_SHARE
+    share = scene.light.statistics()["brightest_percent_share"]
+    assert isinstance(share, float)
+    return share > SUN_SHARE
 
 
 def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:
