@@ -4,8 +4,8 @@
 
 Without ``--data`` the meshes are those that ship with Warp and a few shapes, under synthetic skies. ``--data`` adds the
 meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) of a folder. Each scene is a body of 2 units on a ground of
-6 units, 256 × 256; the figure is the relative L2 error over wholly covered pixels, in percent. The ground is shaded at
-its vertices, as by any ``ws.Renderer``; ``ws.render`` does it by pixel.
+6 units, 256 × 256; the figure is the relative L2 error over wholly covered pixels, in percent. Images
+are those of a ``ws.Renderer``; stills of ``ws.render`` are nearer.
 """
 
 import argparse

@@ -92,7 +92,7 @@ def test_gradients_of_rotations_are_refused_where_pixels_send_rays():
     renderer = Renderer(scene_of("pixel", light=light, self_shadows="rays", directions=128))
     with wp.Tape():
         poses = turned(renderer, (0, 0, 0), True)
-        with pytest.raises(ValueError, match='self_shadows: got "rays" where a rotation or a camera has a gradient'):
+        with pytest.raises(ValueError, match='self_shadows: got "rays" where a pose or a camera has a gradient'):
             renderer.shade(view=renderer.view(renderer.placed(poses)))
 
 

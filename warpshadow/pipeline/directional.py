@@ -137,7 +137,7 @@ class Directional(SphereMethod):
             return past_own
         if past_own.requires_grad:
             raise ValueError(
-                'self_shadows: got "rays" where a rotation or a camera has a gradient, which rays under a sun do not '
+                'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
         assert group.body is not None
