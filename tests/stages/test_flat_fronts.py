@@ -15,8 +15,18 @@ NUMBERS = np.array([0, 1, -1, 2, 0, -1, 3], np.int32)
 """The sphere of each receiver."""
 
 
-def twin_fronts(points, normals, corners, centers, radii, frames, grids):
-    """Fronts, and points off the planes: [receiver, flat + 3]."""
+def over_margin(points, frames, grids):
+    """Heights over flats in half margins, [flat, receiver]."""
+    found = []
+    for f, grid in enumerate(grids):
+        origin, u, v = frames[3 * f : 3 * f + 3]
+        up, margin = np.cross(u, v) / np.linalg.norm(np.cross(u, v)), np.linalg.norm(u) * margin_of(grid)
+        found.append(2 * (points - origin) @ up / margin)
+    return np.array(found)
+
+
+def twin_fronts(points, normals, corners, centers, radii, frames, grids, heights):
+    """Fronts, and points off the planes: [receiver, flat + 3]; steps by heights, which have no gradient, are given."""
     fronts, lifted = np.zeros((len(points), len(grids))), points.copy()
     for f, grid in enumerate(grids):
         origin, u, v = frames[3 * f : 3 * f + 3]
@@ -26,7 +36,7 @@ def twin_fronts(points, normals, corners, centers, radii, frames, grids):
         leaning = np.clip((of_corners.min() + of_corners.max()) / span, -1, 1)
         for point, (place, number) in enumerate(zip(points, NUMBERS, strict=True)):
             height = (place - origin) @ up
-            z = leaning + (1 - leaning**2) * normals[point] @ up + 2 * height / margin
+            z = leaning + (1 - leaning**2) * normals[point] @ up + heights[f, point]
             if number >= 0 and radii[number] > 0:
                 z = 1.25 * (height + (centers[number] - origin) @ up) / radii[number]
             fronts[point, f] = ramp(z)
@@ -58,7 +68,8 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
         spheres = SpheresOfPoints(centers, radii, numbers)
         fronts = find_fronts(points, normals, corners, spheres, frames, setting.flats)
         lifted = lifted_points(points, fronts, frames, setting.flats, None)
-    expected = twin_fronts(*values, setting.grids)
+    heights = over_margin(values[0], values[-1], setting.grids)
+    expected = twin_fronts(*values, setting.grids, heights)
     np.testing.assert_allclose(fronts.numpy()[0], expected[:, :3], atol=5e-3)  # of a margin near float32's rounding
     np.testing.assert_allclose(lifted.numpy()[0], expected[:, 3:], atol=1e-6)
     assert ((expected[:, :3] > 0.01) & (expected[:, :3] < 0.99)).sum() > 5
@@ -72,7 +83,7 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
         ends = []
         for sign in (1, -1):
             moved = [value + sign * step if place == number else value for place, value in enumerate(values)]
-            ends.append((weights * twin_fronts(*moved, setting.grids)).sum())
+            ends.append((weights * twin_fronts(*moved, setting.grids, heights)).sum())
         assert (array.grad.numpy()[0] * step).sum() == pytest.approx((ends[0] - ends[1]) / 2, rel=5e-3), number
 
 
