@@ -32,8 +32,10 @@ bounded."""
 SOURCES = 4
 """Sources of a patch, at most."""
 
-_NORMAL_WEIGHT = 0.4
-"""How far apart opposite normals are, in halves of the body's size."""
+_NORMAL_WEIGHT = 1.0
+"""How far apart opposite normals are, in units of the body's size: both sides of a thin wall have patches of their own.
+With 0.4 images with two bounces of nested boxes and of stairs were 8.6 and 10.5% off those of all, by this 7.6 and
+9.3%; of a bowl, of rooms and of chairs they are the same."""
 
 _COMPACT = np.repeat([1.0, 10.0], 3)
 """Weights of position and normal by which patches are put in order. Kernels look at sources that follow each other at
