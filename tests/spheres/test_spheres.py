@@ -22,7 +22,7 @@ from warpshadow.spheres import fit as fit_module
 from warpshadow.spheres import measure as stage_3
 from warpshadow.spheres import refine as stage_2
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.spheres.receivers import Receivers
+from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.stages.visibility.cones import BLEND, FADE
 from warpshadow.stages.visibility.directional import SOFTNESS, transmittance
 
@@ -95,7 +95,7 @@ def refinement(device):
     """A refinement of a small body, and spheres that receivers see from near, far and inside."""
     mesh, rng = normalized(bumpy(), device), np.random.default_rng(SEED)
     spheres = stage_1.greedy_cover(mesh, 12, rng)
-    return stage_2.Refinement(mesh, Receivers(mesh, 4096, rng), rng), spheres.astype(np.float32).astype(np.float64)
+    return stage_2.Refinement(mesh, FitReceivers(mesh, 4096, rng), rng), spheres.astype(np.float32).astype(np.float64)
 
 
 def seen_from(fit, chosen):
@@ -406,7 +406,7 @@ def test_a_body_has_as_many_spheres_as_it_needs(monkeypatch):
     monkeypatch.setattr(enough, "TRIED", (8, 32))
     meshes = (normalized(mesh, "cpu") for mesh in (icosphere(1.0, 3), box((1.0, 0.05, 0.8), 2)))
     for mesh, expected in zip(meshes, ((8, 16), (32, enough.MOST_SPHERES)), strict=True):
-        receivers = Receivers(mesh, 2048, np.random.default_rng(SEED))
+        receivers = FitReceivers(mesh, 2048, np.random.default_rng(SEED))
         assert enough.enough_spheres(mesh, receivers, seed=0) in expected
 
 

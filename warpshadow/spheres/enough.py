@@ -6,7 +6,7 @@ import numpy as np
 
 from warpshadow.spheres.cover import greedy_cover
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.spheres.receivers import Receivers
+from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.spheres.refine import Refinement
 
 AUTO = "auto"
@@ -32,13 +32,13 @@ Measured with 32 spheres, cow 0.11, box 0.19, bunny 0.19, bowl 0.32, table 0.37,
 0.07, bowl, table and slab 0.14, chair 0.18."""
 
 
-def enough_spheres(mesh: NormalizedMesh, receivers: Receivers, seed: int) -> int:
+def enough_spheres(mesh: NormalizedMesh, receivers: FitReceivers, seed: int) -> int:
     """How many spheres a body needs, a power of two from 8 to 1024.
 
     The error of short fits of 8, 32, 128 and 512 spheres falls with their number. Taken is where it is small enough, or
     where it falls no longer.
     """
-    judges = Receivers(mesh, _JUDGES, np.random.default_rng(seed + 1))
+    judges = FitReceivers(mesh, _JUDGES, np.random.default_rng(seed + 1))
     before = np.inf, np.inf
     for count in TRIED:
         rng = np.random.default_rng(seed)

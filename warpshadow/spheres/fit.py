@@ -27,7 +27,7 @@ from warpshadow.spheres.cover import descend_cover, greedy_cover
 from warpshadow.spheres.enough import AUTO, MOST_SPHERES, enough_spheres
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
-from warpshadow.spheres.receivers import Receivers
+from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.spheres.refine import Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
@@ -237,7 +237,7 @@ def _fit(job: _Job, progress: bool, count: int | str) -> tuple[np.ndarray, FitRe
     ):
         if count:
             if isinstance(count, str) or job.steps:
-                receivers = Receivers(mesh, RECEIVERS, rng)
+                receivers = FitReceivers(mesh, RECEIVERS, rng)
             if isinstance(count, str):
                 count = enough_spheres(mesh, receivers, job.seed)
             spheres = greedy_cover(mesh, count, rng)

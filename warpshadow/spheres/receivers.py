@@ -50,7 +50,7 @@ def hemisphere(count: int) -> np.ndarray:
     return directions[compact_order(directions, runs=(BUNDLE,))]
 
 
-class Receivers:
+class FitReceivers:
     """Receivers on a body, around it and in its cavities, and on grounds below it.
 
     Args:

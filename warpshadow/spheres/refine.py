@@ -26,7 +26,7 @@ from warpshadow.device.launch import launch
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.spheres.receivers import BUNDLE, Receivers
+from warpshadow.spheres.receivers import BUNDLE, FitReceivers
 from warpshadow.stages.visibility.cones import make_cone
 from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
 from warpshadow.stages.visibility.walk import seen_type
@@ -324,7 +324,7 @@ class Refinement:
     RATE = 0.003
     """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
 
-    def __init__(self, mesh: NormalizedMesh, receivers: Receivers, rng: np.random.Generator):
+    def __init__(self, mesh: NormalizedMesh, receivers: FitReceivers, rng: np.random.Generator):
         use_vector_registers(__name__)
         self.mesh, self.receivers, self.rng, self.device = mesh, receivers, rng, mesh.device
         bundles = np.ascontiguousarray(receivers.directions.T, dtype=np.float32).reshape(3, -1, BUNDLE)

@@ -152,7 +152,7 @@ class Radiosity(Node):
             return Outgoing(self._stand_ins, radiosity, shown, frames)
 
         def past_own(radiosity: wp.array | None) -> wp.array:
-            """What patches send of the light of the sky and of others."""
+            """Radiosity of patches by light from the sky and from other bodies."""
             if radiosity is None:
                 parts = [part.direct for part in lit]
             else:

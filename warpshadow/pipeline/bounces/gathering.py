@@ -140,7 +140,7 @@ class StandIns:
 
     @functools.cached_property
     def dark(self) -> list[int]:
-        """Those of them that send nothing: the spheres by which they block stand in for them."""
+        """Bodies that are not flat and send nothing: the spheres by which they block stand in for them."""
         return [body for body in self.solid if body not in self.senders.bodies]
 
     def span_of(self, body: int | None) -> tuple[int, int]:
@@ -247,7 +247,7 @@ class Outgoing:
 
     @functools.cached_property
     def exitance(self) -> wp.array:
-        """What stand-ins of patches send towards cells, vec4 of shape [batch, node, cell]."""
+        """Light that stand-ins of patches send towards cells, vec4 of shape [batch, node, cell]."""
         stand_ins = self.stand_ins
         return sphere_exitance(self.radiosity, self.shown.areas, self.senders.areas, *stand_ins.patches_of_nodes)
 

@@ -161,7 +161,7 @@ class KeptBounces:
         """What nodes get of light that has bounced, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
 
         def past_own(radiosity: wp.array | None) -> wp.array:
-            """What patches get of the light of the sky and of others."""
+            """Light on patches from the sky and from other bodies."""
             return at_patches if radiosity is None else multiply(factors.of_others, radiosity, plus=at_patches)
 
         def with_own(past: wp.array, radiosity: wp.array | None) -> wp.array:
@@ -274,7 +274,7 @@ class KeptBounces:
 
 
 def _mean(at_sources: wp.array, factors: _Factors) -> wp.array:
-    """What patches get of light at sources, vec3 of shape [batch, patch]. Differentiable: light."""
+    """Mean light on patches, given that at their sources: vec3 of shape [batch, patch]. Differentiable: light."""
     return multiply(factors.of_sources, at_sources)
 
 

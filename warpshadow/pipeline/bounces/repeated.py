@@ -32,8 +32,9 @@ def after_bounces(
 
     Args:
         bounces: How often light bounces.
-        light: Of the radiosity of patches, or of direct light for None: what patches reflect of the light of others.
-        reflect: Adds to that what they reflect of their own body's light, given the radiosity, None for none.
+        light: Of the radiosity of patches, or of the sky alone for None: light on patches from the sky and from other
+            bodies, in whatever form ``reflect`` takes it.
+        reflect: Of that and of the radiosity, None for none: the radiosity with their own body's light for it.
         areas: Of patches, shape [patch].
         own_bounces: How often a body's light for itself goes on: after the last of a number of bounces, and
             after each of "all"; 0 where there is none.
