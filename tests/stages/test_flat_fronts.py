@@ -6,7 +6,7 @@ import warp as wp
 from test_flat_light import Setting, margin_of, ramp
 
 from warpshadow.device.tape import recorded
-from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts, lifted_points
+from warpshadow.stages.flats.fronts import NearestBlockers, find_fronts, lifted_points
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -65,7 +65,7 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
     points, normals, corners, centers, radii, frames = given
     numbers = wp.array(NUMBERS, device=device)
     with recorded() as tape:
-        spheres = SpheresOfPoints(centers, radii, numbers)
+        spheres = NearestBlockers(centers, radii, numbers)
         fronts = find_fronts(points, normals, corners, spheres, frames, setting.flats)
         lifted = lifted_points(points, fronts, frames, setting.flats, None)
     heights = over_margin(values[0], values[-1], setting.grids)
@@ -95,7 +95,7 @@ def test_a_source_is_on_the_side_on_which_its_sphere_is(center, at_ground, deep,
     centers = wp.array([[[0.1, center, 0.1]]], dtype=wp.vec3, device=device)
     radii, numbers = wp.full((1, 1), 0.2, dtype=wp.float32, device=device), wp.zeros(2, wp.int32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
-    found = find_fronts(points, points, None, SpheresOfPoints(centers, radii, numbers), frames, setting.flats).numpy()[
+    found = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.flats).numpy()[
         0, :, 0
     ]
     np.testing.assert_allclose(found, [at_ground, deep], atol=1e-6)
@@ -110,7 +110,7 @@ def test_any_size_gives_finite_fronts_and_gradients(size, device):
     numbers = wp.zeros(2, wp.int32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device, requires_grad=True)
     with recorded() as tape:
-        fronts = find_fronts(points, points, None, SpheresOfPoints(centers, radii, numbers), frames, setting.flats)
+        fronts = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.flats)
     tape.backward(grads={fronts: wp.full(fronts.shape, 1.0, dtype=wp.float32, device=device)})
     for array in (fronts, *(given.grad for given in (points, centers, radii, frames))):
         assert np.isfinite(array.numpy()).all()

@@ -15,7 +15,7 @@ from warpshadow.pipeline.flats import FlatsAround, SceneFlats
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.own_shadows import OwnLobes, OwnLookup
-from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts, lifted_points
+from warpshadow.stages.flats.fronts import NearestBlockers, find_fronts, lifted_points
 from warpshadow.stages.flats.prepared import Flats
 from warpshadow.stages.kept_cells import KeptRows
 from warpshadow.stages.own_shadows.sites import Places
@@ -43,14 +43,14 @@ class Group(NamedTuple):
     places: Places | None = None  # where they lie on that body
     own_shadow: OwnLookup | OwnLobes | None = None  # by rays; None where there is none, or its spheres block
     flats: FlatsAround | None = None  # bodies that block as planes; None without any
-    as_spheres: SpheresOfPoints | None = None  # spheres by which others see them; None where they are not sources
+    nearest_blockers: NearestBlockers | None = None  # None where they are not sources of light
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: Clusters | None = None  # of the spheres, where they are found already
 
     def among(self, frames: wp.array, flats: Flats, skip: int | None) -> tuple[wp.array, wp.array]:
         """Where they are lit among flats, off the planes they lie in, and the part of each front that they see."""
-        fronts = find_fronts(self.points, self.normals, self.corners, self.as_spheres, frames, flats)
+        fronts = find_fronts(self.points, self.normals, self.corners, self.nearest_blockers, frames, flats)
         return lifted_points(self.points, fronts, frames, flats, skip), fronts
 
     def parts(self) -> Iterator[Group]:
@@ -79,7 +79,7 @@ class Group(NamedTuple):
                 centers=centers,
                 radii=radii,
                 places=None if self.places is None else self.places.part(part),
-                as_spheres=None if self.as_spheres is None else self.as_spheres.part(part),
+                nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.part(part),
                 clusters=clusters,
             )
 
@@ -146,10 +146,10 @@ class Grouping:
         bodies = self._solid(range(len(self._assembly.scene.bodies)))
         blocking, none = (self._assembly.spheres_of(some, spheres) for some in (bodies, []))
         clusters = None
-        as_spheres = self._as_spheres(spheres)
+        nearest_blockers = self._nearest_blockers(spheres)
         if not receivers.spans:
             flats = self._flats_around(frames)
-            yield Group(receivers.points, receivers.normals, *blocking, flats=flats, as_spheres=as_spheres)
+            yield Group(receivers.points, receivers.normals, *blocking, flats=flats, nearest_blockers=nearest_blockers)
         pose_count = len(self._points.vertices.value(call))
         for span in receivers.spans:
             facing = receivers.points, receivers.normals
@@ -170,8 +170,8 @@ class Grouping:
                 if corners is not None:
                     bounds = self._flats.first_corner[span.body : span.body + 2].tolist()
                     group = group._replace(corners=cut(corners, *bounds))
-            if as_spheres is not None:
-                group = group._replace(as_spheres=as_spheres.part(slice(span.first, span.end)))
+            if nearest_blockers is not None:
+                group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
             yield group
 
     def around(
@@ -190,13 +190,13 @@ class Grouping:
         """Those of some bodies that block by their spheres."""
         return [body for body in bodies if body not in self._points.blocking.flats]
 
-    def _as_spheres(self, spheres: tuple[wp.array, wp.array]) -> SpheresOfPoints | None:
-        """Spheres that stand in for the receivers."""
-        numbers, assembly = self._points.sphere_of_point, self._assembly
+    def _nearest_blockers(self, spheres: tuple[wp.array, wp.array]) -> NearestBlockers | None:
+        """The blockers nearest to the receivers; None where these are not sources."""
+        numbers, assembly = self._points.blocker_of_point, self._assembly
         if numbers is None:
             return None
         own = assembly.spheres_of(solid_bodies(assembly), spheres)
-        return SpheresOfPoints(*own, constant(numbers, wp.int32, assembly.device))
+        return NearestBlockers(*own, constant(numbers, wp.int32, assembly.device))
 
     def _flats_around(
         self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1

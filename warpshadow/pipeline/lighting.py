@@ -46,8 +46,8 @@ class LitPoints:
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocking: How the bodies block light.
         stands: Whether bodies and points are where the scene and its camera have them, for good.
-        sphere_of_point: Of points that send light, the number of the sphere that stands in for each, among those of
-            bodies that are not flat, −1 for none: NumPy of shape [receiver].
+        blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
+            spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
     """
 
     def __init__(
@@ -62,9 +62,9 @@ class LitPoints:
         normals: Node | None = None,
         blocking: Blocking = BY_SPHERES,
         stands: bool = False,
-        sphere_of_point: np.ndarray | None = None,
+        blocker_of_point: np.ndarray | None = None,
     ):
-        self.blocking, self.stands, self.sphere_of_point = blocking, stands, sphere_of_point
+        self.blocking, self.stands, self.blocker_of_point = blocking, stands, blocker_of_point
         self.method, self.materials, self.assembly = method, materials, method.assembly
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static

@@ -257,7 +257,7 @@ class SphereBounces:
 
         make = functools.partial(Node, "sources", senders.sources, points.vertices, points.normals)
         sources = points.kept("sources", senders, lambda: make(items=_words(senders)))
-        seen = see(self._at(sources, points, points.materials, stand_ins.spheres_of_sources), where=_OF_SOURCES)
+        seen = see(self._at(sources, points, points.materials, stand_ins.blocker_of_source), where=_OF_SOURCES)
         frames = Node("", flats.all.frames if flats else lambda _: None, points.vertices)
         return Sources(seen, frames, Node("", show, sources, seen, spheres, frames))
 
@@ -309,8 +309,8 @@ class SphereBounces:
         return KeptBounces(self._patches, self._count, progress=self._method.progress)
 
     def _at(
-        self, sources: Node, points: LitPoints, materials: Materials, sphere_of_point: np.ndarray | None = None
+        self, sources: Node, points: LitPoints, materials: Materials, blocker_of_point: np.ndarray | None = None
     ) -> LitPoints:
-        """Sources, to be lit among the bodies among which points are; the spheres that stand in for them, if any do."""
+        """Sources, to be lit among the bodies among which points are; the blockers nearest to them, if any."""
         given = self._method, materials, points.vertices, points.spheres, sources, points.call
-        return LitPoints(*given, normals=points.normals, blocking=points.blocking, sphere_of_point=sphere_of_point)
+        return LitPoints(*given, normals=points.normals, blocking=points.blocking, blocker_of_point=blocker_of_point)

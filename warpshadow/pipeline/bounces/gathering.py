@@ -30,7 +30,7 @@ from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
 from warpshadow.stages.bounces.own_light import own_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
 from warpshadow.stages.bounces.stand_ins import place_stand_ins
-from warpshadow.stages.flats.fronts import SpheresOfPoints, find_fronts
+from warpshadow.stages.flats.fronts import NearestBlockers, find_fronts
 from warpshadow.stages.flats.prepared import FlatBody, Flats
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
@@ -178,8 +178,8 @@ class StandIns:
         return numbers, ratios
 
     @functools.cached_property
-    def spheres_of_sources(self) -> np.ndarray:
-        """The sphere that stands in for each source, among those of bodies that are not flat; −1 for none."""
+    def blocker_of_source(self) -> np.ndarray:
+        """The blocker nearest to the patch of each source, among the spheres of bodies that are not flat; −1 for none."""
         return self._blockers[0][self.senders.patch_of_source]
 
     def shown(
@@ -200,8 +200,8 @@ class StandIns:
         normals, flats, senders = sources.normals, self.flats, self.senders
         centers, radii = self.assembly.spheres_of(self.solid, spheres)
         if flats is not None:
-            numbers, points, device = self.spheres_of_sources, sources.points, normals.device
-            of_sources = SpheresOfPoints(centers, radii, constant(numbers, wp.int32, device))
+            numbers, points, device = self.blocker_of_source, sources.points, normals.device
+            of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
             fronts = find_fronts(points, normals, None, of_sources, frames, flats.all)
             normals = turn_from_flats(points, normals, radii, numbers, fronts, frames, flats.all)
         rows = [

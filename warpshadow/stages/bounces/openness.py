@@ -98,7 +98,7 @@ def turn_from_flats(
         points: Sources [scene units], vec3 of shape [batch, source].
         normals: Their unit normals, vec3 of shape [batch, source].
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
-        spheres: The sphere that stands in for each source, −1 for none, which keeps its normal: NumPy of shape
+        spheres: The blocker nearest to the patch of each source, −1 for none, which keeps its normal: NumPy of shape
             [source].
         fronts: Part of the front of each flat that sources see, float32 of shape [batch, source, flat], from
             :func:`.fronts.find_fronts`.

@@ -18,12 +18,12 @@ lifted to, off all of them, k = 5 m:
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
 A body that has sunk into a ground a little has sources of bounced light on its surface below. What lies there gets the
-light of the ground's back: that of the sky there. But receivers do not see the sources, they see the spheres that stand
-in for them. So a source is on the side of a flat on which its sphere is:
+light of the ground's back: that of the sky there. But receivers do not see the sources, they see spheres. So a source is
+on the side of a flat on which the blocker nearest to its patch is:
 
     front = S(1.25 (h + c) / r)
 
-c is the height of its sphere's center, and r the sphere's radius. A sphere that touches a flat from above has all its
+c is the height of that sphere's center, and r its radius. A sphere that touches a flat from above has all its
 sources in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh.
 So what a source gets changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the gradient of
 a ball that touches a ground held for steps of 1/5000 of its radius.
@@ -48,17 +48,17 @@ _LIFT = wp.constant(5.0)
 """How far receivers in a plane are lifted off it, in its margins."""
 
 _TINY = wp.constant(1.0e-18)
-"""Radius up to which a sphere stands in for nothing."""
+"""Radius up to which a sphere blocks nothing."""
 
 
-class SpheresOfPoints(NamedTuple):
-    """Spheres that stand in for points."""
+class NearestBlockers(NamedTuple):
+    """Of each source of light the sphere that blocks light nearest to its patch."""
 
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     numbers: wp.array  # [point] int32, the sphere of each; −1 for none
 
-    def part(self, part: slice) -> SpheresOfPoints:
+    def part(self, part: slice) -> NearestBlockers:
         """The same of some points."""
         return self._replace(numbers=self.numbers[part])
 
@@ -178,7 +178,7 @@ def find_fronts(
     points: wp.array,
     normals: wp.array,
     corners: wp.array | None,
-    spheres: SpheresOfPoints | None,
+    spheres: NearestBlockers | None,
     frames: wp.array,
     flats: Flats,
 ) -> wp.array:
@@ -189,7 +189,7 @@ def find_fronts(
         normals: Their unit normals, vec3 of shape [batch, receiver].
         corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
             where it is not known: receivers are in front down to the plane itself.
-        spheres: What stands in for sources of light; None where no receiver has a sphere.
+        spheres: The blockers nearest to sources of light; None where no receiver is one.
         frames: Where the flats are, vec3 of shape [batch, 3 · flat], from :meth:`.Flats.frames`. Any batch may be 1.
         flats: The flats.
 
