@@ -179,7 +179,7 @@ class StandIns:
 
     @functools.cached_property
     def blocker_of_source(self) -> np.ndarray:
-        """The blocker nearest to the patch of each source, among the spheres of bodies that are not flat; −1 for none."""
+        """The blocker nearest to the patch of each source, among spheres of bodies that are not flat; −1 for none."""
         return self._blockers[0][self.senders.patch_of_source]
 
     def shown(

@@ -18,8 +18,8 @@ lifted to, off all of them, k = 5 m:
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
 A body that has sunk into a ground a little has sources of bounced light on its surface below. What lies there gets the
-light of the ground's back: that of the sky there. But receivers do not see the sources, they see spheres. So a source is
-on the side of a flat on which the blocker nearest to its patch is:
+light of the ground's back: that of the sky there. But receivers do not see the sources, they see spheres. So a source
+is on the side of a flat on which the blocker nearest to its patch is:
 
     front = S(1.25 (h + c) / r)
 
