@@ -41,11 +41,14 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.assembly import Assembly
 from warpshadow.scene.scene import AUTO, Scene
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.visibility.narrow import find_narrow
 
 LARGE_FACE = 16.0
 """Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels …"""
@@ -59,9 +62,6 @@ COARSE_FACE = 400.0
 SMALL_FACE = 4.0
 """Pixels of an average face up to which the vertices of a flat body are as close as shadows need; in a small image an
 edge is as sharp there (a ground of 64² quads in 64² pixels is 0.9% off what it is by pixel, adaptive 1.1%)."""
-
-SUN_SHARE = 0.1
-"""Share of all light that comes from the brightest percent of the sphere, about a cell, above which there is a sun."""
 
 _LONG_SHARE = 0.05
 """Share of a body's pixels that its longest faces show …"""
@@ -157,12 +157,11 @@ def for_picture(scene: Scene) -> Scene:
 
 
 def _has_sun(scene: Scene) -> bool:
-    """Whether the directional method is to find shadows of a sun, wherever it stands among the cells."""
+    """Whether the directional method is to find shadows of a sun."""
     if scene.visibility.method != "directional" or not isinstance(scene.light, EnvironmentMap):
         return False
-    share = scene.light.statistics()["brightest_percent_share"]
-    assert isinstance(share, float)
-    return share > SUN_SHARE
+    cells = scene.light.cells(fibonacci(scene.visibility.directions))
+    return find_narrow(cells.radiance @ LUMINANCE, cells.directions, cells.spreads) is not None
 
 
 def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:

@@ -147,15 +147,15 @@ class Painter:
         sized = self._sized.get((key, size), lambda: renderer.with_cameras([camera]))
         matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         view = sized.view(self._geometry(key, renderer, look), matrix)
-        light = self._lights.get((look.turn, look.scale, quality.is_moving), lambda: self._light(look, quality))
+        light = self._light_of(look, quality)
         return sized, view, camera, sized.draw(light, view=view).numpy()[0]
 
     def _renderer(self, look: Look, quality: Quality) -> tuple[Hashable, Renderer]:
         """The renderer of what is shown, and by what it is known."""
         scene = look.settings(self.scene, quality)
-        if not quality.is_moving:
-            scene = for_picture(scene)
-        choices = look.spheres, look.receivers, quality.is_moving
+        if not quality.is_moving:  # as the light is turned; it is given to each call
+            scene = replace(for_picture(replace(scene, light=self._light_of(look, quality))), light=scene.light)
+        choices = look.spheres, tuple(body.receivers for body in scene.bodies), quality.is_moving
         settings = scene.visibility, scene.bounces, scene.supersampling, *choices
         key = (*vars(settings[0]).values(), *settings[1:])
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
@@ -179,14 +179,15 @@ class Painter:
 
         return self._geometries.get((key, look.poses), placed)
 
-    def _light(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
-        return look.light(self.coarse_light if quality.is_moving else self.scene.light)
+    def _light_of(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
+        light = self.coarse_light if quality.is_moving else self.scene.light
+        return self._lights.get((look.turn, look.scale, quality.is_moving), lambda: look.light(light))
 
     def _behind(self, look: Look, camera: Camera, quality: Quality) -> np.ndarray:
         """What is behind the bodies: a gray, or the light itself."""
         if not (look.shows_light and isinstance(self.scene.light, EnvironmentMap)):
             return np.full(3, _BACKGROUND, np.float32)
-        light = self._lights.get((look.turn, look.scale, quality.is_moving), lambda: self._light(look, quality))
+        light = self._light_of(look, quality)
         assert isinstance(light, EnvironmentMap)
         return light.towards(camera.rays()[1]).astype(np.float32)
 
