@@ -144,7 +144,7 @@ class SphereMethod(Method):
         return direct if self.bounces is None else self.bounces.kept_free_shading(direct, points, light, materials)
 
     def openness(self, points: LitPoints) -> Node:
-        """What points send back as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
+        """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = Source("light", EnvironmentMap.constant(1.0))
         return InParts(self, points, Node("", self.taken_from, sky), sky, joined, where=" in an even sky")
 

@@ -127,7 +127,7 @@ class Directional(SphereMethod):
         return seen._replace(past_all=past_coverage(past_solid, covered), past_solid=past_solid)
 
     def _past_own(self, group: Group, taken: Cells) -> wp.array | None:
-        """What receivers see past their own body: looked up, and of a sun by rays where these are asked for."""
+        """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
         if group.own_shadow is None or not group.points.size:
             return None
         assert group.places is not None and isinstance(group.own_shadow, OwnLookup)

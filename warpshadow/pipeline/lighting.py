@@ -212,7 +212,7 @@ class Method:
         raise NotImplementedError
 
     def openness(self, points: LitPoints) -> Node | None:
-        """What points send back as white surfaces under an even sky of 1; None where rays find it on average."""
+        """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None
 
 

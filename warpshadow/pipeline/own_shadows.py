@@ -40,7 +40,7 @@ VERSION = 4
 Found = TypeVar("Found")
 
 _OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]] = weakref.WeakKeyDictionary()
-"""What was found of each mesh that is in memory, for all renderers: what, whether samples receive, device."""
+"""Sites and rows of each mesh in memory, for all renderers, by their kind, whether samples receive, and device."""
 
 
 class Blocking(NamedTuple):
@@ -128,7 +128,7 @@ class OwnShadows:
         return self._how(body) == "rays" and bool(self._samples_receive[body])
 
     def _how(self, body: int) -> str:
-        """What shadows a body casts on itself."""
+        """The kind of shadow that a body casts on itself: one of SELF_SHADOWS."""
         scene = self._assembly.scene
         return scene.bodies[body].self_shadows or scene.visibility.self_shadows
 
