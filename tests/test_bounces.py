@@ -32,8 +32,7 @@ from test_end_to_end import (
 import warpshadow as ws
 from warpshadow.pipeline import groups
 from warpshadow.pipeline.bounces import by_spheres as pipeline_bounces
-from warpshadow.pipeline.bounces import kept as kept_bounces
-from warpshadow.pipeline.bounces import patches
+from warpshadow.pipeline.bounces import patches, static_bounces
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 METHODS = ("directional", "log-sh")
@@ -200,13 +199,13 @@ def open_room(albedo, **options):
     return ws.Scene(bodies, ws.EnvironmentMap.constant(1.0, height=16), camera)
 
 
-@pytest.mark.parametrize("is_kept", [False, True])
-def test_all_bounces_are_those_that_many_come_to(is_kept):
+@pytest.mark.parametrize("is_cached", [False, True])
+def test_all_bounces_are_those_that_many_come_to(is_cached):
     """In a room of albedo 0.8. At 0.7 "all" is 0.2% off and four bounces 4%."""
     scene, images = open_room(0.8), []
     for bounces in (4, 16, "all"):
         renderer = TorchRenderer(dataclasses.replace(scene, bounces=bounces))
-        albedo = [torch.full((1, 1, 3), 0.8) for _ in scene.bodies] if is_kept else None
+        albedo = [torch.full((1, 1, 3), 0.8) for _ in scene.bodies] if is_cached else None
         images.append(renderer(albedo=albedo).numpy()[..., :3])
     four, many, every = images
     assert relative_error(every, many) < 1e-2
@@ -279,7 +278,7 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     renderer = ws.Renderer(bounced("directional", ON_BOTH))
     light = wp.zeros((1, renderer.basis.size), dtype=wp.vec3, requires_grad=True)
     explained = renderer.explain(light, geometry=renderer.placed())
-    for name in ("own light", "flat light", "sphere light", "radiosity", "own light of patches"):
+    for name in ("self light", "plane light", "sphere light", "radiosity", "self light of patches"):
         assert explained[name].forward and explained[name].backward, name
     still = renderer.explain(light)
     for name in ("form factors", "transfer of sources", "bounces"):
@@ -287,15 +286,15 @@ def test_it_says_what_runs_for_bounces_and_what_does_not():
     assert still["bounces"].backward and not still["form factors"].backward
     only = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[:1])
     explained = ws.Renderer(only).explain()
-    assert explained["flat light"].forward.why == "nothing flat reflects"
+    assert explained["plane light"].forward.why == "nothing flat reflects"
     ground = dataclasses.replace(renderer.scene, bodies=renderer.scene.bodies[1:])
-    assert ws.Renderer(ground).explain()["own light"].forward.why == "all that reflects is flat"
+    assert ws.Renderer(ground).explain()["self light"].forward.why == "all that reflects is flat"
 
 
 def test_one_bounce_asks_for_no_light_between_bodies_sources():
     explained = ws.Renderer(bounced("directional", ON_BOTH, 1)).explain()
-    assert explained["own light of patches"].forward
-    for name in ("flat light of sources", "sphere light of sources"):
+    assert explained["self light of patches"].forward
+    for name in ("plane light of sources", "sphere light of sources"):
         assert explained[name].forward.why == "light bounces once", name
 
 
@@ -316,13 +315,14 @@ def bowl(receivers: str = "vertex", **options) -> ws.Body:
 
 def test_light_goes_on_within_a_bowl(monkeypatch):
     """As along paths that bounce as often, although it bounces once between bodies."""
-    scene = ws.Scene([bowl(albedo=(0.8, 0.6, 0.4))], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=1)
+    sky = ws.EnvironmentMap.constant(1.0, height=16)
+    scene = ws.Scene([bowl(albedo=(0.8, 0.6, 0.4))], sky, ON_BOTH, ws.Visibility("directional"), bounces=1)
     paths = dataclasses.replace(
-        scene, bounces=1 + kept_bounces.OWN_BOUNCES, visibility=ws.Visibility("ray-traced", samples=4096)
+        scene, bounces=1 + static_bounces.SELF_BOUNCES, visibility=ws.Visibility("ray-traced", samples=4096)
     )
     expected, found = (ws.render(each)[..., :3].sum(axis=(0, 1)) for each in (paths, scene))
     np.testing.assert_allclose(found, expected, rtol=0.02)
-    monkeypatch.setattr(pipeline_bounces, "OWN_BOUNCES", 0)
+    monkeypatch.setattr(pipeline_bounces, "SELF_BOUNCES", 0)
     once = ws.render(scene)[..., :3].sum(axis=(0, 1))
     assert once[0] < 0.9 * expected[0]
 
@@ -331,7 +331,8 @@ def test_light_goes_on_within_a_bowl(monkeypatch):
 def test_receivers_at_pixels_and_backs_of_open_bodies_are_lit(receivers):
     """A bowl, seen from within and without."""
     ground = ws.Body(ws.plane(4.0, 8), blockers=1)
-    scene = ws.Scene([bowl(receivers), ground], ws.EnvironmentMap.constant(1.0, height=16), ON_BOTH, bounces=2)
+    sky = ws.EnvironmentMap.constant(1.0, height=16)
+    scene = ws.Scene([bowl(receivers), ground], sky, ON_BOTH, ws.Visibility("directional"), bounces=2)
     direct, found = (ws.render(dataclasses.replace(scene, bounces=count)) for count in (0, 2))
     assert np.isfinite(found).all()
     assert (found - direct).min() > -1e-5
@@ -521,21 +522,21 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
     values = image_of.start.reshape(image_of.shape)
     given = {"light": values} if name == "light" else {"albedo": list(values)}
     with torch.no_grad():
-        kept = image_of(image_of.start)
+        cached = image_of(image_of.start)
         anew = renderer(**given, geometry=renderer.placed(*renderer.scene_poses()))
         direct = TorchRenderer(dataclasses.replace(renderer.scene, bounces=0))(**given)
     assert relative_error(direct[..., :3].numpy(), anew[..., :3].numpy()) > 0.04
-    assert relative_error(kept[..., :3].numpy(), anew[..., :3].numpy()) < 0.02
+    assert relative_error(cached[..., :3].numpy(), anew[..., :3].numpy()) < 0.02
 
     def refuse(*_, **__):
         raise AssertionError("it is computed again")
 
-    monkeypatch.setattr(kept_bounces, "trace_factors", refuse)
+    monkeypatch.setattr(static_bounces, "trace_factors", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "see", refuse)
-    monkeypatch.setattr(type(renderer.warp._method), "past_flats", refuse)
+    monkeypatch.setattr(type(renderer.warp._method), "past_planes", refuse)
     with torch.no_grad():
-        assert torch.equal(image_of(image_of.start), kept)
-        assert not torch.equal(image_of(0.5 * image_of.start), kept)
+        assert torch.equal(image_of(image_of.start), cached)
+        assert not torch.equal(image_of(0.5 * image_of.start), cached)
 
 
 def image_and_gradient(renderer: TorchRenderer, name: str, values: torch.Tensor, geometry) -> tuple[torch.Tensor, ...]:
@@ -559,7 +560,7 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
         raise AssertionError("it is seen again")
 
     with monkeypatch.context() as patch:
-        for function in ("see", "past_flats", "transfer", "look_up"):
+        for function in ("see", "past_planes", "transfer", "look_up"):
             patch.setattr(type(renderer.warp._method), function, refuse)
         patch.setattr(pipeline_bounces, "see_cells", refuse)
         patch.setattr(patches, "receivers_on_faces", refuse)
@@ -567,8 +568,8 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
         explained = renderer.explain(**{name: 2 * start if name == "light" else [2 * start, None]}, geometry=geometry)
     assert all(map(torch.equal, found, image_and_gradient(fresh, name, 2 * start, geometry)))
     for stage in ("sources", "visibility of sources", "transfer of sources", "visibility", "transfer"):
-        assert explained[stage].forward.why.startswith("kept: "), stage
-    assert explained["shading"].forward and explained["flat light"].forward
+        assert explained[stage].forward.why.startswith("cached: "), stage
+    assert explained["shading"].forward and explained["plane light"].forward
     moved = geometry.map(lambda array: array.clone())
     moved.positions[:, :5] += 0.1
     moved.radii[:] *= 0.8

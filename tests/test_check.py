@@ -79,11 +79,11 @@ def test_numbers_out_of_range_are_named_with_the_range(device):
     with pytest.raises(
         ValueError, match=r"^points: got 1 values out of range \(first at index \(0, 2, 1\): -3\), expected -2 to 2$"
     ):
-        check.finite_arrays({"points": vectors(device, _021=-3)}, most=2.0)
+        check.finite_arrays({"points": vectors(device, _021=-3)}, maximum=2.0)
     with pytest.raises(
         ValueError, match=r"^radii: got 9 values out of range \(first at index \(0, 0, 0\): -1\), expected 0 to 2$"
     ):
-        check.finite_arrays({"points": vectors(device), "radii": vectors(device)}, most=2.0, nonnegative=["radii"])
+        check.finite_arrays({"points": vectors(device), "radii": vectors(device)}, maximum=2.0, nonnegative=["radii"])
 
 
 @pytest.mark.parametrize("find", [check._outside_on_host, check._outside_on_device])

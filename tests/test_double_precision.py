@@ -213,10 +213,10 @@ def test_log_visibility_of_spheres_that_merge(double, device, check, quad):
     check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *quad)
 
 
-def test_exitance_of_spheres(double, device, check):
+def test_radiance_of_proxies(double, device, check):
     nodes = np.int32([0, 2, 3, 3]), np.int32([0, 1, 2])
     check(
-        lambda b, g: double("stages.bounces.exitance").sphere_exitance(b, g, np.ones(3), *nodes),
+        lambda b, g: double("stages.bounces.proxy_radiance").find_proxy_radiance(b, g, np.ones(3), *nodes),
         (wp.vec3d, random(0, 2, 3, 3)),
         (wp.float64, random(1, 2, 3, 5) ** 2),
     )
@@ -226,8 +226,8 @@ def test_exitance_of_spheres(double, device, check):
 def test_light_from_spheres(double, device, check, spheres):
     directions = double("maths.directions").fibonacci(16)
     sphere_light = double("stages.bounces.sphere_light").sphere_light
-    exitance, unblocked = 1 + random(0, 1, 4, 16, 4) ** 2, 1 + random(1, 1, 5, 16) ** 2
-    rest = (wp.vec4d, exitance), (wp.float64, 0.5 * unblocked), (wp.float64, unblocked)
+    proxy_radiance, unblocked = 1 + random(0, 1, 4, 16, 4) ** 2, 1 + random(1, 1, 5, 16) ** 2
+    rest = (wp.vec4d, proxy_radiance), (wp.float64, 0.5 * unblocked), (wp.float64, unblocked)
     check(lambda *scene: sphere_light(*scene, directions, softness=1.2), *spheres, *rest)
 
 
@@ -240,69 +240,69 @@ def test_light_from_spheres_that_merge(double, device, check, quad):
 
 
 @pytest.fixture
-def flats(double, device):
+def planes(double, device):
     """A ground and a wall, each of two faces, whose frames are given as such."""
-    grids = double("stages.bounces.patches").find_flat_patches
+    grids = double("stages.bounces.patches").find_plane_patches
     square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
     faces = np.int32([[0, 1, 2], [0, 2, 3]])
     near = np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
     found = [grids(square, faces, is_two_sided=is_two_sided, others=near) for is_two_sided in (False, True)]
-    module = double("stages.flats.prepared")
+    module = double("stages.planes.prepared")
     count = found[0].count
     bodies = [
-        module.FlatBody(patches.grid, square, faces, 4 * number, number * count, True)
+        module.PlaneBody(patches.grid, square, faces, 4 * number, number * count, True)
         for number, patches in enumerate(found)
     ]
-    return module.Flats.of(bodies, 3 * count, 8, device=device)
+    return module.PlaneBlockers.of(bodies, 3 * count, 8, device=device)
 
 
 FRAMES = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, -1], [0.1, 0.3, -1.1], [0.9, 0, 0], [0, 0.9, 0]]])
 
 
-def flat_receivers():
+def plane_receivers():
     """Two above the ground in front of the wall, and one below the ground."""
     return np.array([[[0.3, 0.4, 0.2], [-0.7, 0.9, -0.4], [0.2, -0.3, 0.6]]]), unit(random(3, 1, 3, 3))
 
 
 @pytest.mark.slow
-def test_light_of_flats(double, flats, check):
+def test_light_of_planes(double, planes, check):
     directions = double("maths.directions").fibonacci(16)
-    flat_light = double("stages.bounces.flat_light").flat_light
-    points, normals = flat_receivers()
-    radiosity = np.random.default_rng(0).uniform(size=(1, flats.texels_of_patches.shape[1], 3))
+    plane_light = double("stages.bounces.plane_light").plane_light
+    points, normals = plane_receivers()
+    radiosity = np.random.default_rng(0).uniform(size=(1, planes.texels_of_patches.shape[1], 3))
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    fixed = wp.array(radiosity, dtype=wp.vec3d, device=flats.grids.device)
-    check(lambda *scene: flat_light(*scene, fixed, flats, directions), *given)
+    fixed = wp.array(radiosity, dtype=wp.vec3d, device=planes.grids.device)
+    check(lambda *scene: plane_light(*scene, fixed, planes, directions), *given)
 
 
-def test_what_passes_flats(double, flats, check):
+def test_transmittance_past_planes(double, planes, check):
     directions = double("maths.directions").fibonacci(16)
-    passing = double("stages.flats.passing")
-    given = (wp.vec3d, flat_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
-    check(lambda p, t, f: passing.past_coverage(t, passing.flat_coverage(p, f, flats, directions)), *given)
+    past = double("stages.planes.transmittance")
+    given = (wp.vec3d, plane_receivers()[0]), (wp.float64, 0.1 + random(1, 1, 3, 16) ** 2), (wp.vec3d, FRAMES)
+    check(lambda p, t, f: past.transmittance_past_planes(t, past.plane_coverage(p, f, planes, directions)), *given)
 
 
-def test_what_patches_show(double, flats, check, device):
+def test_what_patches_show(double, planes, check, device):
     directions = double("maths.directions").fibonacci(16)
-    openness, sparse = double("stages.bounces.openness"), double("stages.sparse").SparseMatrix
-    points, normals = flat_receivers()
+    areas, sparse = double("stages.bounces.projected_areas"), double("stages.sparse").SparseMatrix
+    points, normals = plane_receivers()
     spheres, radii = np.int32([1, 0, 1]), np.array([[0.3, 0.5]])
     given = (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, radii), (wp.float64, random(1, 1, 3, 2) ** 2)
-    check(lambda p, n, r, *f: openness.turn_from_flats(p, n, r, spheres, *f, flats), *given, (wp.vec3d, FRAMES))
+    check(lambda p, n, r, *f: areas.turn_from_planes(p, n, r, spheres, *f, planes), *given, (wp.vec3d, FRAMES))
     mean = sparse.of(np.array([[0.7, 0.3, 0], [0, 0, 1]]), device=device)
     rest = (wp.vec3d, normals), (wp.float64, random(1, 1, 3, 16) ** 2)
-    check(lambda n, t: openness.shown_areas(n, t, mean, directions), *rest)
+    check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)
 
 
-def test_radiosity_and_own_light(double, device, check):
-    sparse, own_light = double("stages.sparse").SparseMatrix, double("stages.bounces.own_light").own_light
+def test_radiosity_and_self_light(double, device, check):
+    sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")
     mean = radiosity.mean_over_sources(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
     factors = sparse.of(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 
     def light(albedo, shading, weights):
-        return own_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights)
+        return self_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights)
 
     check(light, (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3)), (wp.vec3d, random(3, 1, 2, 3)))
 
@@ -462,22 +462,24 @@ LIGHT = random(0, 4, 3) + 5 * np.eye(4, 1)
 
 
 @pytest.mark.parametrize("sharp", [False, True])
-def test_own_shadows_under_a_rotation(sharp, double, device):
+def test_self_visibility_under_a_rotation(sharp, double, device):
     """From rotations and places in faces to transmittance, of rows of which nothing is known."""
     rng = np.random.default_rng(5)
-    lookup, gather = double("stages.own_shadows.lookup"), double("stages.own_shadows.gather")
+    lookup, gather = double("stages.self_visibility.lookup"), double("stages.self_visibility.gather")
     directions = double("maths.directions").fibonacci(16)
     spreads = np.full(16, 0.1) if sharp else None
-    supports = lookup.find_supports(directions, spreads, 4096, wp.get_device(device))
+    kernels = lookup.find_resampling_kernels(directions, spreads, 4096, wp.get_device(device))
     bits = wp.array(rng.integers(0, 2**32, (6, 128), dtype=np.uint32), device=device)
     cells = wp.array(rng.integers(0, 256, (6, 512), dtype=np.uint8), device=device)
-    rows = double("stages.own_shadows.trace").OwnRows(bits, cells)
+    rows = double("stages.self_visibility.trace").VisibilityRows(bits, cells)
     normals = wp.array(rng.normal(size=(1, 5, 3)), dtype=wp.vec3d, device=device)
     corners = wp.array(rng.integers(0, 6, (1, 5, 3)), dtype=wp.vec3i, device=device)
 
     def see(rotations, weights):
-        places = double("stages.own_shadows.sites").Places(corners, weights)
-        return gather.gather_own(normals, places, lookup.find_lookups(rotations, 0, supports), supports, rows)
+        places = double("stages.self_visibility.probes").ProbeWeights(corners, weights)
+        return gather.gather_self_transmittance(
+            normals, places, lookup.find_resampling_weights(rotations, 0, kernels), kernels, rows
+        )
 
     matrices = torch.linalg.qr(torch.tensor(rng.normal(size=(2, 1, 3, 3))))[0]
     given = matrices.requires_grad_(), torch.tensor(rng.uniform(size=(1, 5, 3))).requires_grad_()

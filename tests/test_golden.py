@@ -79,9 +79,9 @@ def test_irradiance_of_log_sh_is_the_golden_one(log, name, golden, device):
 
 
 def test_irradiance_of_the_product_of_spheres_is_the_golden_one(golden, device):
-    (points, _, centers, radii), normals = geometry(golden, device, has_normals=False)
-    visibility = log_sh.multiply_spheres(points, centers, radii, order=8)
-    transfer = sh_transfer(visibility, normals, order=8).numpy()[0]
+    _, normals = geometry(golden, device, has_normals=False)
+    visibility = twins.multiplied_spheres(*(golden[name] for name in ("points", "sphere_centers", "sphere_radii")), 8)
+    transfer = sh_transfer(wp.array(visibility[None], dtype=wp.float32, device=device), normals, order=8).numpy()[0]
     assert relative(np.pi * transfer @ golden["light_sh"], golden["irradiance_product"]) < IRRADIANCE
 
 

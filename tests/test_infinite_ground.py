@@ -7,7 +7,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene.files import write_scene
-from warpshadow.stages.bounces.patches import find_flat_patches
+from warpshadow.stages.bounces.patches import find_plane_patches
 
 SIZE = 2.0
 SKY = ws.synthetic_sky()
@@ -100,7 +100,7 @@ def test_its_shadow_is_right_with_the_receivers_that_are_chosen():
 def test_its_patches_are_few_and_all_have_pieces(away):
     mesh = ws.infinite_ground(SIZE)
     others = BALL.mesh.positions + np.float32([away, 1, 0.3 * away])
-    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, others=others)
+    patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, others=others)
     pieces = np.bincount(patches.of_pieces[0], minlength=patches.count)
     assert (pieces[patches.areas > 0] > 0).all()
     assert mesh.face_count < pieces.sum() < 100_000

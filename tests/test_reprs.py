@@ -23,7 +23,7 @@ def test_objects_say_in_a_line_what_they_are():
     }
     for text, value in shown.items():
         assert repr(value) == text
-    assert repr(ws.Scene([body], light.sh(2), bounces=2)).endswith("'directional', 2 bounces)")
+    assert repr(ws.Scene([body], light.sh(2), bounces=2)).endswith("fov_y 40), 2 bounces)")
     assert "4 SH coefficients" in repr(ws.Scene([body], light.sh(2)))
     assert "Scene([Body('ball', 42 vertices" in repr(TorchRenderer(scene))
 
@@ -32,7 +32,7 @@ def test_a_fit_says_what_was_free_and_how_it_ended():
     body = ws.Body(ws.icosphere(1.0, 1), blockers=0)
     scene = ws.Scene([body], ws.EnvironmentMap.constant(1.0, 4), ws.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 6)))
     problem = inverse.Problem(scene, inverse.Target(0.5 * ws.render(scene)), [inverse.Albedo(0)])
-    assert repr(problem) == f"Problem({scene}, 1 targets of 8 × 6, free: albedo[0])"
+    assert repr(problem) == f"Problem({scene.with_method()}, 1 targets of 8 × 6, free: albedo[0])"
     result = inverse.fit(problem, [inverse.Stage(3)], progress=False)
     count, loss = len(result.losses[0]), min(result.losses[0])
     assert repr(result) == f"Result(albedo[0]: {result.reason} after {count} iterations, loss {loss:.3g})"

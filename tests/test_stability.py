@@ -314,10 +314,6 @@ def transmittance(points, normals, centers, radii):
     return directional.transmittance(points, normals, centers, radii, fibonacci(16))
 
 
-def multiply(points, normals, centers, radii):
-    return log_sh.multiply_spheres(points, centers, radii)
-
-
 def spoil(array, value):
     """Write a value into the middle of an array."""
     values = array.numpy().copy()
@@ -327,13 +323,10 @@ def spoil(array, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["points", "normals", "centers", "radii"])
-@pytest.mark.parametrize("stage", [accumulate, transmittance, multiply])
+@pytest.mark.parametrize("stage", [accumulate, transmittance])
 def test_visibility_refuses_what_is_not_finite_by_the_name_of_the_argument(stage, name, value, device):
     scene = scene_arrays(device)
     spoil(scene[name], value)
-    if stage is multiply and name == "normals":
-        stage(**scene)  # takes none
-        return
     with pytest.raises(ValueError, match=rf"^{name}: got 1 NaN or Inf values \(first at index \(0, \d.*\)\), expected"):
         stage(**scene)
 
@@ -349,7 +342,7 @@ def test_visibility_refuses_numbers_whose_squares_would_overflow(stage, name, va
         stage(**scene)
 
 
-@pytest.mark.parametrize("stage", [accumulate, transmittance, multiply])
+@pytest.mark.parametrize("stage", [accumulate, transmittance])
 def test_negative_radii_are_refused(stage, device):
     scene = scene_arrays(device)
     spoil(scene["radii"], -0.5)
@@ -376,14 +369,6 @@ def test_directions_that_are_not_finite_or_not_unit_vectors_are_refused(device):
     ):
         with pytest.raises(ValueError, match=message):
             directional.transmittance(*scene.values(), directions)
-
-
-def test_a_product_of_spheres_that_overflows_is_refused(device):
-    points, _, centers, radii = (
-        put(v, t, device) for v, t in zip(twins.stacked_spheres(10000), stability.SCENE, strict=True)
-    )
-    with pytest.raises(ValueError, match="^centers: the SH product of 10000 spheres is not finite, expected fewer"):
-        log_sh.multiply_spheres(points, centers, radii)
 
 
 # ------------------------------------------------------------------------------------------ light

@@ -804,3 +804,99 @@ def test_rotations_are_scipys_quaternions_with_w_last_and_vectors_in_radians():
     for parameters in (turn.as_quat(), turn.as_rotvec()):
         made = rotation_matrices(torch.tensor(parameters, dtype=torch.float32))
         np.testing.assert_allclose(made, turn.as_matrix(), atol=1e-6)
+
+
+def off_center_scene():
+    """A box whose own origin is far outside, turned and scaled."""
+    box = ws.plane(1.0, 2).transformed(translation=(3.0, 0.5, -2.0))
+    posed = ws.Body(box, rotation=(0, 30, 10), translation=(-1, 0, 1), scale=0.7, blockers=0)
+    ball = ws.Body(ws.icosphere(0.5, 1), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 1, 0))
+    return dataclasses.replace(small_scene(), bodies=(posed, ball))
+
+
+def test_a_body_turns_about_its_middle_and_stays_there():
+    renderer = TorchRenderer(off_center_scene())
+    R, t, s = renderer.scene_poses(pivot="center")
+    own = renderer.placed(*renderer.scene_poses()).positions
+    torch.testing.assert_close(renderer.placed(R, t, s, pivot="center").positions, own, rtol=0, atol=1e-5)
+    turn = rotation_matrices(torch.tensor([[0.3, -0.8, 0.4], [0.0, 0.0, 0.0]]))
+    turned = renderer.placed(turn @ R, t, s, pivot="center").positions
+    mesh = renderer.scene.bodies[0].mesh.positions.astype(np.float64)
+    middle = (mesh.min(axis=0) + mesh.max(axis=0)) / 2  # of the body's own space
+    world = 0.7 * middle @ R[0].double().numpy().T + (-1, 0, 1)
+    expected = (own[: len(mesh)].double().numpy() - world) @ turn[0].double().numpy().T + world
+    np.testing.assert_allclose(turned[: len(mesh)].numpy(), expected, atol=1e-5)
+    torch.testing.assert_close(turned[len(mesh) :], own[len(mesh) :], rtol=0, atol=1e-5)
+    points = torch.tensor(np.array([middle, [0, 0, 0]]), dtype=torch.float32)
+    torch.testing.assert_close(renderer.placed(turn @ R, t, s, pivot=points).positions, turned, rtol=0, atol=1e-5)
+    torch.testing.assert_close(renderer.scene_poses(pivot=points)[1], t, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_the_gradients_of_poses_about_a_pivot_are_those_of_the_formula(batch):
+    renderer = TorchRenderer(off_center_scene())
+    turns, shifts = random(*batch, 2, 3, seed=1), random(*batch, 2, 3, seed=2)
+    scales, pivots = random(*batch, 2, seed=3, low=0.5), random(2, 3, seed=4)
+    mesh = [torch.tensor(body.mesh.positions) for body in renderer.scene.bodies]
+    weights = torch.rand(*batch, sum(map(len, mesh)), 3, generator=torch.Generator().manual_seed(5))
+
+    def by_formula(turns, shifts, scales, pivots):
+        R, posed = rotation_matrices(turns), []
+        for body, points in enumerate(mesh):
+            arms = (points - pivots[body]) @ R[..., body, :, :].mT
+            posed.append(scales[..., body, None, None] * arms + shifts[..., body, None, :])
+        return torch.cat(posed, dim=-2)
+
+    def by_renderer(turns, shifts, scales, pivots):
+        return renderer.placed(rotation_matrices(turns), shifts, scales, pivot=pivots).positions
+
+    inputs = turns, shifts, scales, pivots
+    ours, expected = (
+        (positions := function(*inputs), *torch.autograd.grad((positions * weights).sum(), inputs))
+        for function in (by_renderer, by_formula)
+    )
+    for one, other in zip(ours, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
+def test_pivots_that_are_none_are_refused():
+    renderer = TorchRenderer(off_center_scene())
+    poses = renderer.scene_poses()
+    with pytest.raises(ValueError, match="^pivot: got 'middle', expected one of 'center'"):
+        renderer.placed(*poses, pivot="middle")
+    with pytest.raises(ValueError, match=r"^pivot: got shape \(3, 3\), expected \[2, 3\]"):
+        renderer.placed(*poses, pivot=torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="^pivot: got 1 NaN"):
+        renderer.warp.scene_poses(pivot=(0, np.nan, 0))
+
+
+@pytest.mark.parametrize("backend", ["eager", "inductor"])
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # torch's own, of its compiler
+def test_code_that_torch_compiles_may_render(backend):
+    renderer = TorchRenderer(small_scene(), basis=ws.HarmonicBasis(3))
+
+    def loss(light, turn, shift):
+        rotations, translations, scales = renderer.scene_poses()
+        placed = renderer.placed(rotation_matrices(turn.sin()) @ rotations, translations + shift.exp(), scales)
+        cameras = renderer.clip_matrices(*renderer.scene_cameras())
+        return (renderer(2 * light.square(), geometry=placed, clip_matrices=cameras)[..., :3] ** 2).mean()
+
+    torch.compiler.reset()
+    found = []
+    for function in (loss, torch.compile(loss, backend=backend)):
+        inputs = random(9, 3), random(2, 3, seed=1), random(2, 3, seed=2, low=-3.0)
+        for _ in range(2):
+            value = function(*inputs)
+        found.append((value.detach(), *torch.autograd.grad(value, inputs)))
+    for plain, compiled in zip(*found, strict=True):
+        assert plain.abs().max() > 0
+        torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-6)
+
+
+def test_a_compiled_renderer_is_one_and_the_compiler_is_not_imported_before():
+    renderer = TorchRenderer(small_scene())
+    torch.compiler.reset()
+    torch.testing.assert_close(torch.compile(renderer, backend="eager")(), renderer(), rtol=0, atol=0)
+    program = "import sys, warpshadow.torch; print('torch._dynamo' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"

@@ -129,6 +129,17 @@ def log_sh(points, normals, centers, radii, order, log):
     return turned(zonal, directions).sum(axis=1)
 
 
+def multiplied_spheres(points, centers, radii, order):
+    """Visibility by truncated products of the spheres' caps, one by one: what log space saves, [vertex, order²]."""
+    directions, cosine, weight = cones(points[:, None], centers, radii)
+    blocked = turned(zonal_cap(order, cosine) * weight[..., None], directions)
+    one = np.eye(1, order**2) * UNIT
+    visibility = np.repeat(one, len(points), axis=0)
+    for sphere in range(len(radii)):
+        visibility = Product(order)(visibility, one - blocked[:, sphere])
+    return visibility
+
+
 # ------------------------------------------------------------------------------------------ exponentiation
 
 
@@ -225,7 +236,7 @@ def blocked_shares(points, centers, radii, directions, softness=0.35):
     return 1 - np.stack(alone, axis=1)
 
 
-def sphere_exitance(radiosity, shown, areas, patches):
+def find_proxy_radiance(radiosity, shown, areas, patches):
     """Light and area that the patches of spheres show, [sphere, direction, 4]; ``patches`` lists those of a sphere."""
     table = np.zeros((len(patches), shown.shape[1], 4))
     for row, own in zip(table, patches, strict=True):
@@ -235,7 +246,7 @@ def sphere_exitance(radiosity, shown, areas, patches):
     return table
 
 
-def sphere_light(points, normals, centers, radii, exitance, passing, unblocked, directions, shares=None):
+def sphere_light(points, normals, centers, radii, proxy_radiance, passing, unblocked, directions, shares=None):
     """Light of spheres, [vertex, 3]: a weighted mean of what they show in each cell, times what the cell lacks.
 
     ``shares`` are those of nodes whose centers and radii are given, where spheres merge.
@@ -243,7 +254,7 @@ def sphere_light(points, normals, centers, radii, exitance, passing, unblocked, 
     shares = blocked_shares(points, centers, radii, directions) if shares is None else shares
     distance2 = ((centers - points[:, None]) ** 2).sum(axis=-1)
     weights = shares / ((distance2 + radii**2 / 16) ** 2)[:, :, None]
-    sums = np.einsum("vsq,sqc->vqc", weights, exitance)
+    sums = np.einsum("vsq,sqc->vqc", weights, proxy_radiance)
     is_met = sums[..., 3:] > 0
     mean = np.where(is_met, sums[..., :3] / np.where(is_met, sums[..., 3:], 1), 0)
     cosine = np.maximum(normals @ directions.T, 0)

@@ -3,6 +3,7 @@
 from warpshadow import check as _check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera_files import load_cameras
 from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.assets.image import ImageError, read_image, write_image
 from warpshadow.assets.light import EnvironmentMap
@@ -17,10 +18,11 @@ from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.layers import Layers
+from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
+from warpshadow.scene.mesh_scene import default_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.tuning.insert import insert
@@ -50,12 +52,14 @@ __all__ = [
     "Spheres",
     "Tuning",
     "Visibility",
+    "default_scene",
     "fibonacci",
     "fit_spheres",
     "icosphere",
     "infinite_ground",
     "insert",
     "linear_to_srgb",
+    "load_cameras",
     "load_mesh",
     "load_scene",
     "plane",
@@ -81,7 +85,8 @@ def quiet(*, progress: bool = True) -> None:
     Other warnings and errors stay.
 
     Args:
-        progress: Whether progress bars show from now on; False hides all, as ``progress=False`` hides those of a call.
+        progress: Whether progress bars show from now on; False hides all of them, as ``progress=False`` hides the bars
+            of one call.
     """
     _show_bars(_check.flag("progress", progress))
     _start_quietly()

@@ -1,4 +1,4 @@
-"""Argument checks: one clear error that names the argument, what it got and what it accepts; and warnings."""
+"""Argument checks: one clear error that names the argument, its value and the accepted values; and warnings."""
 
 import contextlib
 import difflib
@@ -38,7 +38,7 @@ class _Nothing:
 
 
 NOTHING = _Nothing()
-"""Given for what is missing, so that the check of an argument says what it expects."""
+"""Stands for a missing argument, so that its check says what is expected."""
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -64,7 +64,7 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Make the TypeError of a function for an unknown keyword name the argument that is meant.
 
     Args:
-        instead: What to write in place of keywords that are likely; others are compared with the arguments' names.
+        instead: Replacements to suggest for likely mistakes; other keywords are compared with the arguments' names.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -72,12 +72,12 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
         name = function.__qualname__.removesuffix(".__init__")
 
         @functools.wraps(function)
-        def checked(*args: P.args, **given: P.kwargs) -> T:
-            for key in given:
+        def checked(*args: P.args, **arguments: P.kwargs) -> T:
+            for key in arguments:
                 if key not in known:
-                    meant = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
-                    raise TypeError(f"{name}: unknown argument {key!r}{meant}")
-            return function(*args, **given)
+                    hint = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
+                    raise TypeError(f"{name}: unknown argument {key!r}{hint}")
+            return function(*args, **arguments)
 
         return checked
 
@@ -132,7 +132,7 @@ def is_path(value: object) -> TypeGuard[AnyPath]:
 
 
 def path(name: str, value: object) -> Path:
-    """A path; ValueError for what names no file."""
+    """A path; ValueError for a value that names no file."""
     if not is_path(value):
         raise ValueError(f"{name}: got {described(value)}, expected the path of a file")
     return Path(value)
@@ -145,22 +145,22 @@ def index(name: str, value: object, count: int, what: str) -> None:
 
 
 def instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
-    """Raise ValueError unless a value is of a class; the message says what is expected, and how to get it."""
+    """Raise ValueError unless a value is of a class; the message says which class is expected, and how to make one."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: got {described(value)}, expected {expected}")
 
 
 def file(name: str, value: AnyPath) -> Path:
     """The path of a file, relative to the current folder; FileNotFoundError if there is none."""
-    found = Path(value)
-    if not found.is_file():
-        where = "" if found.is_absolute() else f" (in {Path.cwd()})"
-        raise FileNotFoundError(f"{name}: no such file: {found}{where}")
-    return found
+    result = Path(value)
+    if not result.is_file():
+        where = "" if result.is_absolute() else f" (in {Path.cwd()})"
+        raise FileNotFoundError(f"{name}: no such file: {result}{where}")
+    return result
 
 
 def device(name: str, value: object) -> wp.Device:
-    """Warp's device for one of its own, torch's, a name, or None for its default; ValueError with those there are."""
+    """Warp's device for one of its own, torch's, a name, or None for its default; ValueError lists all devices."""
     wp.init()
     has_gpu = wp.is_cuda_available()
     alias = None if value is None else str(value)
@@ -169,7 +169,7 @@ def device(name: str, value: object) -> wp.Device:
             return wp.get_device(alias)
         except ValueError:
             pass
-    known = ", ".join(repr(each.alias) for each in wp.get_devices())
+    known = ", ".join(repr(device_.alias) for device_ in wp.get_devices())
     raise ValueError(f"{name}: got {alias!r}, expected one of {known}{'' if has_gpu else '; there is no CUDA device'}")
 
 
@@ -186,9 +186,10 @@ def numbers(
     Args:
         name: Of the argument.
         values: An array, a tensor, numbers or nested sequences of them.
-        expected: What the message says is expected.
-        dtype: Of the copy; what is too large for it becomes Inf.
-        error: What is raised: for text, None, rows of different lengths, and tensors whose gradient would be lost.
+        expected: The accepted values, for the message.
+        dtype: Of the copy; numbers too large for it become Inf.
+        error: The exception type to raise: for text, None, rows of different lengths, and tensors whose gradient would
+            be lost.
     """
     if getattr(values, "requires_grad", False):
         raise error(
@@ -196,15 +197,15 @@ def numbers(
             ".detach() is without one"
         )
     try:
-        found = np.asarray(values)
+        result = np.asarray(values)
     except ValueError as cause:  # rows of different lengths
         raise error(f"{name}: got {described(values)}, expected {expected}") from cause
     except TypeError as cause:  # a tensor on a GPU, or of a type that NumPy has not
         raise error(f"{name}: got {described(values)}, expected {expected} ({cause})") from cause
-    if found.dtype.kind not in "iuf" or _holds_truth(values):
+    if result.dtype.kind not in "iuf" or _holds_truth(values):
         raise error(f"{name}: got {described(values)}, expected {expected}")
     with np.errstate(over="ignore"):
-        return np.array(found, dtype, order="C")
+        return np.array(result, dtype, order="C")
 
 
 def _holds_truth(values: object) -> bool:
@@ -220,7 +221,7 @@ def number(name: str, value: object) -> float:
 
 
 def array(name: str, values: object, lengths: tuple[int, ...], meaning: str = "") -> np.ndarray:
-    """Copy finite numbers of a shape to a read-only array of float64; a message ends with what they mean."""
+    """Copy finite numbers of a shape to a read-only array of float64; messages end with their meaning."""
     rows = "".join(f"{length} rows of " for length in lengths[:-1])
     expected = f"{rows}{lengths[-1]} finite numbers{meaning and f': {meaning}'}"
     copied = numbers(name, values, expected=expected, dtype=np.float64)
@@ -245,11 +246,11 @@ def nonnegative(name: str, value: object) -> float:
     return float(value)
 
 
-def whole(name: str, value: object, *, least: int = 1, what: str = "") -> int:
+def whole(name: str, value: object, *, minimum: int = 1, what: str = "") -> int:
     """Return a whole number, maybe of something, as an int, or raise ValueError."""
-    if not is_integer(value) or value < least:
+    if not is_integer(value) or value < minimum:
         of = f"{what}, " if what else ""
-        raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of}at least {least}")
+        raise ValueError(f"{name}: got {described(value)}, expected a whole number of {of}at least {minimum}")
     return int(value)
 
 
@@ -290,7 +291,7 @@ def reflectance(name: str, values: np.ndarray) -> None:
 
 
 def channels_last(got: tuple[int, ...]) -> str:
-    """What makes [height, width, 3] of an image's shape that has it not, for messages; nothing if that is not known."""
+    """Suggest how to get [height, width, 3] from an image's shape, for messages; empty where there is no such way."""
     if len(got) == 2:
         return "gray images are repeated for R, G, B"
     if got[-1:] == (4,):
@@ -299,7 +300,7 @@ def channels_last(got: tuple[int, ...]) -> str:
 
 
 def described(value: object) -> str:
-    """What messages call a value: itself where that is short, else its type and shape."""
+    """Name a value in messages: itself if that is short, else its type and shape."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, os.PathLike):
@@ -315,7 +316,7 @@ def described(value: object) -> str:
     return type(value).__name__
 
 
-def finite(name: str, values: np.ndarray, *, least: float = -LARGEST, most: float = LARGEST) -> None:
+def finite(name: str, values: np.ndarray, *, minimum: float = -LARGEST, maximum: float = LARGEST) -> None:
     """Raise ValueError when an array holds NaN, Inf or numbers out of range, with their count and the first place."""
     bad = ~np.isfinite(values)
     if bad.any():
@@ -323,12 +324,12 @@ def finite(name: str, values: np.ndarray, *, least: float = -LARGEST, most: floa
         raise ValueError(
             f"{name}: got {int(bad.sum())} NaN or Inf values (first at index {place}), expected finite numbers"
         )
-    outside = (values < least) | (values > most)
+    outside = (values < minimum) | (values > maximum)
     if outside.any():
         place = tuple(int(i) for i in np.argwhere(outside)[0])
         raise ValueError(
             f"{name}: got {int(outside.sum())} values out of range (first at index {place}: {values[place]:g}), "
-            f"expected {least:g} to {most:g}"
+            f"expected {minimum:g} to {maximum:g}"
         )
 
 
@@ -336,39 +337,39 @@ def finite(name: str, values: np.ndarray, *, least: float = -LARGEST, most: floa
 def _count_outside(
     # in
     values: wp.array(dtype=wp.float32),
-    least: float,
-    most: float,
+    minimum: float,
+    maximum: float,
     argument: int,
     # out
     faults: wp.array(dtype=wp.int32),
 ):
     """A thread owns a number."""
     value = values[wp.tid()]
-    if not (value >= least and value <= most):  # so NaN, too
+    if not (value >= minimum and value <= maximum):  # so NaN, too
         wp.atomic_add(faults, argument, 1)
 
 
 def finite_arrays(
-    arrays: Mapping[str, wp.array | None], *, most: float = LARGEST, nonnegative: Collection[str] = ()
+    arrays: Mapping[str, wp.array | None], *, maximum: float = LARGEST, nonnegative: Collection[str] = ()
 ) -> None:
-    """Raise ValueError when float32 arrays on a device hold NaN, Inf or numbers out of range, of whatever dtype.
+    """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
 
     On a GPU, one count for all of them is read back, which waits for the device. While a CUDA graph is captured that
     cannot be, and nothing is checked.
 
     Args:
         arrays: By the names of their arguments; None is passed over.
-        most: Largest magnitude that is accepted.
+        maximum: Largest magnitude that is accepted.
         nonnegative: Names of the arrays that must hold nothing below 0.
     """
     present = {name: array for name, array in arrays.items() if array is not None and array.size}
     if not present or any(array.device.is_capturing for array in present.values()):
         return
-    ranges = {name: (0.0 if name in nonnegative else -most, most) for name in present}
+    ranges = {name: (0.0 if name in nonnegative else -maximum, maximum) for name in present}
     is_on_host = all(array.device.is_cpu for array in present.values())
     find = _outside_on_host if is_on_host else _outside_on_device
     for name in find(present, ranges):
-        finite(name, present[name].numpy(), least=ranges[name][0], most=most)
+        finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
 
 
 def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -376,8 +377,8 @@ def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[
     views = {name: array.numpy() for name, array in arrays.items()}
     return [
         name
-        for name, (least, most) in ranges.items()
-        if not least <= views[name].min() <= views[name].max() <= most  # NaN is the least and the largest of any
+        for name, (minimum, maximum) in ranges.items()
+        if not minimum <= views[name].min() <= views[name].max() <= maximum  # NaN is the least and the largest of any
     ]
 
 
@@ -410,10 +411,10 @@ def _scalars(array: wp.array) -> wp.array:
 def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], meaning: str = "") -> None:
     """Raise ValueError unless ``got`` matches ``expected``, where a string stands for any length.
 
-    The message ends with what such an array means, and how to make one, if that is said.
+    If ``meaning`` is given, the message ends with it and with how to make such an array.
     """
     matches = len(got) == len(expected) and all(
-        isinstance(wanted, str) or have == wanted for have, wanted in zip(got, expected, strict=True)
+        isinstance(requested, str) or have == requested for have, requested in zip(got, expected, strict=True)
     )
     if not matches:
         lengths = ", ".join(map(str, expected))
@@ -421,7 +422,7 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
 
 
 def missing(what: str, package: str, extra: str) -> str:
-    """What messages say where a package of one of our extras is not installed."""
+    """The message for a package of one of our extras that is not installed."""
     return f'{what} needs the package {package}: pip install "warpshadow[{extra}]"'
 
 

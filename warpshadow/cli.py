@@ -22,6 +22,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.video import VIDEO_SUFFIXES, check_video, write_video
 from warpshadow.scene.scene import Scene
+from warpshadow.spheres import FitReport
 from warpshadow.viewer import HOST, PORT, FitViewer, serve
 
 app = typer.Typer(
@@ -31,11 +32,31 @@ app = typer.Typer(
     help="Soft shadows on meshes under environment light, differentiable, on CPU and CUDA.",
 )
 
-# Exit statuses beside 0, 1 (a mistake in what was given) and 2 (in how).
+# Exit statuses beside 0, 1 (a mistake in a file or value) and 2 (a mistake in the command line).
 DIVERGED = 3
 INTERRUPTED = 130
 
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
+
+SceneOrMesh = Annotated[
+    Path,
+    typer.Argument(
+        help="Scene file, TOML, whose keys warpshadow/scene/README.md lists; or a mesh: .obj, .ply, .stl, .glb, .usd."
+    ),
+]
+
+Up = Annotated[
+    Optional[Literal["y", "z"]],
+    typer.Option(help="Of a mesh: the axis that points up; without it, it is guessed by how the mesh stands."),
+]
+
+Size = Annotated[
+    Optional[tuple[int, int]], typer.Option(help="Of a mesh: width and height of the image, in pixels: 256 256.")
+]
+
+Light = Annotated[
+    Optional[Path], typer.Option(help="Of a mesh: file of an environment map, .exr or .hdr, in place of a sky.")
+]
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]
 
@@ -58,7 +79,7 @@ Quiet = Annotated[
 
 
 def _note(text: str, is_quiet: bool) -> None:
-    """Print how it goes and what was written."""
+    """Print progress and the files that were written."""
     if not is_quiet:
         typer.echo(text)
 
@@ -99,11 +120,12 @@ def _interrupted(how: str = "") -> typer.Exit:
 
 @contextlib.contextmanager
 def _clear_errors() -> Iterator[None]:
-    """Turn errors in what the user gave into one line and exit status 1, and an interrupt into one and 130."""
+    """Turn errors in the user's input into one line and exit status 1, and an interrupt into one and 130."""
     try:
         yield
     except KeyboardInterrupt as error:
-        raise _interrupted() from error  # at once: threads and kernels take a second to end
+        remark = f"; {error}" if error.args else ""
+        raise _interrupted(remark) from error  # at once: threads and kernels take a second to end
     except (ValueError, OSError, ImportError) as error:
         message = error if error.args else type(error).__name__
         typer.secho(f"error: {message}", fg="red", err=True)
@@ -119,17 +141,20 @@ def _check_output(path: Path, *suffixes: str, instead: str = "") -> None:
 
 @app.command()
 def render(
-    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
+    scene: SceneOrMesh,
     output: Annotated[
         Path,
         typer.Option(
             "-o",
             "--output",
-            help="Image to write: .exr, linear float32 RGBA, alpha = coverage; with --turntable or --camera-path a "
-            "video: .mp4, .gif, .webp.",
+            help="Image to write: .png or .jpg, in sRGB, or .exr, linear float32 RGBA, alpha = coverage; with "
+            "--turntable or --camera-path a video: .mp4, .gif, .webp.",
         ),
     ],
-    png: Annotated[Optional[Path], typer.Option(help="Also write an sRGB picture: .png, or .jpg.")] = None,
+    up: Up = None,
+    size: Size = None,
+    light: Light = None,
+    png: Annotated[Optional[Path], typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.")] = None,
     exposure: Annotated[
         Optional[float],
         typer.Option(help="Exposure of the picture in stops; without it the brightest 1% just saturate."),
@@ -187,12 +212,11 @@ def render(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Render a scene file to an image with soft shadows."""
+    """Render a scene file, or a mesh on a ground under a sky, to an image with soft shadows."""
     from warpshadow.assets.image import write_image
     from warpshadow.pipeline.choice_of_receivers import for_picture
-    from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
-    from warpshadow.scene.files import load_scene
     from warpshadow.scene.scene import AUTO
     from warpshadow.tuning.tune import describe, resolved
 
@@ -200,13 +224,11 @@ def render(
         video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
         path = None if camera_path is None else CameraPath.read(camera_path)
         if video is None:
-            is_picture, is_video = (output.suffix.lower() in suffixes for suffixes in (SUFFIXES, VIDEO_SUFFIXES))
-            remedy = (
-                f"; pictures are written by --png {output}"
-                if is_picture
-                else "; videos take --turntable FRAMES or --camera-path FILE"
-            )
-            _check_output(output, ".exr", instead=remedy if is_picture or is_video else "")
+            is_video = output.suffix.lower() in VIDEO_SUFFIXES
+            remedy = "; videos take --turntable FRAMES or --camera-path FILE" if is_video else ""
+            _check_output(output, ".exr", *SUFFIXES, instead=remedy)
+            if layers and output.suffix.lower() in SUFFIXES:
+                raise ValueError(f"--layers: got it with {output}, expected an .exr file, which has channels for them")
         else:
             _check_output(output, *VIDEO_SUFFIXES)
             for option, value in (("--png", png), ("--layers", layers or None), ("--camera-path", camera_path)):
@@ -226,13 +248,15 @@ def render(
         except ValueError as error:
             others = f", or one of {', '.join(_BACKGROUNDS)}" if str(error).startswith("background") else ""
             raise ValueError(f"--{error}{others}") from error
-        given: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
-        parsed = load_scene(scene, **{name: value for name, value in given.items() if value is not None})
+        arguments: dict[str, Any] = {"method": method, "samples": samples, "bounces": bounces}
+        arguments = {name: value for name, value in arguments.items() if value is not None}
+        parsed = _load(scene, up, size, light, is_quiet, **arguments)
         where = _device(device)
-        loaded = resolved(parsed, device=where, progress=True)
+        loaded = parsed
         if parsed.visibility.method == AUTO:
+            loaded = resolved(parsed, device=where, progress=True)
             _note(f"auto: {describe(loaded)}", is_quiet)
-        loaded = for_picture(loaded)
+        loaded = for_picture(loaded if video is None else loaded.with_method())
         start = time.perf_counter()
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
@@ -240,16 +264,45 @@ def render(
             write_video(output, frames, fps=rate)
             _note(f"{output}: {len(cameras)} frames, rendered in {time.perf_counter() - start:.2f} s", is_quiet)
             return
-        renderer = Renderer(loaded, device=where, progress=True)
+        renderer = SceneRenderer(loaded, device=where, progress=True)
         image = renderer.render()
         seconds = time.perf_counter() - start
-        write_image(output, image, layers=renderer.layers().channels() if layers else None)
-        size = f"{image.shape[1]} × {image.shape[0]}"
-        _note(f"{output}: {loaded.visibility.method}, {size}, {seconds:.2f} s", is_quiet)
-        if png is not None:
+        messages = f"{loaded.visibility.method}, {image.shape[1]} × {image.shape[0]}, {seconds:.2f} s"
+        if output.suffix.lower() == ".exr":
+            write_image(output, image, layers=renderer.layers().channels() if layers else None)
+            _note(f"{output}: {messages}", is_quiet)
+        for file in (item for item in (output, png) if item is not None and item.suffix.lower() != ".exr"):
             picture = Picture(image, exposure=exposure, tone=tone, background=_behind(loaded, background))
-            write_image(png, picture)
-            _note(f"{png}: exposure {picture.exposure:+.2f} stops", is_quiet)
+            write_image(file, picture)
+            _note(f"{file}: {f'{messages}, ' * (file == output)}exposure {picture.exposure:+.2f} stops", is_quiet)
+
+
+def _load(
+    file: Path, up: str | None, size: tuple[int, int] | None, light: Path | None, is_quiet: bool, **settings: Any
+) -> Scene:
+    """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
+    from warpshadow.assets.mesh_files import MESH_SUFFIXES
+    from warpshadow.scene.files import load_scene
+    from warpshadow.scene.mesh_scene import default_scene, guess_up
+    from warpshadow.scene.scene import Body, Visibility
+
+    if file.suffix.lower() not in (*MESH_SUFFIXES, ".toml") and file.is_file():
+        expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
+        raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
+    if file.suffix.lower() not in MESH_SUFFIXES:
+        of_mesh = {"--up": (up, "[[body]] rotation"), "--size": (size, "[camera] size"), "--light": (light, "[light]")}
+        for option, (value, key) in of_mesh.items():
+            if value is not None:
+                raise ValueError(f"{option}: got {value} with {file}, expected a mesh; scene files have {key}")
+        return load_scene(file, **settings)
+    body = Body(file)
+    if up is None:
+        guess = guess_up(body.mesh, file.suffix.lower())
+        up = guess.axis
+        _note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
+    scene = default_scene(body, up=up, size=size or (512, 512), light=light)
+    bounces = settings.pop("bounces", scene.bounces)
+    return replace(scene, visibility=Visibility.of(settings), bounces=bounces)
 
 
 def _behind(scene: Scene, background: str) -> str | np.ndarray | None:
@@ -264,9 +317,9 @@ def _frames(
 ) -> Iterator[Picture]:
     """Pictures from cameras, by default at the exposure of the first."""
     from warpshadow.device.progress import progress_bar
-    from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.pipeline.renderer import SceneRenderer
 
-    renderer = Renderer(scene, device=device, progress=True)
+    renderer = SceneRenderer(scene, device=device, progress=True)
     with progress_bar(len(cameras), "rendering", "frame") as bar:
         for camera in cameras:
             image = renderer.with_cameras([camera]).render()[0]
@@ -291,9 +344,9 @@ def insert(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Put the bodies of a scene into a photograph, with their shadows on what it shows.
+    """Put the bodies of a scene into a photograph, with their shadows on the surfaces it shows.
 
-    Bodies with shadow_catcher = true stand for what the photograph shows; they are not drawn, but darken it, and where
+    Bodies with shadow_catcher = true model surfaces in the photograph; they are not drawn, but darken it, and where
     light bounces tint it.
     """
     from warpshadow.assets.image import write_image
@@ -312,7 +365,9 @@ def insert(
 
 @app.command()
 def view(
-    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
+    scene: SceneOrMesh,
+    up: Up = None,
+    light: Light = None,
     host: Annotated[
         str, typer.Option(help="Address to serve at; by default for this machine alone, 0.0.0.0 is for everybody.")
     ] = HOST,
@@ -321,17 +376,16 @@ def view(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Show a scene in the browser, to be turned with the mouse, until Ctrl+C."""
-    from warpshadow.scene.files import load_scene
-
+    """Show a scene, or a mesh on a ground under a sky, in the browser, to be turned with the mouse, until Ctrl+C."""
     with _clear_errors():
-        loaded = load_scene(scene)
-        viewer = serve(loaded, host=host, port=port, device=_device(device), path=scene)
+        loaded = _load(scene, up, None, light, is_quiet)
+        file = scene if scene.suffix.lower() == ".toml" else None
+        viewer = serve(loaded, host=host, port=port, device=_device(device), path=file)
         typer.echo(f"{viewer.url}   (Ctrl+C ends it)")
         viewer.open(browser)
         viewer.wait()
     sys.stdout.flush()
-    os._exit(0)  # at once: Python's own end waits for what is being compiled or painted, and unloads all kernels
+    os._exit(0)  # exit at once: Python's own exit waits for compiling and painting threads, and unloads all kernels
 
 
 @app.command()
@@ -358,11 +412,10 @@ def tune(
 ) -> None:
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
-    Errors are printed before times are measured. Exit status 1: none reaches it; the one that comes nearest is named,
-    and what to try next.
+    Errors are printed before times are measured. Exit status 1: no setting reaches the error; the message names the
+    nearest one, and what to try next.
     """
     from warpshadow.scene.files import load_scene
-    from warpshadow.tuning.timing import TIMED_RECEIVERS
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene
 
@@ -374,24 +427,18 @@ def tune(
         tuning = tune_scene(
             loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True
         )
-        typer.echo(
-            f"{scene}: error of the shading at points of the image, against rays; time of a warm image of "
-            f"{loaded.camera.width} × {loaded.camera.height},\nof which shadows are timed on {TIMED_RECEIVERS} "
-            "receivers and extrapolated to all"
-        )
-        mark = "chosen" if tuning.is_reached else "nearest"
-        typer.echo(f"{tuning.table()}\n* no other is both faster and more accurate    > {mark}\n")
+        typer.echo(f"{scene}\n{tuning}\n")
         if not tuning.is_reached:
-            wanted = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
+            requested = f"an error of {error:g}" if ms is None else f"{ms:g} ms"
             raise ValueError(
-                f"no setting reaches {wanted}; nearest is {describe(tuning.scene)}, with an error of "
+                f"no setting reaches {requested}; nearest is {describe(tuning.scene)}, with an error of "
                 f"{tuning.error:.3g} in {tuning.milliseconds:.3g} ms; {_next_attempt(tuning, ms is None)}"
             )
         typer.echo(tuning.toml(), nl=False)
 
 
 def _next_attempt(tuning: Tuning, is_inaccurate: bool) -> str:
-    """What may reach what no setting did."""
+    """Suggestions for reaching an error that no setting reached."""
     if not is_inaccurate:
         return "try a smaller image or fewer samples a pixel (supersampling = 1)"
     if tuning.untried_counts:
@@ -438,13 +485,13 @@ def fit(
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
-    """Explain images by what a scene leaves free; run again, it goes on where it was interrupted.
+    """Fit the free parameters of a scene to images; run again, it resumes where it was interrupted.
 
     The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
     became NaN or Inf, and the folder has the best values before that.
 
-    Of many fits each has a folder in the folder, and table.csv says how they ended; those that have ended are not done
-    again. One that fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
+    With many fits, each has a subfolder, and table.csv says how they ended; finished fits are not run again. One that
+    fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
     """
     from warpshadow.inverse import checkpoint as checkpoints
     from warpshadow.inverse.descent import GOOD_ENDINGS
@@ -494,8 +541,8 @@ def fit(
             _note(f"already {ending} (on {last:%Y-%m-%d at %H:%M}); {remedy}", is_quiet)
         else:
             report = Report(result)
-            pace = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
-            _note(f"{ending}{pace}", is_quiet)
+            frame_rate = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
+            _note(f"{ending}{frame_rate}", is_quiet)
             _note(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after", is_quiet)
             if result.light is not None:
                 _note(f"{result.light}", is_quiet)
@@ -506,7 +553,7 @@ def fit(
 
 
 def _fit_many(where: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
-    """Do many fits, and name those that have no good end."""
+    """Run many fits, and list the failed ones."""
     from warpshadow.inverse.many import TABLE, find_fits, fit_many
 
     with _clear_errors():
@@ -540,8 +587,9 @@ def _resumable(folder: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt as error:
         is_kept = has_checkpoint(folder)
-        kept = f"; the same command goes on from {folder / CHECKPOINT}" if is_kept else " before a checkpoint"
-        raise _interrupted(kept) from error
+        remark = f"; the same command goes on from {folder / CHECKPOINT}" if is_kept else " before a checkpoint"
+        remark += f"; {error}" if error.args else ""
+        raise _interrupted(remark) from error
 
 
 @app.command()
@@ -605,18 +653,19 @@ def spheres(
         loaded = load_mesh(mesh)
         if count is not None and error is not None:
             raise ValueError("--count, --error: got both, expected one of them")
-        wanted = {"count": count or "auto"} if error is None else {"error": error}
-        fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **wanted)
+        requested = {"count": count or "auto"} if error is None else {"error": error}
+        fit = fit_spheres(loaded, seed=seed, device=_device(device), progress=True, **requested)
         typer.echo(f"{mesh}: {loaded.vertex_count} vertices, {loaded.face_count} faces")
         report = fit.report
-        kept = ", read from the cache" if report.cached else ""
-        typer.echo(f"{report.sphere_count} spheres, fitted in {report.seconds:.1f} s{kept}")
+        remark = ", read from the cache" if report.cached else ""
+        typer.echo(f"{report.sphere_count} spheres, fitted in {report.seconds:.1f} s{remark}")
         typer.echo(f"irradiance error on the ground   {report.ground_error:6.1%}")
         typer.echo(f"error of the shadow there        {report.shadow_error:6.1%}")
         typer.echo(f"irradiance error on the surface  {report.surface_error:6.1%}")
         typer.echo(f"irradiance error in the air      {report.nearby_error:6.1%}")
         typer.echo(f"surface covered                  {report.coverage:6.1%}")
         typer.echo(f"volume outside the mesh          {report.outside_volume:6.1%}")
+        typer.echo(_judgement(report))
         if output is not None:
             fit.spheres.write(output)
         if picture is not None:
@@ -628,6 +677,17 @@ def spheres(
             )
 
 
+def _judgement(report: FitReport) -> str:
+    """The meaning of a fit's errors for images."""
+    from warpshadow.spheres.enough import MOST_SPHERES, RAGGED
+
+    own = "the error on the surface counts where the body deforms, else it traces its shadow on itself"
+    if report.shadow_error <= RAGGED:
+        return f"the shadow on the ground is whole, as its error is below {RAGGED:.0%}; {own}"
+    more = f"--count {2 * report.sphere_count}" if report.sphere_count < MOST_SPHERES else 'method = "ray-traced"'
+    return f"the shadow on the ground has holes, as its error is above {RAGGED:.0%}; {more} may mend them; {own}"
+
+
 @app.command()
 def envmap(
     file: Annotated[Path, typer.Argument(help="Environment map, .exr or .hdr, twice as wide as high.")],
@@ -637,7 +697,7 @@ def envmap(
     ] = None,
     output: Annotated[
         Optional[Path],
-        typer.Option("-o", "--output", help="Where to write the map; beside FILE by default."),
+        typer.Option("-o", "--output", help="Where to write the map; sh_path FILE by default."),
     ] = None,
     is_quiet: Quiet = False,
 ) -> None:
@@ -647,14 +707,14 @@ def envmap(
     from warpshadow.maths import sh
 
     with _clear_errors():
-        beside = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
-        _check_output(beside, ".exr")
+        sh_path = file.with_name(f"{file.stem}.sh{order}.exr") if output is None else output
+        _check_output(sh_path, ".exr")
         light = EnvironmentMap.read(file, sanitize=sanitize)
         for name, value in light.statistics().items():
             shown = " ".join(f"{number:.4g}" for number in np.array(value).ravel())
             typer.echo(f"{name.replace('_', ' '):26}{shown}")
-        write_image(beside, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
-        _note(f"{beside}: reconstruction from {order**2} coefficients", is_quiet)
+        write_image(sh_path, sh.reconstruct_map(light.sh(order), len(light.radiance)).astype(np.float32))
+        _note(f"{sh_path}: reconstruction from {order**2} coefficients", is_quiet)
 
 
 @app.command()
@@ -670,10 +730,10 @@ def cache(
     with _clear_errors():
         typer.echo(cache_folder())
         for kind, what in KINDS.items():
-            kept = cached_files(kind)
-            typer.echo(f"  {what:40}{_size(kept)}")
+            remark = cached_files(kind)
+            typer.echo(f"  {what:40}{_size(remark)}")
             if clear:
-                for file in kept:
+                for file in remark:
                     file.unlink(missing_ok=True)  # another process may clear, too
         wp.init()
         kernels = Path(wp.config.kernel_cache_dir)
@@ -695,7 +755,7 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
     from warpshadow.assets.light import EnvironmentMap
     from warpshadow.assets.primitives import icosphere
     from warpshadow.device.progress import progress_bar
-    from warpshadow.pipeline.renderer import Renderer
+    from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.scene import METHODS, Body, Scene, Visibility
     from warpshadow.spheres import fit_spheres
 
@@ -713,7 +773,7 @@ def warmup(device: Device = "cpu", is_quiet: Quiet = False) -> None:
                     Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8)),
                     Visibility.of({"method": method, "samples": 16}),
                 )
-                Renderer(scene, device=where).render()
+                SceneRenderer(scene, device=where).render()
                 bar.update()
         _note(f"{where.alias}: ready in {time.perf_counter() - start:.1f} s", is_quiet)
 

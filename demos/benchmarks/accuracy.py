@@ -26,7 +26,7 @@ METHODS = {
     "log-SH cap": ws.Visibility(method="log-sh", log="cap"),
     "log-SH eigen": ws.Visibility(method="log-sh"),
     "directional 64": ws.Visibility(directions=64),
-    "directional 128": ws.Visibility(),
+    "directional 128": ws.Visibility("directional"),
     "directional 256": ws.Visibility(directions=256),
 }
 

@@ -1,7 +1,8 @@
 """Time the stages of rendering the bunny scene, and how long their kernels take to compile.
 
     make bench       or        python demos/benchmarks/benchmark.py [--compile]
-    python demos/benchmarks/benchmark.py --busy     README's loop in torch beside processes that compute
+    python demos/benchmarks/benchmark.py --busy     a loop in torch beside processes that compute
+    python demos/benchmarks/benchmark.py --set-up   the first image of meshes of several kinds
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
@@ -26,8 +27,9 @@ import warp as wp
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos import shapes
 from demos.benchmarks.lane_choice import cpu_text
-from demos.scenes import bunny_scene
+from demos.scenes import bunny_scene, on_ground, shipped_mesh
 from warpshadow import inverse
 from warpshadow.stages import (
     accumulate,
@@ -55,14 +57,14 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     scene = bunny_scene()
     renderer = ws.Renderer(scene, device=device, progress=True)
     positions, centers, radii = renderer.geometry().arrays().values()
-    order = renderer.assembly.vertex_order  # in which renderers light them; all, also those that no sample sees
-    normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
+    order = renderer.merged_scene.vertex_order  # in which renderers light them; all, also those that no sample sees
+    normals = vertex_normals(positions, renderer.merged_scene.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device=device) for a in (positions.numpy()[:, order], normals))
     cells = ws.CellBasis(ws.fibonacci(128))
     cell_light = wp.array(cells.coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     sh_light = wp.array(ws.HarmonicBasis(8).coefficients(scene.light)[None], dtype=wp.vec3, device=device)
     clip_matrices = wp.array(scene.camera.clip_matrix()[None], dtype=wp.mat44, device=device)
-    faces = renderer.assembly.faces
+    faces = renderer.merged_scene.faces
 
     def shade_directional() -> wp.array:
         seen = transmittance(points, normals, centers, radii, cells.directions)
@@ -110,7 +112,7 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     def draw_smoothly(matrices: wp.array = clip_matrices) -> wp.array:
         clip = to_clip(renderer.geometry().positions, matrices)
         fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
-        found = find_silhouettes(fragments, faces, renderer.assembly.edges, clip, renderer.assembly.face_bodies)
+        found = find_silhouettes(fragments, faces, renderer.merged_scene.edges, clip, renderer.merged_scene.face_bodies)
         return smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)
 
     def draw_and_back() -> None:
@@ -230,7 +232,7 @@ def on_threads(count: int, function: Callable[[], object]) -> Callable[[], objec
 
 
 def time_busy(runs: int) -> None:
-    """Mean iterations of README's loop in torch, on an idle machine and beside more busy processes than cores."""
+    """Mean iterations of a torch loop of light and texture, on an idle machine and beside more processes than cores."""
     ws.quiet()
     scene = bunny_scene()
     scene = dataclasses.replace(scene, camera=scene.camera.resized(0.5), supersampling=2)
@@ -265,6 +267,54 @@ def time_busy(runs: int) -> None:
             with computing(processes):
                 busy = 1e3 * seconds(*free)
             print(f"  {label:20}{count:18}{idle:8.1f}{busy:8.1f}{busy / idle:8.1f}", flush=True)
+
+
+def time_set_up(device: str) -> None:
+    """CPU seconds of the first image of meshes, with kernels compiled and nothing else cached."""
+    ws.quiet(progress=False)
+    meshes = {
+        "box": shapes.joined("box", shapes.box((1, 1, 1))),
+        "chair": shapes.chair(),
+        "bunny": shipped_mesh("bunny"),
+        "ball": ws.icosphere(1.0, 6),
+    }
+    print(cpu_text())
+    print("CPU seconds; image: of a kept Renderer, with all that is left of it; again: of another, all cached")
+    print(f"{'':12}{'vertices':>10}{'spheres':>9}{'fit':>8}{'tracing':>9}{'image':>8}{'again':>8}{'still':>8}")
+    for name, mesh in {"": ws.icosphere(1.0, 1), **meshes}.items():  # the first loads kernels
+        scene = on_ground(mesh, ws.synthetic_sky(), blockers="auto")
+        with empty_cache():
+            still = seconds_of(lambda scene=scene: ws.render(scene, device=device))
+        mesh = ws.Mesh(mesh.positions, mesh.faces)  # of which nothing is known yet
+        scene = on_ground(mesh, ws.synthetic_sky(), blockers="auto")
+        with empty_cache():
+            fit = seconds_of(lambda mesh=mesh: ws.fit_spheres(mesh, device=device))
+            count = len(ws.fit_spheres(mesh, device=device).spheres)
+            first, again = (seconds_of(lambda scene=scene: ws.Renderer(scene, device=device).render()) for _ in "12")
+        times = (fit, first - again, fit + first, again, still)
+        if name:
+            cells = "".join(f"{seconds:{width}.1f}" for seconds, width in zip(times, (8, 9, 8, 8, 8), strict=True))
+            print(f"{name:12}{mesh.vertex_count:10,}{count:9}{cells}", flush=True)
+
+
+def seconds_of(function: Callable[[], object]) -> float:
+    """CPU seconds of all threads."""
+    start = time.process_time()
+    function()
+    return time.process_time() - start
+
+
+@contextlib.contextmanager
+def empty_cache() -> Iterator[None]:
+    """Keep fits and shadows of bodies on themselves in a folder that is empty before and gone after."""
+    before = os.environ.get("WARPSHADOW_CACHE_DIR")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["WARPSHADOW_CACHE_DIR"] = folder
+        yield
+    if before is None:
+        del os.environ["WARPSHADOW_CACHE_DIR"]
+    else:
+        os.environ["WARPSHADOW_CACHE_DIR"] = before
 
 
 @contextlib.contextmanager
@@ -316,10 +366,14 @@ if __name__ == "__main__":
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
     parser.add_argument("--runs", type=int, default=15, help="timed runs of each row")
     parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
-    parser.add_argument("--busy", action="store_true", help="time README's loop in torch beside other processes")
+    parser.add_argument("--busy", action="store_true", help="time a loop in torch beside other processes")
+    parser.add_argument("--set-up", action="store_true", help="time the first image of meshes, with nothing cached")
     arguments = parser.parse_args()
     if arguments.busy:
         time_busy(arguments.runs)
+        sys.exit()
+    if arguments.set_up:
+        time_set_up(arguments.device)
         sys.exit()
     main(arguments.device, arguments.runs)
     time_fits(arguments.device)

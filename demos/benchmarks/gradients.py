@@ -49,10 +49,10 @@ def main(methods: list[str], sizes: list[int], loss_count: int) -> None:
                 for size in sizes
                 if name == "pose"
             }
-            for across in sample_counts:
-                print(f"{f'{method}, {name}, {across} × {across} samples':40}", end="")
+            for supersampling in sample_counts:
+                print(f"{f'{method}, {name}, {supersampling} × {supersampling} samples':40}", end="")
                 for size in sizes:
-                    renderer = renderer_of(seen, size, across)
+                    renderer = renderer_of(seen, size, supersampling)
                     gradient = gradients(renderer, image_of, loss_count)
                     own = relative_error(gradient, differences(renderer, image_of, loss_count))
                     rest = f"{relative_error(gradient, fine[size]):7.1%}" if size in fine else " " * 7
@@ -60,9 +60,9 @@ def main(methods: list[str], sizes: list[int], loss_count: int) -> None:
                 print()
 
 
-def renderer_of(scene: ws.Scene, size: int, across: int) -> TorchRenderer:
+def renderer_of(scene: ws.Scene, size: int, supersampling: int) -> TorchRenderer:
     camera = scene.camera.resized(size / scene.camera.width)
-    return TorchRenderer(dataclasses.replace(scene, camera=camera, supersampling=across))
+    return TorchRenderer(dataclasses.replace(scene, camera=camera, supersampling=supersampling))
 
 
 def step_of(renderer: TorchRenderer) -> float:

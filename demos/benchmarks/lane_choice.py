@@ -54,8 +54,8 @@ def time_stages(runs: int = RUNS) -> dict[str, float]:
     ws.set_thread_count(1)
     renderer = ws.Renderer(bunny_scene(), device="cpu")
     positions, centers, radii = renderer.geometry().arrays().values()
-    order = renderer.assembly.vertex_order
-    normals = vertex_normals(positions, renderer.assembly.faces).numpy()[:, order]
+    order = renderer.merged_scene.vertex_order
+    normals = vertex_normals(positions, renderer.merged_scene.faces).numpy()[:, order]
     points, normals = (wp.array(a, dtype=wp.vec3, device="cpu") for a in (positions.numpy()[:, order], normals))
     scene = points, normals, centers, radii
     log = accumulate(*scene, order=8)

@@ -65,7 +65,7 @@ COLUMNS: dict[str, Column] = {
     "direct illumination": Column(problems.DIRECT),
     "log-SH cap": Column(ws.Visibility(method="log-sh", log="cap")),
     "log-SH eigen": Column(ws.Visibility(method="log-sh")),
-    "directional": Column(ws.Visibility()),
+    "directional": Column(ws.Visibility("directional")),
     "ray traced": Column(None),
 }
 ALL_BOUNCES = 12  # of targets with bounces: what comes after is less than their noise
@@ -94,7 +94,7 @@ def scenes(data: Path | None) -> list[tuple[ws.Mesh, str, ws.EnvironmentMap]]:
 
 def columns_with_bounces(bounces: int) -> dict[str, Column]:
     """Fits that know direct light alone, and fits that know bounces."""
-    ours = {"directional": ws.Visibility(), "ray traced": None}
+    ours = {"directional": ws.Visibility("directional"), "ray traced": None}
     known = {f"{name}, {bounces} bounces": Column(visibility, bounces) for name, visibility in ours.items()}
     return {name: COLUMNS[name] for name in ("direct illumination", *ours)} | known
 

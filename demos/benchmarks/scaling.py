@@ -61,10 +61,10 @@ def ball_scene(subdivisions: int, sphere_count: int, size: int) -> ws.Scene:
     return dataclasses.replace(scene, camera=scene.camera.resized(size / scene.camera.width), supersampling=1)
 
 
-def crowded_scene(across: int) -> ws.Scene:
+def crowded_scene(supersampling: int) -> ws.Scene:
     """Balls in rows and columns on a ground of 6 units."""
-    places = (np.arange(across) + 0.5) * 6 / across - 3
-    scale = 2.4 / across
+    places = (np.arange(supersampling) + 0.5) * 6 / supersampling - 3
+    scale = 2.4 / supersampling
     balls = tuple(ball(3, 16, scale=scale, translation=(x, scale, z)) for x in places for z in places)
     scene = ball_scene(3, 16, 256)
     return dataclasses.replace(scene, bodies=(*balls, scene.bodies[1]))
@@ -89,10 +89,10 @@ def bunny_with(spheres: ws.Spheres, size: int = 256) -> ws.Scene:
 def shading(scene: ws.Scene) -> Timed:
     """Visibility and shading of all vertices, by themselves and with all gradients."""
     renderer = ws.Renderer(scene)
-    own, assembly = renderer.geometry(), renderer.assembly
-    vertices, places = np.unique(assembly.faces.numpy(), return_index=True)
-    order = assembly.vertex_order[np.isin(assembly.vertex_order, vertices)]  # in which renderers light them, …
-    order = order[np.argsort(assembly.body_of_vertex[order], kind="stable")]  # … a body after another
+    own, merged_scene = renderer.geometry(), renderer.merged_scene
+    vertices, places = np.unique(merged_scene.faces.numpy(), return_index=True)
+    order = merged_scene.vertex_order[np.isin(merged_scene.vertex_order, vertices)]  # in which renderers light them, …
+    order = order[np.argsort(merged_scene.body_of_vertex[order], kind="stable")]  # … a body after another
     places = places[np.searchsorted(vertices, order)]
     given = places // 3, np.eye(3, dtype=np.float32)[places % 3]
     free = [wp.clone(array, requires_grad=True) for array in (own.positions, own.centers, own.radii)]

@@ -4,8 +4,8 @@
         [--settings still-direct kept-direct still-full kept-full] [--mitsuba] [--output FOLDER]
 
 The scenes are those of demos/kinds.py. A still is ``ws.render``, kept is ``ws.Renderer(scene).render()``. Direct light
-is compared with rays, two bounces (or ``--bounces``) with paths of all bounces, both by method "ray-traced". For each
-scene and setting the demo prints, in percent
+is compared with rays, full light, ``bounces = "all"`` (or as many as ``--bounces`` says), with paths of all bounces,
+both by method "ray-traced". For each scene and setting the demo prints, in percent
 
     error    relative L2 error of color over wholly covered pixels, as in the other demos
     bodies   of each body, how much brighter its pixels are on average: the worst first, as many as --bodies says
@@ -15,7 +15,10 @@ References are rendered twice, the second time with scene and light turned about
 first two figures are against the mean of both, with its noise, half their difference, taken off. They stay in
 OUTPUT/references by a hash of all that they depend on, so that a second run renders ours alone.
 
-Also printed: CPU seconds of the first image (* where the cache lacked a fit, own shadows or form factors of it; the
+Where a still and a kept image of one light are asked for, "still to kept" is their relative L2 difference over pixels
+that are wholly covered.
+
+Also printed: CPU seconds of the first image (* where the cache lacked a fit, self-shadows or form factors of it; the
 very first run also compiles kernels); CPU milliseconds of an image after all bodies moved; the most memory that the
 scene's process had up to each setting. With
 ``--mitsuba`` the references are compared with Mitsuba's, and ours with both. A contact sheet for each scene shows
@@ -43,6 +46,7 @@ import warpshadow as ws
 from demos.kinds import SCENES, Sources
 from demos.references import Reference, Request
 from warpshadow.assets.cache import KINDS, cached_files
+from warpshadow.scene.scene import Bounces
 
 SETTINGS = ("still-direct", "kept-direct", "still-full", "kept-full")
 ALL_BOUNCES = 16
@@ -60,7 +64,7 @@ class Options:
         data: Folder with meshes/ and envmaps/.
         size: Pixels across and down.
         samples: Rays, or paths, of a pixel of a reference; half of them in each of its two images.
-        bounces: Of ours, in full light.
+        bounces: Of ours, in full light: a number, or "all".
         settings: Some of SETTINGS.
         output: Folder of pictures, figures and references.
         references: Folder of references.
@@ -70,7 +74,7 @@ class Options:
     data: Path | None = None
     size: int = 256
     samples: int = 2048
-    bounces: int = 2
+    bounces: Bounces = "all"
     settings: tuple[str, ...] = SETTINGS
     output: Path = Path("out/scenes_of_all_kinds")
     references: Path = Path("out/references")
@@ -131,6 +135,11 @@ def measure(name: str, options: Options) -> dict[str, Any]:
             figures["error to Mitsuba"] = checks[light].error(image)
         result["settings"][setting] = figures
         images[setting] = image
+    result["still to kept"] = {
+        light: relative(images[f"kept-{light}"], images[f"still-{light}"], references[light].covered)
+        for light in options.lights()
+        if {f"still-{light}", f"kept-{light}"} <= set(images)
+    }
     draw_sheet(name, images, references, result, options.output / f"{name}.png")
     return result
 
@@ -158,7 +167,7 @@ def kept(scene: ws.Scene) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def cached_counts() -> dict[str, int]:
-    """How many fits, own shadows and form factors the cache has."""
+    """How many fits, self-shadows and form factors the cache has."""
     return {kind: len(cached_files(kind)) for kind in KINDS}
 
 
@@ -289,7 +298,8 @@ def print_scene(name: str, result: dict[str, Any], body_count: int) -> None:
         first = f"{figures['first CPU s']:.1f} s{'*' if any(figures['made'].values()) else ' '}"
         bodies = ", ".join(f"{body} {error:+.1%}" for body, error in worst_bodies(figures["bodies"])[:body_count])
         errors = f"{figures['error']:7.1%}{figures['block']:8.0%}"
-        print(f"{name:20}{setting:14}{errors}{first:>10}{moved:>9}{memory:>10}  {bodies}")
+        theirs = f"; to Mitsuba {figures['error to Mitsuba']:.1%}" if "error to Mitsuba" in figures else ""
+        print(f"{name:20}{setting:14}{errors}{first:>10}{moved:>9}{memory:>10}  {bodies}{theirs}")
     for light, figures in result["references"].items():
         line = f"{name:20}{light + ' rays':14} noise {figures['noise']:.1%}"
         if "error to Mitsuba" in figures:
@@ -297,6 +307,8 @@ def print_scene(name: str, result: dict[str, Any], body_count: int) -> None:
             line += f", to Mitsuba {figures['error to Mitsuba']:.1%}, {figures['brighter than Mitsuba']:+.2%}; "
             line += ", ".join(f"{body} {error:+.1%}" for body, error in bodies)
         print(line)
+    for light, difference in result["still to kept"].items():
+        print(f"{name:20}{light + ' light':14} still to kept {difference:.1%}")
     sys.stdout.flush()
 
 
@@ -320,6 +332,13 @@ def print_means(results: dict[str, Any], options: Options) -> None:
             f"{setting}: mean error {statistics.mean(errors.values()):.1%}, worst {errors[worst]:.1%} ({worst}); "
             f"worst body {bodies[worst_body][1]:+.1%} ({bodies[worst_body][0]}, {worst_body})"
         )
+    for light in next(iter(results.values()))["still to kept"]:
+        differences = {name: result["still to kept"][light] for name, result in results.items()}
+        worst = max(differences, key=lambda name: differences[name])
+        print(
+            f"{light} light, still to kept: mean {statistics.mean(differences.values()):.1%}, "
+            f"worst {differences[worst]:.1%} ({worst})"
+        )
 
 
 def processor() -> str:
@@ -327,6 +346,11 @@ def processor() -> str:
     from demos.benchmarks.lane_choice import cpu_text
 
     return cpu_text().splitlines()[0]
+
+
+def bounce_count(text: str) -> Bounces:
+    """What ``--bounces`` says."""
+    return "all" if text == "all" else int(text)
 
 
 def described(options: Options) -> dict[str, Any]:
@@ -343,7 +367,7 @@ if __name__ == "__main__":
     parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
     parser.add_argument("--size", type=int, default=Options.size, help="pixels across and down")
     parser.add_argument("--samples", type=int, default=Options.samples, help="rays of a pixel of a reference")
-    parser.add_argument("--bounces", type=int, default=Options.bounces, help="of ours, in full light")
+    parser.add_argument("--bounces", type=bounce_count, default=Options.bounces, help="of ours, in full light")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=SETTINGS)
     parser.add_argument("--mitsuba", type=int, nargs="?", const=1024, default=0, metavar="SAMPLES", help="compare, too")
     parser.add_argument("--output", type=Path, default=Options.output, help="folder of pictures and figures")

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.scenes import on_ground, shipped_mesh
-from warpshadow.viewer.look import Look
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PageCamera, quaternion, rotation
 from warpshadow.viewer.painter import Frame, Painter, own_page
-from warpshadow.viewer.quality import Pace
+from warpshadow.viewer.quality import FrameRate
+from warpshadow.viewer.state import ViewerState
 
 QUALITY = 80  # of the JPEGs
 
@@ -69,20 +69,20 @@ class QuickPage:
             raise RuntimeError(message)
 
 
-def one_after_another(painter: Painter, look: Look, page: PageCamera, count: int) -> np.ndarray:
+def one_after_another(painter: Painter, viewer_state: ViewerState, page: PageCamera, count: int) -> np.ndarray:
     """Seconds of each image of an orbit, encoding included."""
-    pace, seconds = Pace(), []
+    pace, seconds = FrameRate(), []
     pace.pixels = page.width * page.height
     for number in range(count):
         start = time.perf_counter()
-        encoded(painter.paint(look, orbited(page, 2.0 * number), pace.moving()))
+        encoded(painter.paint(viewer_state, orbited(page, 2.0 * number), pace.moving()))
         seconds.append(time.perf_counter() - start)
     return np.array(seconds[2:])  # what is made once was made
 
 
-def in_the_loop(painter: Painter, look: Look, page: PageCamera, seconds: float) -> QuickPage:
+def in_the_loop(painter: Painter, viewer_state: ViewerState, page: PageCamera, seconds: float) -> QuickPage:
     """What a page that orbits for some seconds is sent."""
-    loop, taker = Loop(painter.paint, look), QuickPage()
+    loop, taker = Loop(painter.paint, viewer_state), QuickPage()
     loop.join("page", taker)
     start = time.monotonic()
     while (now := time.monotonic() - start) < seconds:
@@ -96,11 +96,11 @@ def main(size: int, seconds: float) -> None:
     ws.quiet()
     scene = on_ground(shipped_mesh("bunny"), ws.synthetic_sky())
     painter = Painter(scene)
-    look = Look.of(scene, painter.natural_stops())
+    viewer_state = ViewerState.of(scene, painter.natural_stops())
     page = dataclasses.replace(own_page(scene, painter.page_scale), width=size, height=size)
-    one_after_another(painter, look, page, 3)
+    one_after_another(painter, viewer_state, page, 3)
     used = time.process_time()
-    times = one_after_another(painter, look, page, 60)
+    times = one_after_another(painter, viewer_state, page, 60)
     used = (time.process_time() - used) / 60
     print(f"load of the machine {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores")
     print(
@@ -108,8 +108,8 @@ def main(size: int, seconds: float) -> None:
         f"at best ({1e3 * np.median(times):.1f} and {1e3 * times.min():.1f} ms; {1e3 * used:.1f} ms of one core)"
     )
     large = dataclasses.replace(page, width=1280, height=960)
-    in_the_loop(painter, look, large, 1.0)
-    taker = in_the_loop(painter, look, large, seconds)
+    in_the_loop(painter, viewer_state, large, 1.0)
+    taker = in_the_loop(painter, viewer_state, large, seconds)
     print(
         f"in a page of 1280 × 960 for {seconds:g} s: {len(taker.delays) / seconds:.0f} images/s of "
         f"{np.median(taker.sizes):.0f} pixels and {np.median(taker.bytes) / 1e3:.0f} kB; from mouse to picture "

@@ -33,7 +33,7 @@ from demos.examples.bunny import checkers, contact_sheet
 from demos.problems import DIRECT, changed, displaced, placement, pose_errors, ray_traced
 from demos.scenes import image_error, on_ground, shipped_mesh
 from warpshadow import inverse
-from warpshadow.inverse.world import Found
+from warpshadow.inverse.world import FittedScene
 from warpshadow.maths.sh import equirectangular_directions
 
 FOCAL_LENGTH, SENSOR_HEIGHT = 24.0, 15.6  # mm: as EXIF and the camera's data sheet have them
@@ -190,7 +190,7 @@ def follow_recipe(folder: Path) -> inverse.Result:
     return result
 
 
-def measure(found: Found, truth: ws.Scene) -> dict[str, float]:
+def measure(found: FittedScene, truth: ws.Scene) -> dict[str, float]:
     """How far a result is from the truth, in percent, and by how many degrees it is turned."""
     (body, ground), (true_body, true_ground) = (scene.bodies[:2] for scene in (found.scene, truth))
     pose = pose_errors(body, true_body)

@@ -8,6 +8,7 @@ import warpshadow as ws
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 ws.quiet()
+np.set_printoptions(suppress=True)  # no powers of ten
 bunny = ws.Body(warp.examples.get_asset_directory() + "/bunny.usd", albedo=(0.8, 0.4, 0.2)).on_ground(size=2)
 camera = ws.Camera.framing(bunny, size=(96, 96), margin=0.4)
 scene = ws.Scene([bunny, ws.Body(ws.plane(6.0))], ws.synthetic_sky(sun_radius=5.0), camera)

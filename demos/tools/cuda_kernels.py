@@ -12,10 +12,10 @@ import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
-from warpshadow.stages import transfer
+from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
-from warpshadow.stages.interpolate import _make_interpolate, _make_interpolate_adjoint
-from warpshadow.stages.own_shadows import gather, lobes, sun_cells, trace
+from warpshadow.stages.interpolate import _make_interpolate
+from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -30,7 +30,6 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for make in (log_sh._make_accumulate, log_sh._make_accumulate_adjoint)
         for order, horizon in [(2, False), (8, True)]
     },
-    **{f"_make_multiply_spheres {order}": partial(log_sh._make_multiply_spheres, order, LANES) for order in ORDERS},
     **{
         f"_make_exponentiate {order} {base} {keeps}": partial(exponential._make_exponentiate, order, base, keeps, LANES)
         for order, base, keeps in [(2, "quadratic", True), *((8, base, False) for base in exponential.THRESHOLDS)]
@@ -57,7 +56,6 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (
             _make_interpolate,
-            _make_interpolate_adjoint,
             batch._make_add,
             smooth._make_blend,
             smooth._make_blend_adjoint,
@@ -70,6 +68,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
     "trace._make_trace": trace._make_trace,
     "sun_cells._make_trace": sun_cells._make_trace,
+    "shared_rays._make_trace": shared_rays._make_trace,
+    "_make_trace_cosines": traced_transfer._make_trace_cosines,
     "_make_empty": partial(lanes._make_empty, ""),
 }
 """Makers of kernels that depend on an order, a dtype or an option, with the arguments that differ most."""

@@ -199,15 +199,20 @@ def measure(scene: ws.Scene) -> tuple[Size, float, float]:
     """A scene in numbers, and what culling leaves of its visibility."""
     renderer = ws.Renderer(scene)
     geometry = renderer.geometry()
-    normals = vertex_normals(geometry.positions, renderer.assembly.faces)
+    normals = vertex_normals(geometry.positions, renderer.merged_scene.faces)
     arrays = [geometry.positions, normals, geometry.centers, geometry.radii]
     directions = ws.fibonacci(scene.visibility.directions)
     width = falloff_width(scene.visibility.softness, len(directions))
     shares = needed(*(array.numpy()[0].astype(np.float64) for array in arrays), directions, width)
     vertex_count, sphere_count = arrays[0].shape[1], arrays[3].shape[1]
-    face_count, sample_count = renderer.assembly.faces.shape[0], scene.camera.width * scene.camera.height
+    face_count, sample_count = renderer.merged_scene.faces.shape[0], scene.camera.width * scene.camera.height
     size = Size(
-        vertex_count, face_count, sphere_count, len(directions), sample_count, renderer.assembly.two_sided_faces.size
+        vertex_count,
+        face_count,
+        sphere_count,
+        len(directions),
+        sample_count,
+        renderer.merged_scene.two_sided_faces.size,
     )
     return size, *shares
 

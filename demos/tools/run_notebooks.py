@@ -24,6 +24,13 @@ def executed(path: Path, *more: str) -> nbformat.NotebookNode:
     return notebook
 
 
+def lasting_outputs(cell: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    """What a cell shows on every machine: neither warnings nor bars, which only slow work shows."""
+    bar = "application/vnd.jupyter.widget-view+json"
+    outputs = cell.get("outputs", [])
+    return [output for output in outputs if output.get("name") != "stderr" and bar not in output.get("data", {})]
+
+
 def tidied(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     """The same without what differs from run to run, and from machine to machine: times, progress and warnings."""
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -31,7 +38,7 @@ def tidied(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     for number, cell in enumerate(notebook.cells):
         cell.metadata, cell["id"] = nbformat.from_dict({}), f"cell-{number}"
         if cell.cell_type == "code":
-            cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+            cell.outputs = lasting_outputs(cell)
     return notebook
 
 

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import twins
+import warp as wp
 
+import warpshadow as ws
 from warpshadow.assets.basis import CellBasis, HarmonicBasis, check_basis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.sky import synthetic_sky
 from warpshadow.maths import directions as cells
+from warpshadow.maths.sh import equirectangular_directions
 
 # Coefficients are float32 of numbers up to 10.
 FLOAT32 = 5e-6
@@ -110,3 +113,64 @@ def test_coefficients_are_the_callers_own(basis):
     expected = coefficients.copy()
     coefficients[:] = 0
     np.testing.assert_array_equal(basis.coefficients(light), expected)
+
+
+# ------------------------------------------------------------------------------------------------ maps of coefficients
+
+
+@pytest.mark.parametrize("count", [16, 128, 512])
+def test_cells_keep_their_energy_in_a_map(count):
+    basis = CellBasis(cells.fibonacci(count))
+    light = np.random.default_rng(4).uniform(0.1, 10, (count, 3))
+    np.testing.assert_allclose(basis.coefficients(basis.to_map(light)), light, rtol=FLOAT32)
+
+
+@pytest.mark.parametrize("order", [2, 5, 8])
+def test_harmonics_that_are_nowhere_negative_are_in_a_map_what_they_were(order):
+    basis = HarmonicBasis(order)
+    light = np.random.default_rng(5).normal(size=(order**2, 3))
+    light /= np.linalg.norm(light)
+    light[0] = np.sqrt(4 * np.pi) * order
+    found = basis.coefficients(basis.to_map(light))
+    assert np.linalg.norm((found - light)[1:]) < 5e-3 * np.linalg.norm(light[1:])  # pixels of 1/64 of a half turn
+    assert np.abs(found[0] / light[0] - 1).max() < 1e-4
+
+
+@pytest.mark.parametrize("basis", [HarmonicBasis(3), CellBasis(cells.fibonacci(16))])
+def test_negative_radiance_is_none_in_a_map(basis):
+    light = np.random.default_rng(6).normal(size=(basis.size, 3))
+    radiance = basis.to_map(light).radiance
+    assert radiance.min() == 0 and radiance.max() > 0
+    directions = equirectangular_directions(len(radiance))
+    values = np.stack([basis.functions(row) @ light for row in directions])
+    np.testing.assert_array_equal(radiance > 0, values > 0)
+
+
+@pytest.mark.parametrize("basis", [HarmonicBasis(3), CellBasis(cells.fibonacci(16))])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.zeros((7, 3)), r"got shape \(7, 3\), expected \[(9|16), 3\]"),
+        (np.full(1, np.nan), "got 1 NaN or Inf"),
+        ("sky.exr", "got 'sky.exr', expected linear RGB"),
+    ],
+)
+def test_maps_are_made_of_coefficients_in_the_basis(basis, given, message):
+    if isinstance(given, np.ndarray) and given.ndim == 1:
+        given = np.where(np.arange(3 * basis.size).reshape(-1, 3) == 4, given, 1.0)
+    with pytest.raises(ValueError, match=f"^coefficients: {message}"):
+        basis.to_map(given)
+
+
+def test_a_map_of_cells_lights_a_scene_as_the_cells_do():
+    """Without shadows, by which alone a map that a renderer knows differs from free light."""
+    ball = ws.Body(ws.icosphere(1.0, 3), blockers=0)
+    camera = ws.Camera.look_at((0, 1, 3), (0, 0, 0), size=(16, 16))
+    basis = CellBasis(cells.fibonacci(128))
+    light = basis.coefficients(synthetic_sky(height=64))
+    scene = ws.Scene([ball], basis.to_map(light), camera)
+    found = ws.Renderer(scene, basis=basis)
+    free = found.draw(wp.array(light[None], dtype=wp.vec3)).numpy()
+    again = found.draw(wp.array(basis.coefficients(scene.light)[None], dtype=wp.vec3)).numpy()
+    np.testing.assert_allclose(again, free, rtol=FLOAT32, atol=FLOAT32)
+    assert np.linalg.norm(found.render() - free) < 0.01 * np.linalg.norm(free)

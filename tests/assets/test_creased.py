@@ -187,9 +187,9 @@ def turn(angles: torch.Tensor) -> torch.Tensor:
     return torch.linalg.matrix_exp(torch.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x]).reshape(3, 3))
 
 
-def motion_gradients(mesh: ws.Mesh, receivers: str, across: int) -> tuple[np.ndarray, np.ndarray]:
+def motion_gradients(mesh: ws.Mesh, receivers: str, supersampling: int) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a loss of the image by how a body shifts and turns, and a camera, and differences, [4, 3]."""
-    scene = dataclasses.replace(scene_of(mesh, receivers=receivers), supersampling=across)
+    scene = dataclasses.replace(scene_of(mesh, receivers=receivers), supersampling=supersampling)
     renderer = TorchRenderer(scene)
     rotations, translations, scales = renderer.scene_poses()
     clip_matrix = torch.tensor(scene.camera.clip_matrix(), dtype=torch.float32)
@@ -213,13 +213,13 @@ def motion_gradients(mesh: ws.Mesh, receivers: str, across: int) -> tuple[np.nda
 
 
 @pytest.mark.parametrize(
-    ("mesh", "receivers", "across"),
+    ("mesh", "receivers", "supersampling"),
     [(CUBE, "vertex", 1), (CUBE, "vertex", 2), (CUBE, "pixel", 1), (CUBE, "pixel", 2), (ROCK, "pixel", 2)],
     ids=lambda value: getattr(value, "name", str(value)),
 )
-def test_gradients_of_motions_of_creased_bodies_are_those_of_differences(mesh, receivers, across):
+def test_gradients_of_motions_of_creased_bodies_are_those_of_differences(mesh, receivers, supersampling):
     """By pixel they are 16 to 99% off if creases do not move."""
-    got, expected = motion_gradients(mesh.creased(), receivers, across)
+    got, expected = motion_gradients(mesh.creased(), receivers, supersampling)
     errors = np.linalg.norm(got - expected, axis=1) / np.linalg.norm(expected, axis=1)
     assert errors.max() < MOTION
 
@@ -235,6 +235,22 @@ def test_a_mesh_whose_sharp_edges_share_normals_costs_a_warning_with_the_remedy(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ws.render(scene_of(mesh.creased()))
+
+
+def joined(*meshes):
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return ws.Mesh(np.concatenate([mesh.positions for mesh in meshes]), np.concatenate(faces))
+
+
+def test_many_boxes_are_as_sharp_as_one():
+    places = np.stack(np.meshgrid(*[np.arange(3)] * 3), axis=-1).reshape(-1, 3)
+    boxes = [CUBE.transformed(translation=3.0 * place) for place in places]
+    ball = ws.icosphere(9.0, 3)
+    heap = joined(*boxes)
+    assert heap.rounds_edges and not heap.creased().rounds_edges
+    assert joined(ball, *boxes).rounds_edges
+    assert not joined(ball, CUBE.transformed(scale=0.1)).rounds_edges  # a button
 
 
 def test_round_meshes_and_irregular_ones_are_not_remarked_upon():

@@ -316,26 +316,28 @@ def test_harmonics_of_a_turned_map_are_turned_harmonics(height, degrees):
 def cells_twin(environment, directions, split):
     """Every sub-pixel to the nearest direction, one at a time, in float64."""
     height = len(environment.radiance)
-    energy, moment = np.zeros((2, len(directions), 3))
+    (energy, moment), squares = np.zeros((2, len(directions), 3)), np.zeros((len(directions), 4))
     for row, col in np.ndindex(height * split, 2 * height * split):
         towards = direction_twin(row + 0.5, col + 0.5, height * split)
         light = environment.radiance[row // split, col // split] * solid_angle_twin(row, height * split)
         owner = np.argmin(np.linalg.norm(directions - towards, axis=1))
         energy[owner] += light
         moment[owner] += light @ LUMINANCE * towards
-    return energy, moment
+        squares[owner] += (light @ LUMINANCE) ** 2 / solid_angle_twin(row, height * split) * np.append(towards, 1)
+    return energy, moment, squares
 
 
 def test_cells_and_their_moments_equal_their_twins():
     environment, directions = random_map(8), fibonacci(10)
-    energy, moment = cells_twin(environment, directions, split=int(np.ceil(4 * np.pi * np.sqrt(10) / 8)))
+    energy, moment, squares = cells_twin(environment, directions, split=int(np.ceil(4 * np.pi * np.sqrt(10) / 8)))
     cells = environment.cells(directions).radiance
     assert cells.dtype == np.float32
     np.testing.assert_allclose(cells, energy * 10 / (4 * np.pi), rtol=1e-5)
-    _, mean, spreads = environment.cells(directions)
-    length = np.linalg.norm(moment, axis=1)
-    np.testing.assert_allclose(mean, moment / length[:, None], atol=1e-5)
-    np.testing.assert_allclose(spreads, np.arccos(2 * length / (energy @ LUMINANCE) - 1), atol=1e-5)
+    _, mean, spots, spreads = environment.cells(directions)
+    np.testing.assert_allclose(mean, moment / np.linalg.norm(moment, axis=1)[:, None], atol=1e-5)
+    length = np.linalg.norm(squares[:, :3], axis=1)
+    np.testing.assert_allclose(spots, squares[:, :3] / length[:, None], atol=1e-5)
+    np.testing.assert_allclose(spreads, np.arccos(2 * length / squares[:, 3] - 1), atol=1e-5)
 
 
 @settings(max_examples=15, deadline=None)
@@ -359,14 +361,23 @@ def test_a_point_light_has_its_own_direction_and_no_spread():
     environment = spot(20, 30, height=64)
     towards = direction_twin(20.5, 30.5, 64)
     directions = fibonacci(32)
-    _, mean, spreads = environment.cells(directions)
+    _, mean, spots, spreads = environment.cells(directions)
     lit = np.argmax(environment.cells(directions).radiance[:, 0])
     assert lit == np.argmax(directions @ towards)
-    np.testing.assert_allclose(mean[lit], towards, atol=1e-3)
+    np.testing.assert_allclose([mean[lit], spots[lit]], [towards, towards], atol=1e-3)
     assert spreads[lit] < np.pi / 64
     dark = np.arange(32) != lit
-    np.testing.assert_allclose(mean[dark], directions[dark], atol=1e-6)
+    np.testing.assert_allclose([mean[dark], spots[dark]], [directions[dark], directions[dark]], atol=1e-6)
     np.testing.assert_allclose(spreads[dark], np.arccos(1 - 2 / 32), rtol=1e-6)  # a cap of 4π/32
+
+
+def test_the_sky_around_a_sun_does_not_widen_it():
+    sun, directions = EnvironmentMap(2000 * spot(20, 30, height=64).radiance), fibonacci(32)
+    lit = np.argmax(sun.cells(directions).radiance[:, 0])
+    both = EnvironmentMap(sun.radiance + np.float32(1)).cells(directions)
+    np.testing.assert_allclose(both.spots[lit], direction_twin(20.5, 30.5, 64), atol=1e-3)
+    assert both.spreads[lit] < 1.1 * np.pi / 64  # a tenth of its cell
+    assert both.directions[lit] @ both.spots[lit] < np.cos(np.radians(0.3))  # the mean of both is beside it
 
 
 @pytest.mark.parametrize("directions", [np.zeros((0, 3)), np.ones((4, 3)), np.full((4, 3), np.nan), np.ones(3)])

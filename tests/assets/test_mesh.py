@@ -69,7 +69,7 @@ def write(folder, name, text):
         ((TRIANGLE, None), "faces: got None, expected integers"),
         (("cow.obj", None), r"positions: got 'cow.obj', expected an array .*load_mesh\(path\)"),
         (([[0, 0, 0], [1]], [[0, 1, 2]]), r"positions: got \[\[0, 0, 0\], \[1\]\], expected an array"),
-        ((TRIANGLE, [[0, 1, 2]], TRIANGLE[:, :2]), "uv_faces: got None"),
+        ((TRIANGLE, [[0, 1, 2]], TRIANGLE[:2, :2]), "uvs: got 2 for 3 vertices, expected one for each, or uv_faces"),
         ((TRIANGLE, [[0, 1, 2]], None, [[0, 1, 2]]), "uvs: got None"),
         ((TRIANGLE, [[0, 1, 2]], TRIANGLE[:, :2], [[0, 1, 3]]), r"uv_faces: got 1 .*face 0: uv 3\)"),
         ((TRIANGLE, [[0, 1, 2]], TRIANGLE[:, :2], [[0, 1, 2]] * 2), "uv_faces: got 2 faces, expected 1"),
@@ -276,6 +276,36 @@ def test_oddities_are_accepted_with_one_warning_that_counts_each(tmp_path):
 
 
 # ---------------------------------------------------------------------------------------------- PLY, STL, GLB
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+@pytest.mark.parametrize(
+    ("part", "messages"),
+    [
+        (0.6, {"stl": "9650 bytes, .* says 320 triangles, which are 16084", "stl_ascii": "no endsolid"}),
+        (0.0, {"stl": "got 0 bytes, fewer than", "stl_ascii": "got 0 bytes, fewer than"}),
+    ],
+)
+def test_an_stl_file_that_is_cut_off_says_so(tmp_path, kind, part, messages):
+    import trimesh
+
+    ball = icosphere(1.0, 2)
+    content = trimesh.Trimesh(ball.positions, ball.faces, process=False).export(file_type=kind)
+    content = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "x.stl").write_bytes(content[: int(part * len(content))])
+    with pytest.raises(MeshError, match=f"x.stl: faces: got none.*cut off.*({messages[kind]})"):
+        load_mesh(tmp_path / "x.stl")
+
+
+def test_uvs_of_vertices_need_no_faces_of_their_own():
+    quad = plane(2.0, 1)
+    uvs = quad.positions[:, ::2]
+    mesh = Mesh(quad.positions, quad.faces, uvs)
+    np.testing.assert_array_equal(mesh.uvs, uvs)
+    np.testing.assert_array_equal(mesh.uv_faces, quad.faces)
+    with pytest.warns(UserWarning, match="1 duplicate faces dropped"):
+        twice = Mesh(quad.positions, [*quad.faces, quad.faces[0]], uvs)
+    np.testing.assert_array_equal(twice.uv_faces, quad.faces)
 
 
 def cylinder(normals=None):

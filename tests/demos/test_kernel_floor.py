@@ -72,10 +72,11 @@ def test_the_scene_is_measured():
 def test_the_launches_of_the_stages_are_those_of_a_captured_pose_iteration(monkeypatch):
     """Captured on the CPU, whose graphs count what they hold; all vertices are receivers, as on a GPU."""
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)  # as on a GPU
-    ball = ws.Body(ws.icosphere(0.5, 1), blockers=ws.Spheres([[0, 0, 0]], [0.5]), translation=(0, 0.5, 0))
+    spheres = ws.Spheres([[0, 0, 0]], [0.5])
+    ball = ws.Body(ws.icosphere(0.5, 1), blockers=spheres, translation=(0, 0.5, 0), receivers="vertex")
     camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(8, 8))
     by_spheres = ws.Visibility(self_shadows="spheres")
-    ground = ws.Body(ws.plane(4, 4), blockers=0)  # the floor knows of no flats that block light
+    ground = ws.Body(ws.plane(4, 4), blockers=0, receivers="vertex")  # the floor knows of no planes that block light
     scene = ws.Scene((ball, ground), ws.synthetic_sky(height=16), camera, by_spheres, supersampling=1)
     pose = warp_loop.FreePose(ws.Renderer(scene))
     target = wp.zeros(64, dtype=wp.vec4)

@@ -8,7 +8,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from demos.tools.run_notebooks import NOTEBOOKS, executed, tidied
+from demos.tools.run_notebooks import NOTEBOOKS, executed, lasting_outputs, tidied
 
 SCRIPTS = Path(__file__).parents[2] / "demos" / "scripts"
 
@@ -33,9 +33,8 @@ def test_a_notebook_finds_what_it_says(path):
     run = executed(path, FOUND[path.stem])
     kept = nbformat.read(path, as_version=4)
     for cell, own in zip(kept.cells, run.cells[:-1], strict=True):
-        assert [output.output_type for output in cell.get("outputs", [])] == [
-            output.output_type for output in own.get("outputs", []) if output.get("name") != "stderr"
-        ]
+        shown = [output.output_type for output in lasting_outputs(own)]
+        assert [output.output_type for output in cell.get("outputs", [])] == shown
 
 
 @each_notebook

@@ -8,7 +8,15 @@ import warp as wp
 
 from warpshadow.device.batch import accumulate, instance_in
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import Scratch, run_length, scratch_place, strip_count
+from warpshadow.device.parallel import (
+    Scratch,
+    find_run,
+    run_dimensions,
+    run_length,
+    scratch_place,
+    set_thread_count,
+    strip_count,
+)
 from warpshadow.device.tape import recorded
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -103,6 +111,58 @@ def test_outputs_of_warps_own_adjoint_require_a_gradient_if_an_input_does(device
     np.testing.assert_allclose(values.grad.numpy(), 3 * 2 * values.numpy(), rtol=1e-6)
 
 
+@wp.kernel
+def _weigh(
+    first_row: int,
+    worker: int,
+    # in
+    values: wp.array2d(dtype=wp.float32),
+    weights: wp.array2d(dtype=wp.float32),
+    # out
+    weighted: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a row; all read the same weights, one as an item and the others from a row of them."""
+    row = first_row + wp.tid()
+    own = weights[0]
+    for item in range(values.shape[1]):
+        weighted[row, item] = values[row, item] * weights[0, 0] * own[item]
+
+
+@pytest.mark.parametrize("cost", [1.0, 1e6])
+def test_warps_own_adjoint_of_slices_adds_to_what_rows_share(cost, device, verified_tape):
+    values, weights = floats(device, 20, 3), floats(device, 1, 3)
+    weighted = wp.empty((20, 3), dtype=wp.float32, device=device)
+    with recorded() as tape:
+        launch(_weigh, 20, inputs=[values, weights], outputs=[weighted], shared=[weights], cost=cost)
+    own = weights.numpy()[0]
+    np.testing.assert_allclose(weighted.numpy(), values.numpy() * own[0] * own, rtol=1e-6)
+    pulls = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
+    for _ in range(2):
+        weighted.grad.assign(pulls)
+        tape.backward()
+    np.testing.assert_allclose(values.grad.numpy(), 2 * pulls * own[0] * own, rtol=1e-6)
+    sums = (pulls * values.numpy()).sum(axis=0)
+    expected = own[0] * sums
+    expected[0] += own @ sums
+    np.testing.assert_allclose(weights.grad.numpy()[0], 2 * expected, rtol=1e-5)
+
+
+def test_what_rows_share_has_the_same_gradient_for_any_number_of_threads():
+    values, weights = floats("cpu", 4000, 3), floats("cpu", 1, 3)
+    gradients = set()
+    for count in (1, 2, 3, 7):
+        set_thread_count(count)
+        weighted = wp.empty((4000, 3), dtype=wp.float32, device="cpu")
+        with recorded() as tape:
+            launch(_weigh, 4000, inputs=[values, weights], outputs=[weighted], shared=[weights], cost=1e4)
+        weighted.grad.fill_(1.0)
+        tape.backward()
+        gradients.add(weights.grad.numpy().tobytes())
+        tape.zero()
+    set_thread_count(None)
+    assert len(gradients) == 1
+
+
 @pytest.mark.parametrize("compute", [lambda values: square(values)[0], lambda values: cube(values.flatten())])
 def test_nothing_is_recorded_and_no_result_requires_a_gradient_if_no_input_does(compute, device):
     with recorded() as tape:
@@ -180,3 +240,24 @@ def test_a_thread_owns_a_row_on_a_cpu_and_a_sample_on_a_gpu():
 
     assert run_length(wp.get_device("cpu"), 640) == 640 and run_length(Gpu(), 640) == 1
     assert strip_count(wp.get_device("cpu")) == 1 and strip_count(Gpu()) > 1
+    assert run_dimensions(wp.get_device("cpu"), 480, 2) == (480, 2) and run_dimensions(Gpu(), 480, 2) == (2, 480)
+
+
+@wp.kernel(enable_backward=False)
+def _name_runs(
+    first_row: int,
+    worker: int,
+    # out
+    runs: wp.array2d(dtype=wp.vec2i),
+):
+    """A thread owns a run."""
+    row, column = wp.tid()
+    instance, run = find_run(worker, first_row + row, column)
+    runs[instance, run] = wp.vec2i(instance, run)
+
+
+@pytest.mark.parametrize("worker, dimensions", [(0, (4, 3)), (-1, (3, 4))])
+def test_each_run_of_each_instance_has_a_thread(worker, dimensions, device):
+    runs = wp.empty((3, 4), dtype=wp.vec2i, device=device)
+    wp.launch(_name_runs, dimensions, inputs=[0, worker], outputs=[runs], device=device)
+    np.testing.assert_array_equal(runs.numpy(), np.moveaxis(np.indices((3, 4)), 0, -1))

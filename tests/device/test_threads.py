@@ -310,7 +310,7 @@ def test_a_copied_network_has_the_same_images_and_gradients(copied, has_cameras,
     assert torch.equal(image, model(features))
     image.sum().backward()
     assert torch.equal(other.layer.weight.grad, model.layer.weight.grad)
-    assert other.renderer.warp.assembly is not model.renderer.warp.assembly
+    assert other.renderer.warp.merged_scene is not model.renderer.warp.merged_scene
 
 
 def test_a_copy_does_not_choose_its_method_anew(monkeypatch):

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 import warpshadow as ws
+from warpshadow.device import progress
 from warpshadow.inverse import (
     Albedo,
     CheckpointError,
@@ -394,6 +395,23 @@ def test_a_loss_of_zero_has_converged():
     for optimizer, count in ((QuasiNewton, 2), (short_adam, 2 * WINDOW)):
         result = fit(problem, [Stage(500)], optimizer=optimizer)
         assert result.losses[0] == [0.0] * count and result.reason == "converged"
+
+
+def test_the_bar_of_a_fit_ends_where_the_fit_does(monkeypatch, capsys):
+    scene = small_scene()
+    black = dataclasses.replace(scene, light=np.zeros((4, 3)))
+    problem = Problem(black, Target(np.zeros((24, 24, 3))), Albedo(0), still=None)
+    left = []
+    monkeypatch.setattr(progress, "_can_be_seen", lambda: True)
+    monkeypatch.setattr(
+        progress.Wait, "expect", lambda self, count, do=progress.Wait.expect: (left.append(count), do(self, count))
+    )
+    result = fit(problem, [Stage(500, candidates=2), Stage(3, tolerance=0.0)], progress=True)
+    counts = [len(losses) for losses in result.losses]
+    assert counts[:2] == [2, 2] and result.reason != "stopped"
+    # of the first candidate a loss, and then both; of the second the same; then the last stage
+    assert left[:4] == [1002, 1001, 502, 501] and left[-1] == 0
+    assert f"{sum(counts)}/{sum(counts)}" in capsys.readouterr().err.split("\r")[-1]
 
 
 @pytest.mark.slow

@@ -185,7 +185,7 @@ def test_a_fit_is_another_once_a_file_that_it_or_its_scene_names_has_changed(tmp
 
 
 def test_a_damaged_record_is_none(tmp_path):
-    job = many._Job("a", tmp_path, tmp_path / "fit.toml", "digest", "cpu", 10.0)
+    job = many._FitJob("a", tmp_path, tmp_path / "fit.toml", "digest", "cpu", 10.0)
     job.folder.mkdir()
     for text in ("{", "[]", "{}"):
         (job.folder / "ending.json").write_text(text)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.torch import TorchRenderer
 
 # What image errors are measured in: of the ground's pixels that see nothing else.
@@ -23,7 +23,7 @@ def scene_of(receivers: str, *others: ws.Body, segments: int = 64, size: int = 6
 
 
 def image_and_count(scene: ws.Scene, **options) -> tuple[np.ndarray, int]:
-    renderer = Renderer(scene, **options)
+    renderer = SceneRenderer(scene, **options)
     return renderer.render(), renderer.view().receivers.points.shape[1]
 
 
@@ -65,15 +65,17 @@ def test_flat_bodies_are_adaptive_unless_shadows_are_soft_or_faces_small():
     )
     for method, segments, expected in cases:
         scene = dataclasses.replace(scene_of("auto", segments=segments), visibility=ws.Visibility(method))
-        assert Renderer(scene).scene.bodies[1].receivers == expected
+        assert SceneRenderer(scene).scene.bodies[1].receivers == expected
 
 
 def test_several_cameras_and_poses_are_as_alone():
     scene = scene_of("adaptive", size=32)
     cameras = [ws.Camera.look_at((x, 2.5, 5), (0, 0.4, 0), size=(32, 32)) for x in (0, 2.0)]
-    together = Renderer(scene, cameras=cameras)
+    together = SceneRenderer(scene, cameras=cameras)
     for camera, image in zip(cameras, together.render(), strict=True):
-        assert np.abs(image - Renderer(dataclasses.replace(scene, camera=camera)).render()).max() < 1e-5 * image.max()
+        assert (
+            np.abs(image - SceneRenderer(dataclasses.replace(scene, camera=camera)).render()).max() < 1e-5 * image.max()
+        )
     assert [len(group.points) for group in _groups(together)] == [1, 2]  # cameras share the vertices of the ball
     renderer = TorchRenderer(scene)
     rotations, translations, scales = renderer.scene_poses()
@@ -85,21 +87,21 @@ def test_several_cameras_and_poses_are_as_alone():
         assert (image - alone[0]).abs().max() < 1e-4 * image.max()
 
 
-def _groups(renderer: Renderer) -> list:
+def _groups(renderer: SceneRenderer) -> list:
     from warpshadow.pipeline.groups import Grouping
 
     view = renderer.view()
-    spheres, frames = view.spheres.value(), renderer._method.flats.frames((1,), view.vertices.value())
-    return Grouping(view, renderer._method.flats).groups(view.call, view.receivers, spheres, None, {}, frames, None)
+    spheres, frames = view.spheres.value(), renderer._method.planes.frames((1,), view.vertices.value())
+    return Grouping(view, renderer._method.planes).groups(view.call, view.receivers, spheres, None, {}, frames, None)
 
 
 def test_where_shadows_are_kept_at_vertices_they_stay_there():
     """Of static bodies on a static ground; the moving one's falls there, too. A ground that is alone is adaptive."""
     post = ws.Body(ws.icosphere(0.3, 2), blockers=BALL, translation=(1.2, 0.3, 0), receivers="vertex")
     for others, at_vertices in (((post,), True), ((), False)):
-        renderer = Renderer(scene_of("adaptive", *others, segments=16, size=32))
+        renderer = SceneRenderer(scene_of("adaptive", *others, segments=16, size=32))
         view = renderer.view(renderer.placed(renderer.scene_poses(), moving=[0]))
-        first, end = renderer.assembly.first_vertex[1:3]
+        first, end = renderer.merged_scene.first_vertex[1:3]
         assert (view.receivers.of_vertices.numpy()[first:end] >= 0).any() == at_vertices
         assert np.isfinite(renderer.draw(view=view).numpy()).all()
 

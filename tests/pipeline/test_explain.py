@@ -12,16 +12,17 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.device.batch import expand
-from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import assembly, node
+from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.pipeline import directional as directional_method
-from warpshadow.pipeline.assembly import Geometry
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline import merged_scene, node
+from warpshadow.pipeline.merged_scene import Geometry
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.view import View
 from warpshadow.stages.light_samples import sample_map
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
-from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
+from warpshadow.stages.ray_tracing import trace_shading
+from warpshadow.stages.traced_transfer import trace_transfer
 from warpshadow.stages.visibility import directional
 from warpshadow.torch import TorchRenderer
 
@@ -62,7 +63,7 @@ def scene_of(method: str = "directional", *, still_blocks: bool = True, size: in
     return ws.Scene((*balls, ground), sky, camera, visibility)
 
 
-def poses_of(renderer: Renderer, shift=(0.0, 0.0, 0.0), requires_grad: bool = False) -> Poses:
+def poses_of(renderer: SceneRenderer, shift=(0.0, 0.0, 0.0), requires_grad: bool = False) -> Poses:
     """The scene's, the first body shifted."""
     poses = renderer.scene_poses()
     translations = poses.translations.numpy().copy()
@@ -71,7 +72,9 @@ def poses_of(renderer: Renderer, shift=(0.0, 0.0, 0.0), requires_grad: bool = Fa
     return Poses(poses.rotations, moved, poses.scales)
 
 
-def gradient_and_image(renderer: Renderer, moving, *, light=None, shift=(0.1, -0.1, 0.2)) -> tuple[np.ndarray, ...]:
+def gradient_and_image(
+    renderer: SceneRenderer, moving, *, light=None, shift=(0.1, -0.1, 0.2)
+) -> tuple[np.ndarray, ...]:
     """Of a weighted sum of the image to translations of all bodies, and the image."""
     poses = poses_of(renderer, shift, requires_grad=True)
     with wp.Tape() as tape:
@@ -81,7 +84,7 @@ def gradient_and_image(renderer: Renderer, moving, *, light=None, shift=(0.1, -0
     return poses.translations.grad.numpy()[0], image.numpy()
 
 
-def free_light(renderer: Renderer, requires_grad: bool = False) -> wp.array:
+def free_light(renderer: SceneRenderer, requires_grad: bool = False) -> wp.array:
     values = np.random.default_rng(2).uniform(0.1, 1, (1, renderer.basis.size, 3))
     return wp.array(values, dtype=wp.vec3, device=renderer.device, requires_grad=requires_grad)
 
@@ -96,7 +99,7 @@ def assert_near(got: np.ndarray, expected: np.ndarray, tolerance: float = FLOAT3
 @pytest.mark.slow
 @pytest.mark.parametrize("method", (*METHODS, "ray-traced"))
 def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
-    renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
+    renderer, fresh = SceneRenderer(scene_of(method)), SceneRenderer(scene_of(method))
     light = free_light(renderer)
     for _ in range(2):
         geometry = renderer.placed(poses_of(renderer, (0.2, 0.1, 0)))
@@ -112,12 +115,12 @@ def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
 
 @pytest.mark.parametrize("method", (*METHODS, "ray-traced"))
 def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch):
-    renderer = Renderer(scene_of(method))
+    renderer = SceneRenderer(scene_of(method))
     coefficients = np.random.default_rng(6).uniform(0.1, 1, (9, 3)).astype(np.float32)
     for light in (ws.synthetic_sky(height=32), coefficients):
         first = renderer.shade(light)
         scenes = renderer.shade()
-        np.testing.assert_array_equal(first.numpy(), Renderer(scene_of(method)).shade(light).numpy())
+        np.testing.assert_array_equal(first.numpy(), SceneRenderer(scene_of(method)).shade(light).numpy())
         with monkeypatch.context() as patch:
             patch.setattr(wp, "launch", None)
             assert renderer.shade(light) is first and renderer.shade() is scenes
@@ -127,7 +130,7 @@ def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch
 
 @pytest.mark.parametrize("name", ["positions", "centers", "radii", "clip_matrices"])
 def test_what_is_mutated_in_place_is_seen_anew(name):
-    renderer = Renderer(scene_of())
+    renderer = SceneRenderer(scene_of())
     geometry = renderer.placed(poses_of(renderer))
     clip_matrices = wp.clone(renderer.clip_matrices)
     before = renderer.view(geometry, clip_matrices)
@@ -137,16 +140,16 @@ def test_what_is_mutated_in_place_is_seen_anew(name):
     after = renderer.view(geometry, clip_matrices)
     image = renderer.draw(view=after).numpy()
     assert after is not before and (image != first).any()
-    fresh = Renderer(scene_of())
+    fresh = SceneRenderer(scene_of())
     np.testing.assert_array_equal(image, fresh.draw(view=fresh.view(geometry, clip_matrices)).numpy())
 
 
 def test_a_view_is_of_its_geometry_as_it_was():
     """The arrays change before anything is computed from the view."""
-    renderer = Renderer(scene_of())
+    renderer = SceneRenderer(scene_of())
     geometry = renderer.placed(poses_of(renderer, (0.1, 0, 0)))
     expected = renderer.draw(view=renderer.view(geometry)).numpy().copy()
-    other = Renderer(scene_of())
+    other = SceneRenderer(scene_of())
     view = other.view(geometry)
     for array in geometry.arrays().values():
         array.zero_()
@@ -206,8 +209,8 @@ def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_b
             image = renderer(light, **given)
             gradients = torch.autograd.grad((image * weights).sum(), [texture, colors])
             results.append([value.detach().numpy() for value in (image, *gradients)])
-        for alone, beside in zip(*results, strict=True):
-            assert_near(alone, beside, 10 * FLOAT32)
+        for alone, extra_inputs in zip(*results, strict=True):
+            assert_near(alone, extra_inputs, 10 * FLOAT32)
 
 
 # ---------------------------------------------------------------------------------------------- moving bodies
@@ -216,7 +219,7 @@ def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_b
 @pytest.mark.parametrize("is_free", [False, True])
 @pytest.mark.parametrize("method", METHODS)
 def test_bodies_without_blockers_that_stand_still_change_nothing(method, is_free):
-    renderer = Renderer(scene_of(method, still_blocks=False))
+    renderer = SceneRenderer(scene_of(method, still_blocks=False))
     light = free_light(renderer) if is_free else None
     for _ in range(2):
         gradient, image = gradient_and_image(renderer, [0], light=light)
@@ -228,7 +231,7 @@ def test_bodies_without_blockers_that_stand_still_change_nothing(method, is_free
 
 @pytest.mark.parametrize("is_free", [False, True])
 def test_log_sums_of_spheres_that_stand_still_change_nothing(is_free):
-    renderer = Renderer(scene_of("log-sh"))
+    renderer = SceneRenderer(scene_of("log-sh"))
     light = free_light(renderer) if is_free else None
     for _ in range(2):
         gradient, image = gradient_and_image(renderer, [0], light=light)
@@ -243,12 +246,12 @@ def mesh_of(body: ws.Body) -> wp.Mesh:
     return wp.Mesh(wp.array(mesh.positions, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
 
 
-def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.ndarray]:
+def shading_and_truth(renderer: SceneRenderer, light, directions: int) -> list[np.ndarray]:
     """Of the receivers on still bodies, where the moving one is too far away to matter: as rendered, and by rays."""
     view = renderer.view(renderer.placed(poses_of(renderer, (0, 900, 0)), moving=[0]))
     shading = renderer.shade(light, view).numpy()[0, : len(view.receivers.on_static)]
     vertices = renderer.geometry().positions.numpy()[0]
-    normals = vertex_normals(renderer.geometry().positions, renderer.assembly.faces).numpy()[0]
+    normals = vertex_normals(renderer.geometry().positions, renderer.merged_scene.faces).numpy()[0]
     points, normals = (wp.array(values[view.receivers.on_static], dtype=wp.vec3) for values in (vertices, normals))
     mesh = mesh_of(renderer.scene.bodies[1])
     if light is None:
@@ -264,7 +267,7 @@ def shading_and_truth(renderer: Renderer, light, directions: int) -> list[np.nda
 @pytest.mark.parametrize("is_free", [False, True])
 def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
     """Under the sun, too: it is much smaller than a cell."""
-    renderer = Renderer(scene_of(samples=2048))
+    renderer = SceneRenderer(scene_of(samples=2048))
     light = free_light(renderer) if is_free else None
     shading, truth = shading_and_truth(renderer, light, 8192)
     assert len(shading) > 200
@@ -280,9 +283,9 @@ def test_bodies_that_stand_still_shadow_one_another_as_rays_say(is_free):
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differences(method, is_free):
     """A weighted sum of the shading of receivers on still bodies, to the translation of the moving one."""
-    renderer = Renderer(scene_of(method, samples=64))
+    renderer = SceneRenderer(scene_of(method, samples=64))
     light = free_light(renderer) if is_free else None
-    weight_of_vertex = np.random.default_rng(3).uniform(0.5, 1, (len(renderer.assembly.body_of_vertex), 3))
+    weight_of_vertex = np.random.default_rng(3).uniform(0.5, 1, (len(renderer.merged_scene.body_of_vertex), 3))
 
     def view_of(poses: Poses) -> View:
         return renderer.view(renderer.placed(poses, moving=[0]))
@@ -312,7 +315,7 @@ def test_a_shadow_on_bodies_that_stand_still_has_the_gradient_of_central_differe
 
 @pytest.mark.parametrize("method", METHODS)
 def test_instances_share_what_stands_still(method):
-    renderer = Renderer(scene_of(method))
+    renderer = SceneRenderer(scene_of(method))
     poses = renderer.scene_poses()
     shifts = np.zeros((3, 3, 3))
     shifts[:, 0] = np.random.default_rng(4).normal(size=(3, 3)) * [0.2, 0.1, 0.2]
@@ -338,7 +341,7 @@ def test_instances_share_what_stands_still(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_cameras_share_what_stands_still(method):
     cameras = [ws.Camera.look_at(eye, (0, 0.5, 0), size=(24, 24)) for eye in ((0.5, 2.2, 4.6), (3, 1.5, -3))]
-    renderer = Renderer(scene_of(method, still_blocks=False), cameras=cameras)
+    renderer = SceneRenderer(scene_of(method, still_blocks=False), cameras=cameras)
     gradient, image = gradient_and_image(renderer, [0])
     expected_gradient, expected = gradient_and_image(renderer, None)
     assert image.shape[0] == 2
@@ -351,7 +354,7 @@ def test_samples_that_are_receivers_are_lit_by_everything_that_moves_or_not(meth
     """Bodies that do not move and have no spheres: nothing may change."""
     scene = scene_of(method, still_blocks=False)
     ground = dataclasses.replace(scene.bodies[2], receivers="pixel")
-    renderer = Renderer(dataclasses.replace(scene, bodies=(*scene.bodies[:2], ground)))
+    renderer = SceneRenderer(dataclasses.replace(scene, bodies=(*scene.bodies[:2], ground)))
     gradient, image = gradient_and_image(renderer, [0])
     expected_gradient, expected = gradient_and_image(renderer, None)
     assert_near(image, expected)
@@ -364,7 +367,7 @@ def test_samples_that_are_receivers_are_lit_by_everything_that_moves_or_not(meth
 @pytest.mark.parametrize("method", ["log-sh", "none"])
 def test_light_of_few_bands_gives_the_image_that_it_gives_with_all_of_them(method):
     """Free light in a basis of few bands over a pose with a gradient, and known light."""
-    few, all_ = (Renderer(scene_of(method), basis=HarmonicBasis(order)) for order in (2, 4))
+    few, all_ = (SceneRenderer(scene_of(method), basis=HarmonicBasis(order)) for order in (2, 4))
     values = np.random.default_rng(5).uniform(0.1, 1, (4, 3)).astype(np.float32)
     padded = np.concatenate([values, np.zeros((12, 3), np.float32)])
     light, same = (wp.array(each[None], dtype=wp.vec3) for each in (values, padded))
@@ -383,9 +386,9 @@ def test_light_of_few_bands_gives_the_image_that_it_gives_with_all_of_them(metho
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_other_bodies_that_move_are_noticed(method):
-    renderer = Renderer(scene_of(method))
+    renderer = SceneRenderer(scene_of(method))
     for moving in ([0], [1], [0, 1], [2], [], [0]):
-        fresh = Renderer(scene_of(method))
+        fresh = SceneRenderer(scene_of(method))
         image, expected = (
             each.draw(view=each.view(each.placed(poses_of(each, (0.1, 0, 0)), moving=moving))).numpy()
             for each in (renderer, fresh)
@@ -397,7 +400,7 @@ def test_other_bodies_that_move_are_noticed(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_bodies_that_stand_elsewhere_are_noticed(method):
     """A geometry that was not placed, in which what is said not to move is somewhere else."""
-    renderer, fresh = Renderer(scene_of(method)), Renderer(scene_of(method))
+    renderer, fresh = SceneRenderer(scene_of(method)), SceneRenderer(scene_of(method))
     image = renderer.draw(view=renderer.view(renderer.placed(moving=[0]))).numpy().copy()
     poses = renderer.scene_poses()
     shift = wp.array(poses.translations.numpy() + np.array([[[0, 0, 0], [0.3, 0.1, 0.2], [0, 0, 0]]]), dtype=wp.vec3)
@@ -410,11 +413,11 @@ def test_bodies_that_stand_elsewhere_are_noticed(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_another_camera_sees_what_stands_still_anew(method):
     """It shows vertices that the first did not, and shows all of them elsewhere."""
-    renderer = Renderer(scene_of(method))
+    renderer = SceneRenderer(scene_of(method))
     images = []
     for camera in (renderer.scene.camera, ws.Camera.look_at((-3, 1.0, -3.6), (0.4, 0.3, 0), size=(24, 24))):
         clip_matrices = wp.array(camera.clip_matrix()[None], dtype=wp.mat44)
-        fresh = Renderer(scene_of(method))
+        fresh = SceneRenderer(scene_of(method))
         image, expected = (
             each.draw(view=each.view(each.placed(poses_of(each, (0.1, 0, 0)), moving=[0]), clip_matrices)).numpy()
             for each in (renderer, fresh)
@@ -425,7 +428,7 @@ def test_another_camera_sees_what_stands_still_anew(method):
 
 
 def test_instances_that_differ_in_what_stands_still_are_refused():
-    renderer = Renderer(scene_of("none"))
+    renderer = SceneRenderer(scene_of("none"))
     positions, centers, radii = renderer.geometry().arrays().values()
     two = wp.array(positions.numpy() * np.array([1, 1.1])[:, None, None], dtype=wp.vec3)
     with pytest.raises(ValueError, match=r"geometry: got instances that differ in more than the bodies \(0,\)"):
@@ -433,7 +436,7 @@ def test_instances_that_differ_in_what_stands_still_are_refused():
 
 
 def test_a_body_that_moves_is_one_of_the_scenes():
-    renderer = Renderer(scene_of("none"))
+    renderer = SceneRenderer(scene_of("none"))
     with pytest.raises(ValueError, match="moving: got 3, expected the number of a body, from 0 to 2"):
         renderer.placed(moving=[3])
 
@@ -461,11 +464,11 @@ SHADOWS = ("static shadows", VISIBILITY)
 def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     """The stage that a kernel with some inputs belongs to; None for copies, poses and corners, which come before."""
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
-    if module in ("device.batch", "stages.poses", "stages.own_shadows.sites", "stages.sparse"):
+    if module in ("device.batch", "stages.poses", "stages.self_visibility.probes", "stages.sparse"):
         return None
-    if module in ("stages.own_shadows.trace", "stages.own_shadows.lookup", "stages.own_shadows.lobes"):
-        return "own shadows"
-    of_visibility = "stages.visibility", "stages.own_shadows.gather", "stages.ray_tracing"
+    if module in ("stages.self_visibility.trace", "stages.self_visibility.lookup", "stages.self_visibility.lobes"):
+        return "self-shadows"
+    of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.ray_tracing"
     if module.startswith(of_visibility) or key == "_add_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
@@ -483,7 +486,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return "reflectance"
     if module in ("stages.rasterize", "stages.barycentrics"):
         return "rasterization"
-    if module in ("stages.transfer", "stages.kept_cells"):
+    if module in ("stages.transfer", "stages.cached_cells"):
         return "shading" if "_light_cells" in key else "transfer"
     if module == "stages.film":
         return "averaging" if "average" in key else "radiance"
@@ -598,7 +601,7 @@ def test_what_is_said_to_run_runs_and_what_is_said_to_be_left_out_is_left_out(fi
     scene = scene_of(method)
     if not blocks:
         scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=0) for body in scene.bodies])
-    call, variables, explain = fit(Renderer(scene))
+    call, variables, explain = fit(SceneRenderer(scene))
     launches = Launches(monkeypatch)
     for _ in range(3):  # the first call finds out what the others keep
         explanation = explain()
@@ -612,29 +615,30 @@ def test_only_what_moves_is_projected_onto_what_stands_still(monkeypatch):
 
     The body that moves has its shadow on itself from rays, so that only the other's sphere blocks its light.
     """
-    renderer = Renderer(scene_of())
+    renderer = SceneRenderer(scene_of())
     call, _, explain = one_of_three(renderer)
     call()
     asked = []
     transmittance = directional.transmittance
 
-    def recorded(points, normals, centers, radii, *arguments, **options):
+    def recorded(points, normals, centers, radii, directions, **options):
         first, end = options["skip"]
-        asked.append((points.shape[1], radii.shape[1] - (end - first), points.requires_grad))
-        return transmittance(points, normals, centers, radii, *arguments, **options)
+        asked.append((points.shape[1], radii.shape[1] - (end - first), points.requires_grad, len(directions)))
+        return transmittance(points, normals, centers, radii, directions, **options)
 
     monkeypatch.setattr(directional, "transmittance", recorded)
     call()
-    on_still, on_moving = asked
-    assert on_still[1:] == (1, False) and on_moving[1:] == (1, True)
-    vertex_count = len(renderer.assembly.body_of_vertex)
+    on_still, sun_on_still, on_moving, sun_on_moving = asked
+    assert on_still[1:] == (1, False, 32) and on_moving[1:] == (1, True, 32)
+    assert sun_on_still == (*on_still[:3], CHUNK) and sun_on_moving == (*on_moving[:3], CHUNK)  # its cells again
+    vertex_count = len(renderer.merged_scene.body_of_vertex)
     assert 0 < on_still[0] < vertex_count - 162 and 0 < on_moving[0] <= 162
     items = explain()["visibility"].items
     assert "receivers × 2 spheres" in items and "receivers on static bodies × 1 spheres" in items
 
 
 def test_rays_are_traced_once(monkeypatch):
-    renderer = Renderer(scene_of())
+    renderer = SceneRenderer(scene_of())
     call, _, explain = one_of_three(renderer)
     assert explain()["static shadows"]
     call()
@@ -647,7 +651,7 @@ def test_rays_are_traced_once(monkeypatch):
 
 
 def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
-    renderer = Renderer(scene_of())
+    renderer = SceneRenderer(scene_of())
     call, variables, explain = texture_fit(renderer)
     assert "nothing is kept yet" in str(explain())
     with wp.Tape() as tape:
@@ -656,7 +660,7 @@ def test_the_explanation_is_a_table_of_stages_with_times_and_reasons():
     lines = str(explain()).splitlines()
     assert [line.split()[0] for line in (lines[0], lines[19])] == ["forward", "backward"]
     (rasterization,) = (line for line in lines[:19] if "rasterization" in line)
-    assert "–" in rasterization and "kept: vertices and cameras are the same" in rasterization
+    assert "–" in rasterization and "cached: vertices and cameras are the same" in rasterization
     (radiance,) = (line for line in lines[19:] if "radiance" in line)
     assert "runs" in radiance and " ms" in radiance and "a gradient to textures is asked for" in radiance
     assert "2,304 samples" in radiance
@@ -666,8 +670,8 @@ def test_an_explanation_computes_nothing(monkeypatch):
     """Not even the spheres of bodies, which take seconds to fit; the ground blocks as a plane."""
     scene = scene_of()
     scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
-    renderer = Renderer(scene)
-    monkeypatch.setattr(assembly, "scene_blockers", None)
+    renderer = SceneRenderer(scene)
+    monkeypatch.setattr(merged_scene, "scene_blockers", None)
     monkeypatch.setattr(wp, "launch", None)
     assert "up to 902 receivers × 14 spheres" in str(renderer.explain())
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.node import Call, Clock, Fixed, Node, Source
+from warpshadow.pipeline.node import Call, Clock, Fixed, Input, Node
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def array(values=(1.0, 2.0), **options):
 
 def test_a_node_is_computed_once_for_all_that_ask(clock):
     log = []
-    source = Source("vertices", 2)
+    source = Input("vertices", 2)
     first = counting("first", log)(source, 1)
     second, third = counting("second", log)(first, first), counting("third", log)(first)
     total = counting("total", log)(second, third)
@@ -45,7 +45,7 @@ def test_a_node_is_computed_once_for_all_that_ask(clock):
 
 def test_a_node_that_keeps_its_value_asks_nothing_before_it(clock):
     log = []
-    transfer = counting("transfer", log, keeps=False)(Source("vertices", 2))
+    transfer = counting("transfer", log, caches=False)(Input("vertices", 2))
     shading = counting("shading", log)(transfer)
     for _ in range(3):
         assert shading.value(Call(clock)) == 2
@@ -56,22 +56,22 @@ def test_a_node_that_keeps_its_value_asks_nothing_before_it(clock):
 
 def test_what_a_call_may_not_keep_is_computed_once_in_it(clock):
     log = []
-    source = Source("vertices", array(requires_grad=True))
+    source = Input("vertices", array(requires_grad=True))
     first = Node("first", lambda given: log.append("first") or 3, source)
     total = Node("total", lambda *given: log.append("total") or sum(given), first, first)
     for _ in range(2):
         assert total.value(Call(clock)) == 6
-    assert log == ["first", "total"] * 2 and total.requires_grad and not total.is_kept
+    assert log == ["first", "total"] * 2 and total.requires_grad and not total.is_cached
 
 
 def test_nothing_is_kept_of_a_call_that_is_captured(clock):
-    node = counting("node", [])(Source("vertices", 2))
-    assert node.value(Call(clock, keeps=False)) == 2 and not node.is_kept
+    node = counting("node", [])(Input("vertices", 2))
+    assert node.value(Call(clock, caches=False)) == 2 and not node.is_cached
 
 
 def test_a_call_knows_what_another_found(clock):
     log = []
-    node = counting("node", log, keeps=False)(Source("vertices", 2))
+    node = counting("node", log, caches=False)(Input("vertices", 2))
     call = Call(clock)
     node.value(call)
     node.value(Call(clock, call))
@@ -80,7 +80,7 @@ def test_a_call_knows_what_another_found(clock):
 
 def test_a_source_is_made_when_it_is_first_asked_for():
     log = []
-    source = Source("vertices", lambda: log.append("made") or 5)
+    source = Input("vertices", lambda: log.append("made") or 5)
     assert not log
     assert [source.value(), source.value()] == [5, 5] and log == ["made"]
 
@@ -89,27 +89,27 @@ def test_a_source_is_made_when_it_is_first_asked_for():
 
 
 def test_the_same_values_are_the_same_source():
-    first = Source.renewed("vertices", array(), None)
-    assert Source.renewed("vertices", array(), first) is first
-    other = Source.renewed("vertices", array((1.0, 3.0)), first)
+    first = Input.renewed("vertices", array(), None)
+    assert Input.renewed("vertices", array(), first) is first
+    other = Input.renewed("vertices", array((1.0, 3.0)), first)
     assert other is not first and other.news == "vertices changed since the last call" and not first.news
 
 
 def test_a_source_has_the_values_that_it_was_given():
     given = array()
-    first = Source.renewed("vertices", given, None)
+    first = Input.renewed("vertices", given, None)
     given.zero_()
     assert first.value().numpy()[1] == 2
-    assert Source.renewed("vertices", given, first) is not first
+    assert Input.renewed("vertices", given, first) is not first
 
 
 def test_a_write_that_torch_does_not_count_is_seen():
     numbers = np.ones((1, 3), np.float32)
     given = wp.array(numbers, dtype=wp.float32, device="cpu", copy=False)
     given.version = 7
-    first = Source.renewed("radii", given, None)
+    first = Input.renewed("radii", given, None)
     numbers[:] = 2
-    assert given.numpy()[0, 0] == 2 and Source.renewed("radii", given, first) is not first
+    assert given.numpy()[0, 0] == 2 and Input.renewed("radii", given, first) is not first
 
 
 def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monkeypatch):
@@ -121,29 +121,29 @@ def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monke
         same.origin, same.version = origin, version
         return same
 
-    first = Source.renewed("spheres", (again(tensor, 7),), None)
+    first = Input.renewed("spheres", (again(tensor, 7),), None)
     monkeypatch.setattr(np, "array_equal", None)  # values are not looked at
-    assert Source.renewed("spheres", (again(tensor, 7),), first) is first
-    assert Source.renewed("spheres", (again(tensor, 8),), first) is not first
-    assert Source.renewed("spheres", (again(other, 7),), first) is not first  # versions of another begin at 0 again
-    assert Source.renewed("spheres", (given,), first) is not first
+    assert Input.renewed("spheres", (again(tensor, 7),), first) is first
+    assert Input.renewed("spheres", (again(tensor, 8),), first) is not first
+    assert Input.renewed("spheres", (again(other, 7),), first) is not first  # versions of another begin at 0 again
+    assert Input.renewed("spheres", (given,), first) is not first
 
 
 def test_what_has_a_gradient_is_never_the_same():
     given = array(requires_grad=True)
-    first = Source.renewed("vertices", given, None)
+    first = Input.renewed("vertices", given, None)
     assert first.requires_grad and first.value() is given
-    assert Source.renewed("vertices", given, first) is not first
-    assert Source.renewed("vertices", array(), first) is not first
+    assert Input.renewed("vertices", given, first) is not first
+    assert Input.renewed("vertices", array(), first) is not first
 
 
 def test_coefficients_are_compared_and_other_things_are_what_they_are():
-    first = Source.renewed("light", np.ones((4, 3)), None)
-    assert Source.renewed("light", np.ones((4, 3)), first) is first
-    assert Source.renewed("light", np.zeros((4, 3)), first) is not first
+    first = Input.renewed("light", np.ones((4, 3)), None)
+    assert Input.renewed("light", np.ones((4, 3)), first) is first
+    assert Input.renewed("light", np.zeros((4, 3)), first) is not first
     sky = object()
-    last = Source.renewed("light", sky, first)
-    assert Source.renewed("light", sky, last) is last and Source.renewed("light", object(), last) is not last
+    last = Input.renewed("light", sky, first)
+    assert Input.renewed("light", sky, last) is last and Input.renewed("light", object(), last) is not last
 
 
 # ---------------------------------------------------------------------------------------------- what is said
@@ -151,13 +151,13 @@ def test_coefficients_are_compared_and_other_things_are_what_they_are():
 
 def wired(vertices=2, cameras=3, **options):
     """Silhouettes of what cameras see, which no gradient passes, and an image."""
-    vertices = Source("vertices", vertices)
-    cameras = Source("cameras", cameras, news="cameras changed since the last call")
+    vertices = Input("vertices", vertices)
+    cameras = Input("cameras", cameras, news="cameras changed since the last call")
     clip = Node("clip positions", lambda a, b: 1, vertices, cameras, items="4 vertices")
     silhouettes = Node("silhouettes", lambda clip: clip, clip, has_adjoint=False)
     normals = Node("normals", lambda a: 1, vertices)
     sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
-    image = Node("image", lambda *given: sum(given), sides, Fixed(silhouettes), normals, keeps=False)
+    image = Node("image", lambda *given: sum(given), sides, Fixed(silhouettes), normals, caches=False)
     return image, {node.name: node for node in (clip, silhouettes, normals, sides, image)}
 
 
@@ -176,21 +176,21 @@ def test_each_node_says_why_it_runs_or_does_not(clock):
     assert list(explanation.stages)[0] == "clip positions" and explanation["clip positions"].items == "4 vertices"
     image.value(call)
     decisions = decide(image, Call(clock))
-    assert decisions[nodes["normals"]].why == "kept: vertices are the same"
-    assert decisions[nodes["clip positions"]].why == "kept: vertices and cameras are the same"
+    assert decisions[nodes["normals"]].why == "cached: vertices are the same"
+    assert decisions[nodes["clip positions"]].why == "cached: vertices and cameras are the same"
     assert decisions[image].runs
 
 
 def test_what_is_not_asked_for_is_left_out_for_the_reason_of_who_would_ask(clock):
-    transfer = Node("transfer", lambda a: a, Source("vertices", 1), keeps=False)
-    shading = Node("shading", lambda a, b: a + b, transfer, Source("light", 2))
+    transfer = Node("transfer", lambda a: a, Input("vertices", 1), caches=False)
+    shading = Node("shading", lambda a, b: a + b, transfer, Input("light", 2))
     shading.value(Call(clock))
     decisions = decide(shading, Call(clock))
-    assert not decisions[transfer] and decisions[transfer].why == "kept: vertices and light are the same"
+    assert not decisions[transfer] and decisions[transfer].why == "cached: vertices and light are the same"
 
 
 def test_an_explanation_computes_nothing(clock):
-    node = Node("node", None, Source("vertices", lambda: pytest.fail("asked for")))
+    node = Node("node", None, Input("vertices", lambda: pytest.fail("asked for")))
     assert Explanation(node, Call(clock), {}, is_host=True)["node"]
 
 
@@ -206,9 +206,9 @@ def test_gradients_pass_where_they_can(clock):
 
 
 def test_a_fixed_input_matters_and_gets_no_gradient(clock):
-    vertices = Source("vertices", array(requires_grad=True))
+    vertices = Input("vertices", array(requires_grad=True))
     fixed, constant = (Node("node", None, Fixed(vertices, is_constant=is_constant)) for is_constant in (False, True))
-    assert fixed.requires_grad and not fixed.pulled and list(fixed.sources) == [vertices]
+    assert fixed.requires_grad and not fixed.differentiated_inputs and list(fixed.sources) == [vertices]
     assert not constant.requires_grad and not constant.sources and not constant.before
 
 
@@ -219,7 +219,7 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
     """By a clock that ticks when it is looked at."""
     ticks = itertools.count()
     monkeypatch.setattr(clock, "now", lambda: next(ticks))
-    node = Node("transfer", lambda given: given, Source("vertices", array(requires_grad=True)))
+    node = Node("transfer", lambda given: given, Input("vertices", array(requires_grad=True)))
     with recorded() as tape:
         call = Call(clock)
         for part in range(3):

@@ -13,9 +13,9 @@ from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import directional, groups
-from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.merged_scene import Geometry
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning.point_sample import PointSample
 
 METHODS = ("directional", "log-sh", "none", "ray-traced")
@@ -99,7 +99,7 @@ def test_an_unoccluded_white_plane_shows_the_radiance_of_constant_light(device, 
 def test_the_ground_under_a_ball_gets_what_the_form_factor_leaves(device):
     """A ball of radius r at height h above a point, θ off its normal, blocks cos θ r²/h² of a constant dome."""
     grazing = ws.Camera.look_at((3.5, 0.4, 0), (0, 0, 0), fov_y=10, size=(32, 32))
-    renderer = Renderer(scene_of("ray-traced", camera=grazing, samples=8192, supersampling=1), device=device)
+    renderer = SceneRenderer(scene_of("ray-traced", camera=grazing, samples=8192, supersampling=1), device=device)
     shading, points = (array.numpy()[0] for array in (renderer.shade(), renderer.view().receivers.points))
     body_ids = renderer.body_ids()[0]
     on_ground = body_ids[body_ids >= 0] == 1
@@ -141,7 +141,7 @@ def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, b
     results = []
     for bodies in ((ball(), ground()), (ball(), ground(), canopy)):
         scene = scene_of(method, *bodies, samples=64)
-        renderer = Renderer(scene, device=device)
+        renderer = SceneRenderer(scene, device=device)
         moved = renderer.view(renderer.placed(moving=[0]))
         results.append((renderer.render(), renderer.draw(view=moved).numpy(), PointSample(scene, count=99).truth))
     for without, with_canopy in zip(*results, strict=True):
@@ -150,7 +150,7 @@ def test_a_body_without_blockers_casts_no_shadow_by_any_method(device, method, b
 
 def test_where_nothing_casts_a_shadow_rays_need_no_hierarchy(device, monkeypatch):
     monkeypatch.setattr(wp, "Mesh", None)
-    renderer = Renderer(scene_of("ray-traced", ball(blockers=0), ground()), device=device)
+    renderer = SceneRenderer(scene_of("ray-traced", ball(blockers=0), ground()), device=device)
     assert renderer.explain()["visibility"].forward.why == "no body has blockers"
     direct = ws.render(scene_of("none", ball(blockers=0), ground()), device=device)
     assert relative_error(renderer.render(), direct) < RAY_NOISE
@@ -166,7 +166,7 @@ def test_where_nothing_casts_a_shadow_rays_need_no_hierarchy(device, monkeypatch
 def test_images_are_linear_in_sh_light(device, method):
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 16, 3)).astype(np.float32)
-    renderer = Renderer(scene_of(method), device=device)
+    renderer = SceneRenderer(scene_of(method), device=device)
     mixed = renderer.render(0.5 * a - 2 * b)[..., :3]
     parts = 0.5 * renderer.render(a)[..., :3] - 2 * renderer.render(b)[..., :3]
     assert np.abs(mixed - parts).max() < FLOAT32 * np.abs(parts).max()
@@ -174,7 +174,7 @@ def test_images_are_linear_in_sh_light(device, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_twice_the_map_is_twice_the_image(device, method):
-    renderer = Renderer(scene_of(method, light=sunny()), device=device)
+    renderer = SceneRenderer(scene_of(method, light=sunny()), device=device)
     once, twice = renderer.render()[..., :3], renderer.render(sunny().scaled(2))[..., :3]
     assert np.abs(twice - 2 * once).max() < FLOAT32 * once.max()
 
@@ -187,7 +187,7 @@ def test_sh_light_and_the_map_it_came_from_give_nearly_the_same_image(device, me
     coefficients[1:] = np.random.default_rng(1).uniform(-0.5, 0.5, (8, 3))
     image = sh.reconstruct_map(coefficients, 64)
     assert image.min() > 0
-    renderer = Renderer(scene_of(method), device=device)
+    renderer = SceneRenderer(scene_of(method), device=device)
     by_map = renderer.render(ws.EnvironmentMap(image.astype(np.float32)))
     by_harmonics = renderer.render(coefficients)
     assert relative_error(by_map, by_harmonics) < 0.01  # the mean of a cell is not its middle: 0.3% measured
@@ -230,7 +230,7 @@ def test_two_triangles_receive_a_shadow_with_pixel_receivers(device, method):
 
 def test_pixel_and_vertex_receivers_mix_in_one_image(device):
     renderers = [
-        Renderer(scene_of("directional", ball(receivers=receivers), ground(), supersampling=1), device=device)
+        SceneRenderer(scene_of("directional", ball(receivers=receivers), ground(), supersampling=1), device=device)
         for receivers in ("pixel", "vertex")
     ]
     mixed, by_vertex = (renderer.render() for renderer in renderers)
@@ -261,7 +261,7 @@ def test_a_camera_that_sees_no_body_renders_nothing(device, method, receivers):
 )
 def test_an_image_that_shows_nothing_says_why_once(device, options, reason):
     camera = ws.Camera.look_at((0, 0, 5), **{"target": (0, 0, 0), "size": (8, 8)} | options)
-    renderer = Renderer(scene_of("none", camera=camera), device=device)
+    renderer = SceneRenderer(scene_of("none", camera=camera), device=device)
     with pytest.warns(UserWarning, match=f"camera: the image shows nothing of the scene: .*{reason}") as caught:
         renderer.render()
         renderer.draw(view=renderer.view(renderer.placed()))
@@ -271,11 +271,11 @@ def test_an_image_that_shows_nothing_says_why_once(device, options, reason):
 def test_a_view_of_several_that_shows_nothing_is_named(device):
     views = [CAMERA, dataclasses.replace(CAMERA, translation=-CAMERA.translation)]
     with pytest.warns(UserWarning, match="camera: image 1 of 2 shows nothing of the scene: .* behind"):
-        Renderer(scene_of("none"), cameras=views, device=device).render()
+        SceneRenderer(scene_of("none"), cameras=views, device=device).render()
 
 
 def test_moving_geometry_that_leaves_the_image_is_remarked_on():
-    renderer = Renderer(scene_of("none"))
+    renderer = SceneRenderer(scene_of("none"))
     positions, *spheres = renderer.geometry().arrays().values()
     away = wp.array(positions.numpy() + (0, 0, 100), dtype=wp.vec3)
     with pytest.warns(UserWarning, match="camera: the image shows nothing of the scene: .* behind the camera"):
@@ -294,7 +294,7 @@ def test_moving_geometry_that_leaves_the_image_is_remarked_on():
 )
 def test_what_a_renderer_is_not_made_of_is_refused_when_it_is_made(options, message):
     with pytest.raises(ValueError, match=message):
-        Renderer(**{"scene": scene_of("none")} | options)
+        SceneRenderer(**{"scene": scene_of("none")} | options)
 
 
 @pytest.mark.parametrize(
@@ -307,12 +307,12 @@ def test_what_a_renderer_is_not_made_of_is_refused_when_it_is_made(options, mess
 )
 def test_what_is_no_light_is_refused(light, message):
     with pytest.raises(ValueError, match=message):
-        Renderer(scene_of("none")).render(light)
+        SceneRenderer(scene_of("none")).render(light)
 
 
 def test_the_texels_of_a_body_without_a_texture_are_refused():
     with pytest.raises(ValueError, match="body: got 0, a body without a texture"):
-        Renderer(scene_of("none")).seen_texels(0)
+        SceneRenderer(scene_of("none")).seen_texels(0)
 
 
 # ---------------------------------------------------------------------------------------------- pixels
@@ -320,8 +320,8 @@ def test_the_texels_of_a_body_without_a_texture_are_refused():
 
 def test_supersampling_averages_samples(device):
     fine_camera = CAMERA.resized(4)
-    fine = Renderer(scene_of("directional", camera=fine_camera, supersampling=1), device=device).render()
-    coarse = Renderer(scene_of("directional", supersampling=4), device=device).render()
+    fine = SceneRenderer(scene_of("directional", camera=fine_camera, supersampling=1), device=device).render()
+    coarse = SceneRenderer(scene_of("directional", supersampling=4), device=device).render()
     expected = fine.reshape(32, 4, 32, 4, 4).mean(axis=(1, 3))
     assert np.abs(coarse - expected).max() < FLOAT32
     assert ((coarse[..., 3] > 0) & (coarse[..., 3] < 1)).any()
@@ -339,11 +339,11 @@ def test_the_background_is_zero_and_color_is_premultiplied(device):
 
 def test_writing_into_an_image_does_not_change_the_next_one(device):
     for supersampling in (1, 2):
-        renderer = Renderer(scene_of("directional", supersampling=supersampling), device=device)
+        renderer = SceneRenderer(scene_of("directional", supersampling=supersampling), device=device)
         first = renderer.render()
-        kept = first.copy()
+        cached = first.copy()
         first[:] = np.nan
-        np.testing.assert_array_equal(renderer.render(), kept)
+        np.testing.assert_array_equal(renderer.render(), cached)
 
 
 # ---------------------------------------------------------------------------------------------- reflectance
@@ -375,7 +375,7 @@ def test_bodies_with_and_without_uvs_keep_their_own_reflectance(device):
     gray = (0.5, 0.5, 0.5)
     bodies = (ball(albedo=red), ground(texture=texture), ball(albedo=gray, translation=(1.5, 1, -1)))
     for order in (1, -1):
-        renderer = Renderer(scene_of("none", *bodies[::order]), device=device)
+        renderer = SceneRenderer(scene_of("none", *bodies[::order]), device=device)
         albedo = renderer.reflect().numpy()[0]
         body_ids = renderer.body_ids()[0]
         for number, color in enumerate([red, (0.1, 0.2, 0.9), gray][::order]):
@@ -389,7 +389,7 @@ def test_albedo_of_vertices_is_interpolated(device):
     body = ground(4)
     colors = 0.5 + body.mesh.positions / 6  # linear in x and z, so exact between vertices
     scene = scene_of("none", ground(4, albedo=colors), supersampling=1, camera=FROM_ABOVE)
-    renderer = Renderer(scene, device=device)
+    renderer = SceneRenderer(scene, device=device)
     points = renderer.reflect().numpy()[0]
     rows, columns = np.mgrid[0.5:16, 0.5:16] / 16 - 0.5
     scale = 2 * 5 * np.tan(np.radians(20)) / 6  # of the plane that the image shows
@@ -402,7 +402,7 @@ def test_points_on_faces_are_lit_where_a_geometry_has_them(device, method):
     """As those of a scene whose ball has that place."""
     moved = ws.Renderer(scene_of(method, ball(translation=(0.3, 1.2, 0)), ground(8)), device=device)
     renderer = ws.Renderer(scene_of(method, ball(), ground(8)), device=device)
-    sides = np.arange(0, len(renderer.assembly.body_of_face), 7)
+    sides = np.arange(0, len(renderer.merged_scene.body_of_face), 7)
     places = sides, np.full((len(sides), 3), 1 / 3, np.float32)
     expected = moved.shade(view=moved.on_faces(*places)).numpy()
     found = renderer.shade(view=renderer.on_faces(*places, moved.geometry())).numpy()
@@ -434,7 +434,7 @@ def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, metho
     """Light of order 3 is in both bases, but in 64 cells as steps: 0.3%. Rays to free light are spread evenly: 1%."""
     light = np.random.default_rng(3).normal(size=(9, 3)) * 0.2
     light[0] = 3
-    renderer = Renderer(scene_of(method, samples=2048), device=device, basis=basis)
+    renderer = SceneRenderer(scene_of(method, samples=2048), device=device, basis=basis)
     transfer = renderer.transfer().numpy()[0]
     free = transfer @ basis.coefficients(light)
     expected = renderer.shade(light).numpy()[0]
@@ -448,12 +448,12 @@ def test_transfer_to_any_basis_gives_nearly_the_image_of_its_light(device, metho
 def test_no_light_is_lost_between_cells_of_different_size(device, count):
     """One cell of light after the other gives all that the method's own 128 cells give."""
     scene = scene_of("directional", directions=128)
-    own = Renderer(scene, device=device).transfer().numpy()[0]
-    renderer = Renderer(scene, device=device, basis=CellBasis(fibonacci(count)))
+    own = SceneRenderer(scene, device=device).transfer().numpy()[0]
+    renderer = SceneRenderer(scene, device=device, basis=CellBasis(fibonacci(count)))
     transfer = renderer.transfer().numpy()[0]
     assert np.abs(transfer.sum(axis=1) - own.sum(axis=1)).max() < FLOAT32
     upward = fibonacci(count)[:, 1] > 0.3
-    body_of_vertex = np.repeat([0, 1], np.diff(renderer.assembly.first_vertex))
+    body_of_vertex = np.repeat([0, 1], np.diff(renderer.merged_scene.first_vertex))
     on_ground = renderer.view().receivers.of_vertices.numpy()[body_of_vertex == 1]
     on_ground = on_ground[on_ground >= 0]  # the ground sees every cell above it somewhere
     assert (transfer[on_ground].max(axis=0)[upward] > 0).all()
@@ -464,7 +464,7 @@ def test_no_light_is_lost_between_cells_of_different_size(device, count):
 def test_a_mesh_of_few_faces_that_is_shaded_at_its_corners_draws_a_warning():
     floor = ws.Body(ws.plane(4.0, 1), blockers=0, receivers="vertex")
     camera = ws.Camera.look_at((0, 3, 3), (0, 0, 0), size=(64, 64))
-    scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
+    scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera, ws.Visibility("directional"))
     expected = r"body 0 \('plane'\): its faces have 1.7e\+03 pixels each, and the long ones are 91 pixels .*\"pixel\""
     with pytest.warns(UserWarning, match=expected):
         ws.render(scene)
@@ -492,7 +492,7 @@ def coarse_and_fine(size: int = 64, receivers: str = "auto") -> ws.Scene:
 
 
 def chosen_receivers(scene: ws.Scene, **options) -> list[str]:
-    return [body.receivers for body in Renderer(scene, **options).scene.bodies]
+    return [body.receivers for body in SceneRenderer(scene, **options).scene.bodies]
 
 
 def test_bodies_of_large_faces_are_shaded_by_pixel(device):
@@ -506,15 +506,23 @@ def test_bodies_of_large_faces_are_shaded_by_pixel(device):
 
 def test_what_is_large_is_the_mean_over_the_faces_that_the_cameras_see():
     scene = coarse_and_fine()
-    renderer = Renderer(dataclasses.replace(scene, supersampling=1))
+    renderer = SceneRenderer(dataclasses.replace(scene, supersampling=1))
     face_ids = renderer.view().fragments.face_ids.numpy()
     on_ground = face_ids >= ball().mesh.face_count
     size = on_ground.sum() / len(np.unique(face_ids[on_ground]))
     assert f"Body 1 ('mesh') has receivers at pixels: its faces have {size:.2g} pixels each" in str(renderer.explain())
     assert "Body 0 ('icosphere') has receivers at vertices" in str(renderer.explain())
-    assert "has receivers" not in str(Renderer(coarse_and_fine(receivers="vertex")).explain())
-    far = [ws.Camera.look_at((0, 60.0, 150), (0, 0, 0), size=(64, 64))]
+    assert "has receivers" not in str(SceneRenderer(coarse_and_fine(receivers="vertex")).explain())
+    far = [ws.Camera.look_at((0, 240.0, 600), (0, 0, 0), size=(64, 64))]
     assert chosen_receivers(scene, cameras=far) == ["vertex", "vertex"]
+
+
+@pytest.mark.parametrize(("segments", "expected"), [(11, "pixel"), (12, "vertex")])
+def test_of_few_faces_a_pixel_each_is_large(segments, expected):
+    """Those of 242 and 288, which have 7 pixels each on average."""
+    camera = ws.Camera.look_at((0, 4.0, 9), (0, 0, 0), size=(64, 64))
+    scene = scene_of("directional", bent(segments, receivers="auto"), camera=camera)
+    assert chosen_receivers(scene) == [expected]
 
 
 @pytest.mark.parametrize(("size", "largest"), [(64, 16), (256, 16), (512, 64), (2048, 400)])
@@ -543,7 +551,7 @@ def test_long_faces_are_large_though_they_have_few_pixels():
     capsule = ws.Body(ws.Mesh(positions, faces), blockers=0)
     for eye in ((0, 0, 4.0), (0, 0, 0.5)):  # in front of it, and between its ends, near its side
         camera = ws.Camera.look_at(eye, (0, 0.1, 0), size=(64, 64), near=0.3)
-        renderer = Renderer(ws.Scene((capsule, ball()), ws.EnvironmentMap.constant(), camera))
+        renderer = SceneRenderer(ws.Scene((capsule, ball()), ws.EnvironmentMap.constant(), camera))
         assert renderer.scene.bodies[0].receivers == "pixel"
         assert np.isfinite(renderer.render()).all()
 
@@ -555,9 +563,9 @@ def test_in_a_picture_shadows_end_sharply_on_a_coarse_ground():
     scene = scene_of("directional", ball(), ground(12, receivers="auto"), light=sun, camera=CAMERA.resized(2))
     truth = ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=512)))
     at_vertices = dataclasses.replace(scene, bodies=(ball(), ground(12, receivers="vertex")))
-    images = Renderer(at_vertices).render(), Renderer(scene).render(), ws.render(scene)
-    kept, adaptive, once = (relative_error(image, truth) for image in images)
-    assert chosen_receivers(scene) == ["vertex", "adaptive"] and kept > 0.05  # measured 6.2%
+    images = SceneRenderer(at_vertices).render(), SceneRenderer(scene).render(), ws.render(scene)
+    cached, adaptive, once = (relative_error(image, truth) for image in images)
+    assert chosen_receivers(scene) == ["vertex", "adaptive"] and cached > 0.05  # measured 6.2%
     assert max(adaptive, once) < 0.03  # measured 2.5% and 2.4%
 
 
@@ -569,7 +577,7 @@ def test_in_a_picture_only_flat_bodies_that_leave_it_open_are_shaded_by_pixel():
 
 
 def test_what_moves_does_not_change_the_choice_and_a_copy_makes_the_same():
-    renderer = Renderer(coarse_and_fine())
+    renderer = SceneRenderer(coarse_and_fine())
     poses = renderer.scene_poses()
     nearer = wp.array(poses.translations.numpy() + [0, 0, 4.5], dtype=wp.vec3, device=renderer.device)
     geometry = renderer.placed(dataclasses.replace(poses, translations=nearer))
@@ -581,7 +589,7 @@ def test_what_moves_does_not_change_the_choice_and_a_copy_makes_the_same():
 
 
 def test_rays_need_no_choice():
-    renderer = Renderer(dataclasses.replace(coarse_and_fine(), visibility=ws.Visibility("ray-traced")))
+    renderer = SceneRenderer(dataclasses.replace(coarse_and_fine(), visibility=ws.Visibility("ray-traced")))
     assert [body.receivers for body in renderer.scene.bodies] == ["auto", "auto"]
     assert "has receivers" not in str(renderer.explain())
 
@@ -605,25 +613,25 @@ def textured_scene(method: str, receivers: str) -> ws.Scene:
 @pytest.mark.parametrize("method", METHODS)
 def test_images_of_several_cameras_are_those_of_each_alone(device, method, receivers):
     scene = textured_scene(method, receivers)
-    together = Renderer(scene, cameras=cameras(), device=device)
+    together = SceneRenderer(scene, cameras=cameras(), device=device)
     light = wp.array(np.random.default_rng(5).uniform(size=(1, together.basis.size, 3)), dtype=wp.vec3, device=device)
     images, lit = together.render(), together.draw(light).numpy()
     assert images.shape == lit.shape == (2, 16, 24, 4)
     for number, camera in enumerate(cameras()):
-        alone = Renderer(dataclasses.replace(scene, camera=camera), device=device)
+        alone = SceneRenderer(dataclasses.replace(scene, camera=camera), device=device)
         assert np.abs(images[number] - alone.render()).max() < FLOAT32 * images.max()
         assert np.abs(lit[number] - alone.draw(light).numpy()[0]).max() < FLOAT32 * lit.max()
 
 
 def test_one_camera_that_is_given_makes_a_batch_of_one(device):
     scene = textured_scene("none", "vertex")
-    images = Renderer(scene, cameras=cameras()[:1], device=device).render()
+    images = SceneRenderer(scene, cameras=cameras()[:1], device=device).render()
     expected = ws.render(dataclasses.replace(scene, camera=cameras()[0]), device=device)
     np.testing.assert_array_equal(images, expected[None])
 
 
 def test_cameras_share_the_visibility_of_moving_geometry(device):
-    renderer = Renderer(textured_scene("directional", "vertex"), cameras=cameras(), device=device)
+    renderer = SceneRenderer(textured_scene("directional", "vertex"), cameras=cameras(), device=device)
     view = renderer.view(renderer.placed())
     assert view.fragments.face_ids.shape[0] == 2 and view.receivers.points.shape[0] == 1
     np.testing.assert_array_equal(renderer.draw(view=view).numpy(), renderer.render())
@@ -632,15 +640,15 @@ def test_cameras_share_the_visibility_of_moving_geometry(device):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_renderer_for_other_cameras_draws_what_one_made_for_them_does(device, method):
     scene = scene_of(method, ball(), ground(receivers="vertex"), light=sunny())
-    renderer = Renderer(scene, device=device)
+    renderer = SceneRenderer(scene, device=device)
     before = renderer.render()
     cameras = [ws.Camera.look_at((x, 2, 4), (0, 0.6, 0), size=(24, 40)) for x in (-1, 1)]
     other = renderer.with_cameras(cameras)
-    expected = Renderer(scene, cameras=cameras, device=device).render()
+    expected = SceneRenderer(scene, cameras=cameras, device=device).render()
     np.testing.assert_allclose(other.render(), expected, atol=FLOAT32)
     np.testing.assert_array_equal(renderer.render(), before)  # which has kept its own
     np.testing.assert_allclose(pickle.loads(pickle.dumps(other)).render(), expected, atol=FLOAT32)
-    assert other.assembly is renderer.assembly
+    assert other.merged_scene is renderer.merged_scene
 
 
 @pytest.mark.parametrize(
@@ -653,7 +661,7 @@ def test_a_renderer_for_other_cameras_draws_what_one_made_for_them_does(device, 
 )
 def test_cameras_of_another_size_or_near_plane_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        Renderer(scene_of("none"), cameras=given)
+        SceneRenderer(scene_of("none"), cameras=given)
 
 
 def test_a_coarse_face_in_one_view_of_two_is_as_coarse_as_in_one_alone():
@@ -662,7 +670,7 @@ def test_a_coarse_face_in_one_view_of_two_is_as_coarse_as_in_one_alone():
     scene = ws.Scene((floor,), ws.EnvironmentMap.constant(), camera)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a face covers 330 pixels of either image
-        Renderer(scene, cameras=[camera, camera]).render()
+        SceneRenderer(scene, cameras=[camera, camera]).render()
 
 
 @pytest.mark.parametrize("method", ["directional", "log-sh", "none"])
@@ -670,9 +678,9 @@ def test_receivers_lit_in_parts_are_those_lit_at_once(method, monkeypatch):
     """In parts, transfer vectors take memory for those alone that are lit at once."""
     ball = ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE, translation=(0, 1, 0))
     scene = ws.Scene((ball, ws.Body(ws.plane(4, 16), blockers=0)), dome(), CAMERA, ws.Visibility(method))
-    whole = Renderer(scene).render()
+    whole = SceneRenderer(scene).render()
     monkeypatch.setattr(groups, "PART", 37)
-    renderer = Renderer(scene)
+    renderer = SceneRenderer(scene)
     np.testing.assert_array_equal(renderer.render(), whole)
     assert "transfer" in str(renderer.explain())
 
@@ -688,7 +696,7 @@ def test_parts_of_receivers_need_little_memory(monkeypatch):
         lambda seen, *rest, **most: sizes.append(seen.shape[1]) or shade(seen, *rest, **most),
     )
     scene = ws.Scene((ws.Body(ws.icosphere(1.0, 3), blockers=UNIT_SPHERE),), dome(), CAMERA)
-    Renderer(scene).render()
+    SceneRenderer(scene).render()
     assert len(sizes) > 2
     assert max(sizes) <= 64
 
@@ -699,8 +707,8 @@ def test_parts_of_receivers_need_little_memory(monkeypatch):
 def test_a_view_of_another_renderer_is_refused(device):
     """It keeps what the other computed in its light and of its reflectance."""
     scene = scene_of("none", ball(), light=dome())
-    first = Renderer(scene, device=device)
-    second = Renderer(dataclasses.replace(scene, light=sunny()), device=device)
+    first = SceneRenderer(scene, device=device)
+    second = SceneRenderer(dataclasses.replace(scene, light=sunny()), device=device)
     view = first.view()
     image = first.draw(view=view).numpy()
     calls = second.draw, second.shade, second.reflect, second.explain, second.body_ids
@@ -712,7 +720,7 @@ def test_a_view_of_another_renderer_is_refused(device):
 
 def test_a_plain_tuple_is_a_geometry_whose_rotations_are_not_known(device):
     scene = scene_of("directional", ball(), light=dome(), self_shadows="spheres")
-    renderer = Renderer(scene, device=device)
+    renderer = SceneRenderer(scene, device=device)
     plain = tuple(renderer.placed().arrays().values())
     image = renderer.draw().numpy()
     np.testing.assert_array_equal(renderer.draw(view=renderer.view(plain)).numpy(), image)

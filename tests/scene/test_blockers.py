@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.scene import blockers
 
 # Positions are float32; the ground's sphere has a radius of tens.
@@ -30,7 +30,7 @@ def scene_of(
 
 
 def spheres_of(*bodies: ws.Body, device="cpu") -> tuple[np.ndarray, np.ndarray]:
-    _, centers, radii = Renderer(scene_of(*bodies), device=device).geometry().arrays().values()
+    _, centers, radii = SceneRenderer(scene_of(*bodies), device=device).geometry().arrays().values()
     assert centers.shape == radii.shape and str(centers.device) == str(radii.device) == device
     return centers.numpy()[0], radii.numpy()[0]
 
@@ -166,7 +166,7 @@ def test_the_ground_shadows_a_body_above_it_nearly_as_the_plane_does(device):
     errors = {}
     for number, blocker_count in (("one sphere", 1), ("none", 0)):
         scene = scene_of(ws.Body(ws.plane(6.0, 2), blockers=blocker_count, receivers="vertex"), ball(), directions=256)
-        renderer = Renderer(scene, device=device)
+        renderer = SceneRenderer(scene, device=device)
         shading = renderer.shade().numpy()[0, 9:]
         points, normals = (array.numpy()[0, 9:] for array in renderer.view().receivers[:2])
         expected = traced_shading(points, normals)
@@ -186,3 +186,15 @@ def traced_shading(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     for axis in (0, 2):
         hits &= np.abs(points[:, axis : axis + 1] + reach * directions[:, axis]) < 3
     return np.repeat((cosine * ~hits).sum(axis=1, keepdims=True) * 4 / len(directions), 3, axis=1)
+
+
+def test_fits_that_take_long_are_announced_with_the_way_around_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(blockers, "fit_seconds", lambda count: 1000.0 * count)
+    monkeypatch.setenv("WARPSHADOW_NUM_THREADS", "1")
+    scene = scene_of(ws.Body(ws.icosphere(1.0, 1), blockers=1))
+    blockers.scene_blockers(scene, progress=True)
+    assert capsys.readouterr().err.startswith("fitting spheres to 1 mesh takes about 17 min, once; method")
+    blockers.scene_blockers(scene, progress=True)  # reads them
+    blockers.scene_blockers(scene_of(ws.Body(ws.icosphere(1.0, 2), blockers=1)), progress=False)
+    assert not capsys.readouterr().err

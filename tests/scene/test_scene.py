@@ -52,7 +52,8 @@ def test_every_key_has_the_documented_default_but_camera_light_and_a_body(load):
     expected = ws.Camera.look_at((0, 1, 4), (0, 0, 0), up=(0, 1, 0), fov_y=40)
     np.testing.assert_array_equal(scene.camera.clip_matrix(), expected.clip_matrix())
     visibility = scene.visibility
-    assert (visibility.method, visibility.directions, visibility.softness) == ("directional", 128, 0.35)
+    assert (visibility.method, visibility.directions, visibility.softness) == (None, 128, 0.35)
+    assert visibility.sampling == "independent"
     assert visibility.merging == 0.75
     assert (visibility.order, visibility.log, visibility.base) == (8, "eigen", "quadratic")
     (body,) = scene.bodies
@@ -571,3 +572,16 @@ def test_another_method_takes_along_the_settings_that_it_reads():
 def test_settings_that_are_not_read_are_checked(settings):
     with pytest.raises(ValueError, match="order: got 9|method: got 'rays'|softness: got -1|did you mean 'order'"):
         ws.Visibility.of(settings)
+
+
+def test_arguments_in_each_others_places_are_named():
+    body, light = ws.Body(ws.icosphere(1.0, 0)), ws.EnvironmentMap.constant(1.0)
+    camera, visibility = ws.Camera.framing(body), ws.Visibility("none")
+    for message, arguments in (
+        ("camera in place of light and light in place of camera", ([body], camera, light)),
+        ("camera in place of bodies and bodies in place of light", (camera, [body], light)),
+        ("light in place of bodies and bodies in place of light", (light, body)),
+        ("visibility in place of camera", ([body], light, visibility)),
+    ):
+        with pytest.raises(ValueError, match=rf"^Scene: got {message}.*, expected Scene\(bodies, light, camera"):
+            ws.Scene(*arguments)

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warpshadow.assets.cache import cached_files
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import load_mesh
-from warpshadow.assets.primitives import icosphere
+from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.spheres import Spheres, enough, exact_occlusion, fit_spheres, plot_spheres
 from warpshadow.spheres import cover as stage_1
@@ -384,6 +385,14 @@ def test_no_sphere_is_in_the_open_and_cavities_stay_light(device):
         assert (gaps > 0).all()
 
 
+def test_a_cloth_lets_no_light_through():
+    """A sheet over a ridge. Its spheres, which darken the sheet itself, once shrank until its shadow was off by 40%."""
+    flat = plane(2.0, 8)
+    x, y, z = flat.positions.T
+    cloth = Mesh(np.stack([x, 0.8 * (1 - abs(x)) + 0.05, z], axis=1), flat.faces)
+    assert fit_spheres(cloth, 96, **QUICK).report.shadow_error < 0.2  # measured 9%
+
+
 def test_an_open_mesh_has_the_same_spheres_whatever_its_winding():
     shell = half_shell()
     turned = Mesh(shell.positions, shell.faces[:, ::-1])
@@ -480,6 +489,44 @@ def test_a_mesh_without_surface_is_refused():
 
 
 # ------------------------------------------------------------------------------ cache and picture
+
+
+@pytest.mark.parametrize(
+    ("stop", "kept", "known"),
+    [(15, "1 short fits", 10), (70, "50 of 100 steps", 70)],
+    ids=["in the second short fit", "in the descent"],
+)
+def test_a_fit_goes_on_where_an_interrupt_left_it_to_the_same_bits(tmp_path, monkeypatch, stop, kept, known):
+    steps, limit, gradient = [], [np.inf], stage_2.Refinement.gradient
+
+    def counted(self, *args):
+        if len(steps) == limit[0]:
+            raise KeyboardInterrupt
+        steps.append(1)
+        return gradient(self, *args)
+
+    def fit(folder):
+        monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / folder))
+        steps.clear()
+        return fit_spheres(bumpy(), **{**QUICK, "cache": True, "steps": 100})
+
+    monkeypatch.setattr(stage_2.Refinement, "gradient", counted)
+    monkeypatch.setattr(enough, "TRIED", (2, 4))
+    monkeypatch.setattr(enough, "_WANTED", 0.0)
+    monkeypatch.setattr(enough, "_STEPS", 10)
+    whole = fit("whole").spheres
+    assert len(steps) == 120  # of two short fits, and the descent
+    limit[0] = stop
+    with pytest.raises(KeyboardInterrupt, match=f"^{kept} of the fit are kept"):
+        fit("interrupted")
+    (part,) = cached_files("spheres")
+    assert part.name.endswith(".part.npz")
+    limit[0] = np.inf
+    resumed = fit("interrupted").spheres
+    np.testing.assert_array_equal(resumed.centers, whole.centers)
+    np.testing.assert_array_equal(resumed.radii, whole.radii)
+    assert len(steps) == 120 - known
+    assert [path.name for path in cached_files("spheres")] == [part.name.replace(".part", "")]
 
 
 @pytest.mark.slow

@@ -82,16 +82,18 @@ def test_batches_that_differ_are_refused(device):
         sample_radiance(Fragments(face_ids, weights), faces, shading, albedo)
 
 
-@pytest.mark.parametrize("across", [1, 2, 3])
-def test_pixels_are_the_means_of_their_samples_and_share_their_gradients(device, across, verified_tape):
+@pytest.mark.parametrize("supersampling", [1, 2, 3])
+def test_pixels_are_the_means_of_their_samples_and_share_their_gradients(device, supersampling, verified_tape):
     rng = np.random.default_rng(2)
-    values, weights = rng.normal(size=(2, 6, 12, 4)), rng.normal(size=(2, 6 // across, 12 // across, 4))
+    values, weights = rng.normal(size=(2, 6, 12, 4)), rng.normal(size=(2, 6 // supersampling, 12 // supersampling, 4))
     samples = wp.array(values, dtype=wp.vec4, device=device, requires_grad=True)
     with wp.Tape() as tape:
-        pixels = average(samples, across)
-    expected = values.reshape(2, 6 // across, across, 12 // across, across, 4).mean(axis=(2, 4))
+        pixels = average(samples, supersampling)
+    expected = values.reshape(2, 6 // supersampling, supersampling, 12 // supersampling, supersampling, 4).mean(
+        axis=(2, 4)
+    )
     assert np.abs(pixels.numpy() - expected).max() < FLOAT32
-    if across > 1:
+    if supersampling > 1:
         tape.backward(grads={pixels: wp.array(weights, dtype=wp.vec4, device=device)})
-        shares = np.repeat(np.repeat(weights, across, axis=1), across, axis=2) / across**2
+        shares = np.repeat(np.repeat(weights, supersampling, axis=1), supersampling, axis=2) / supersampling**2
         assert np.abs(samples.grad.numpy() - shares).max() < FLOAT32

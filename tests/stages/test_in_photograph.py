@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.stages.photograph import compose, divide_samples
+from warpshadow.stages.photograph import compose, find_ratio_image
 
 # A handful of float32 products.
 FLOAT32 = 3e-6
@@ -48,7 +48,7 @@ def divided(face_ids, variables, device):
     """The arrays of the variables, and the parts."""
     arrays = [array_of(values, device) for values in variables]
     catches = wp.array(CATCHES, dtype=wp.bool, device=device)
-    return arrays, divide_samples(wp.array(face_ids, dtype=wp.int32, device=device), catches, *arrays)
+    return arrays, find_ratio_image(wp.array(face_ids, dtype=wp.int32, device=device), catches, *arrays)
 
 
 def array_of(values, device, requires_grad=True):

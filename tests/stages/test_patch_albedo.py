@@ -5,7 +5,7 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
-from warpshadow.stages.bounces.patches import find_flat_patches, find_patches
+from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
 
 EXACT = 1e-6
 """Weights are float64, and barycentric coordinates of pieces float32."""
@@ -38,14 +38,14 @@ def texture_means(patches, mesh, texture):
 @pytest.mark.parametrize("is_two_sided", [False, True])
 def test_a_texture_of_one_color_has_that_on_every_patch(size, is_two_sided):
     mesh = ws.plane((2.0, 1.0), 8)
-    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=is_two_sided)
+    patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=is_two_sided)
     found = texture_means(patches, mesh, np.full((*size, 3), 0.3, np.float32))
     np.testing.assert_allclose(found[patches.areas > 0], 0.3, atol=EXACT)
 
 
 def test_a_texture_has_its_mean_over_each_patch():
     mesh = ws.plane((2.0, 1.0), 8)
-    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=False)
+    patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=False)
     height, width = 256, 512
     u, v = (np.arange(width) + 0.5) / width, 1 - (np.arange(height) + 0.5) / height
     wave = 0.5 + 0.4 * np.sin(6 * np.pi * u) * np.cos(4 * np.pi * v)[:, None]
@@ -69,6 +69,6 @@ def test_a_texture_has_its_mean_over_each_patch():
 def test_a_texture_repeats_outside_of_the_unit_square():
     mesh = ws.plane((2.0, 1.0), 8)
     moved = ws.Mesh(mesh.positions, mesh.faces, uvs=mesh.uvs + 3, uv_faces=mesh.uv_faces)
-    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=False)
+    patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=False)
     texture = RANDOM.uniform(size=(16, 32, 3)).astype(np.float32)
     np.testing.assert_allclose(texture_means(patches, moved, texture), texture_means(patches, mesh, texture), atol=1e-5)

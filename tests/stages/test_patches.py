@@ -5,8 +5,8 @@ import pytest
 
 import warpshadow as ws
 from demos.scenes import shipped_mesh
-from warpshadow.stages.bounces.patches import find_flat_patches, find_patches
-from warpshadow.stages.flats.grid import squeezed, stretched
+from warpshadow.stages.bounces.patches import find_patches, find_plane_patches
+from warpshadow.stages.planes.grid import squeezed, stretched
 
 ROUNDING = 1e-5
 
@@ -52,6 +52,27 @@ def test_patches_cover_the_surface_of_each_side_once(mesh):
     np.testing.assert_allclose(np.bincount(front, areas), patches.areas[: patches.count // sides], rtol=ROUNDING)
 
 
+def joined(*meshes):
+    counts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
+    positions = np.concatenate([mesh.positions for mesh in meshes])
+    return ws.Mesh(positions, np.concatenate([mesh.faces + n for mesh, n in zip(meshes, counts, strict=False)]))
+
+
+def test_faces_between_boxes_that_touch_belong_to_no_patch():
+    """Two steps: the front of the higher one is hidden up to the lower one's height, the back of this all over."""
+    low, high = box((1.0, 1.0, 1.0)), box((1.0, 2.0, 1.0)).transformed(translation=np.array([0.0, 0, 1]))
+    steps = joined(low, high)
+    patches = patches_of(steps)
+    pieces = patches.pieces.positions(steps.positions, steps.surface.faces)
+    middles, front = pieces.mean(axis=1), patches.of_pieces[0]
+    is_between = np.isclose(pieces[..., 2], 1).all(axis=1) & (middles[:, 1] < 0.9)
+    assert is_between.sum() > 10 and (front[is_between] == -1).all()
+    is_outside = ~np.isclose(pieces[..., 2], 1).all(axis=1)
+    assert (front[is_outside] >= 0).all()
+    np.testing.assert_allclose(patches.areas.sum(), area_of(steps) - 2, rtol=0.03)
+    assert set(front) == {-1, *range(patches.count)}
+
+
 def test_every_patch_has_up_to_four_sources_on_it_that_weigh_one(mesh):
     patches = patches_of(mesh)
     sources = patches.sources
@@ -83,7 +104,7 @@ def test_needles_do_not_make_pieces_without_end():
     needles = np.array([[[0, y, 0], [100, y, 0], [0, y + 1e-4, 0]] for y in range(50)]).reshape(-1, 3)
     positions = np.concatenate([needles, [[0, 0, 1], [1, 0, 1], [0, 1, 1]]])
     patches = find_patches(positions, np.arange(len(positions)).reshape(-1, 3), is_two_sided=True)
-    assert len(patches.pieces.faces) < 20 * 256
+    assert len(patches.pieces.faces) < 40 * 256
     assert patches.areas.sum() == pytest.approx(2 * (0.5 + 50 * 100 * 1e-4 / 2))
 
 
@@ -108,7 +129,7 @@ def test_patches_belong_to_the_sphere_whose_surface_is_nearest():
 
 
 def flat_patches_of(mesh, **options):
-    return find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, **options)
+    return find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=False, **options)
 
 
 def test_a_stretch_undoes_a_squeeze():
@@ -172,7 +193,7 @@ def test_texels_off_the_mesh_have_no_sources():
 
 def test_both_sides_of_a_grid_have_patches():
     mesh = ws.plane(1.0, 2)
-    patches = find_flat_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
+    patches = find_plane_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
     assert patches.count == 2 * 24 * 24 and patches.grid.sides == 2
     np.testing.assert_allclose(patches.normals[576:], [[0, -1, 0]] * 576, atol=ROUNDING)
     assert patches.sources.is_back[576:].all() and not patches.sources.is_back[:576].any()

@@ -8,7 +8,7 @@ import warpshadow as ws
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.primitives import icosphere, plane
 from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.path_tracing import Surfaces, trace_bounces
+from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.textures.pyramid import mip_pyramids
 
 SEED = 3
@@ -21,7 +21,9 @@ def vectors(values, device) -> wp.array:
     return wp.array(np.asarray(values, np.float32), dtype=wp.vec3, device=device)
 
 
-def make_surfaces(mesh: Mesh, colors, device, *, casting: Mesh | None = None, texture=None, textured=()) -> Surfaces:
+def make_surfaces(
+    mesh: Mesh, colors, device, *, casting: Mesh | None = None, texture=None, textured=()
+) -> PathSurfaces:
     """A mesh with colors [3] or [vertex, 3]; a texture, repeated by uvs, in place of them on some faces."""
 
     def hierarchy(each: Mesh) -> wp.Mesh:
@@ -35,7 +37,7 @@ def make_surfaces(mesh: Mesh, colors, device, *, casting: Mesh | None = None, te
     of_face = np.full(len(mesh.faces), -1)
     of_face[list(textured)] = 0
     uvs = np.zeros((1, 2)) if mesh.uvs is None else mesh.uvs
-    return Surfaces(
+    return PathSurfaces(
         hierarchy(mesh),
         hierarchy(mesh if casting is None else casting),
         faces,
@@ -48,7 +50,7 @@ def make_surfaces(mesh: Mesh, colors, device, *, casting: Mesh | None = None, te
     )
 
 
-def bounced(surfaces: Surfaces, points, normals, radiance, *, bounces: int, paths: int = 1024) -> np.ndarray:
+def bounced(surfaces: PathSurfaces, points, normals, radiance, *, bounces: int, paths: int = 1024) -> np.ndarray:
     device = surfaces.faces.device
     places = vectors(points, device), vectors(normals, device)
     samples = sample_map(np.asarray(radiance, np.float32), 1024)
@@ -150,13 +152,13 @@ class Twin:
     def meet(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest face of each ray, -1 for none, and barycentrics."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
-        across = np.cross(b - a, c - a)
-        slope = directions @ across.T
-        t = ((a * across).sum(axis=1) - points @ across.T) / np.where(slope == 0, 1e-30, slope)
+        supersampling = np.cross(b - a, c - a)
+        slope = directions @ supersampling.T
+        t = ((a * supersampling).sum(axis=1) - points @ supersampling.T) / np.where(slope == 0, 1e-30, slope)
         reached = points[:, None] + t[..., None] * directions[:, None]
-        size = (across**2).sum(axis=1)
-        v = (np.cross(reached - a, c - a) * across).sum(axis=-1) / size
-        w = (np.cross(b - a, reached - a) * across).sum(axis=-1) / size
+        size = (supersampling**2).sum(axis=1)
+        v = (np.cross(reached - a, c - a) * supersampling).sum(axis=-1) / size
+        w = (np.cross(b - a, reached - a) * supersampling).sum(axis=-1) / size
         t = np.where((t > 1e-9) & (v >= 0) & (w >= 0) & (v + w <= 1), t, np.inf)
         face = t.argmin(axis=1)
         each = np.arange(len(points))
@@ -201,8 +203,10 @@ class Twin:
             met = face >= 0
             face, weights, directions = face[met], weights[met], directions[met]
             points = np.einsum("rk,rkc->rc", weights, self.corners[face])
-            across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])[face]
-            normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+            supersampling = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])[
+                face
+            ]
+            normals = supersampling / np.linalg.norm(supersampling, axis=1, keepdims=True)
             normals *= -np.sign((normals * directions).sum(axis=1, keepdims=True))
             reflected = reflected[met] * self.albedo(face, weights)
             total += (reflected * self.direct(points + 1e-7 * normals, normals)).sum(axis=0) / count

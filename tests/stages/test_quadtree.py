@@ -28,31 +28,33 @@ def sheet_and_triangle(device, eyes=((0, 0, 3.0),), size=20):
     return positions, faces, rasterize(clip, faces, size, size)
 
 
-def shares_of(fragments, across, value):
+def shares_of(fragments, supersampling, value):
     """Light at probes that rises along a row from one column on."""
     _, height, width = fragments.face_ids.shape
-    row, column = probe_grid((height, width), across)
-    return np.tile(value(column / across), (len(fragments.face_ids), len(row), 1))
+    row, column = probe_grid((height, width), supersampling)
+    return np.tile(value(column / supersampling), (len(fragments.face_ids), len(row), 1))
 
 
-def receivers_in(positions, faces, fragments, quadtree, across):
+def receivers_in(positions, faces, fragments, quadtree, supersampling):
     wants = KEYS >= 0
     numbering = number_receivers(faces, np.repeat([[False, True]], [4, 3], axis=1))
     normals = vertex_normals(positions, faces)
-    return find_receivers(positions, normals, faces, fragments, numbering, wants, across=across, quadtree=quadtree)
+    return find_receivers(
+        positions, normals, faces, fragments, numbering, wants, supersampling=supersampling, quadtree=quadtree
+    )
 
 
-@pytest.mark.parametrize("across", [1, 2, 3])
+@pytest.mark.parametrize("supersampling", [1, 2, 3])
 @pytest.mark.parametrize("edge", [None, 9.0])
-def test_samples_get_what_lies_where_they_look_from_few_receivers(device, across, edge):
+def test_samples_get_what_lies_where_they_look_from_few_receivers(device, supersampling, edge):
     """A sheet that faces the camera: what is linear on it is linear in the image, at its ends and beside others, too.
 
     But for samples of the same face that share a receiver at their mean, as without a quadtree.
     """
-    positions, faces, fragments = sheet_and_triangle(device, ((0, 0, 3.0), (0.3, 0.1, 3.2)), size=22 * across)
-    shares = shares_of(fragments, across, lambda x: np.zeros_like(x) if edge is None else 1.0 * (x > edge))
-    quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, across)
-    found = receivers_in(positions, faces, fragments, quadtree, across)
+    positions, faces, fragments = sheet_and_triangle(device, ((0, 0, 3.0), (0.3, 0.1, 3.2)), size=22 * supersampling)
+    shares = shares_of(fragments, supersampling, lambda x: np.zeros_like(x) if edge is None else 1.0 * (x > edge))
+    quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, supersampling)
+    found = receivers_in(positions, faces, fragments, quadtree, supersampling)
     got = interpolate(found.fragments, found.faces, found.points).numpy()
     gaps = np.linalg.norm(got - interpolate(fragments, faces, positions).numpy(), axis=-1)
     is_inside = found.fragments.face_ids.numpy() >= 3 + (found.points.shape[1] - 3)
@@ -60,7 +62,7 @@ def test_samples_get_what_lies_where_they_look_from_few_receivers(device, across
     pixel = 2 * np.tan(np.radians(20)) * 3.2 / 22
     assert gaps.max() < 1.5 * pixel
     sees_sheet = KEYS[fragments.face_ids.numpy()] >= 0
-    assert (found.points.shape[1] - 3) < 0.4 * sees_sheet[0].sum() / across**2
+    assert (found.points.shape[1] - 3) < 0.4 * sees_sheet[0].sum() / supersampling**2
 
 
 def test_squares_are_small_where_light_has_an_edge_and_large_where_it_rises_evenly(device):

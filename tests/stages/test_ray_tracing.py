@@ -12,7 +12,8 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages import ray_tracing
 from warpshadow.stages.light_samples import SET_COUNT, cell_samples, even_samples, sample_map
-from warpshadow.stages.ray_tracing import nearest, trace_cells, trace_shading, trace_transfer, trace_visibility
+from warpshadow.stages.ray_tracing import nearest, trace_cells, trace_shading, trace_visibility
+from warpshadow.stages.traced_transfer import trace_transfer
 
 SEED = 5
 
@@ -65,10 +66,10 @@ def moeller_trumbore(mesh: Mesh, points: np.ndarray, directions: np.ndarray) -> 
     """Whether rays meet any face, float64: bool of shape [point, direction]."""
     corners = mesh.positions[mesh.faces].astype(np.float64)
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across = np.cross(directions[:, None], second[None])  # [direction, face, 3]
-    determinant = (across * first).sum(axis=-1)
+    supersampling = np.cross(directions[:, None], second[None])  # [direction, face, 3]
+    determinant = (supersampling * first).sum(axis=-1)
     from_corner = points[:, None] - corners[None, :, 0]  # [point, face, 3]
-    u = np.einsum("pfi,dfi->pdf", from_corner, across) / determinant
+    u = np.einsum("pfi,dfi->pdf", from_corner, supersampling) / determinant
     sideways = np.cross(from_corner, first)
     v = np.einsum("pfi,di->pdf", sideways, directions) / determinant
     along = (sideways * second).sum(axis=-1)[:, None] / determinant

@@ -30,12 +30,12 @@ def two_triangles(device, cameras: int, requires_grad=False):
     return positions, faces, wp.array(np.array(matrices), dtype=wp.mat44, device=device)
 
 
-def receivers_of(positions, faces, matrices, wants_samples, across=1):
+def receivers_of(positions, faces, matrices, wants_samples, supersampling=1):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     wants = np.array(wants_samples)
     numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
     found = find_receivers(
-        positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, across=across
+        positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, supersampling=supersampling
     )
     return found, fragments
 
@@ -51,30 +51,36 @@ def test_what_samples_get_from_their_receivers_is_what_lies_where_they_look(devi
         assert np.abs(got - expected).max() < FLOAT32
 
 
-def means_over_pixels(image, face_ids, across):
+def means_over_pixels(image, face_ids, supersampling):
     """Twin: the mean over the samples of a pixel that see the same face."""
     views, height, width = face_ids.shape
     means = np.zeros(image.shape)
     for view, row, column in np.argwhere(face_ids >= 0):
-        block = (view, *(slice(k // across * across, k // across * across + across) for k in (row, column)))
+        block = (
+            view,
+            *(
+                slice(k // supersampling * supersampling, k // supersampling * supersampling + supersampling)
+                for k in (row, column)
+            ),
+        )
         means[view, row, column] = image[block][face_ids[block] == face_ids[view, row, column]].mean(axis=0)
     return means
 
 
-@pytest.mark.parametrize("across", [2, 3])
+@pytest.mark.parametrize("supersampling", [2, 3])
 @pytest.mark.parametrize("wants_samples", [(True, False), (True, True)])
-def test_samples_of_a_pixel_that_see_the_same_face_share_a_receiver_at_their_mean(device, across, wants_samples):
+def test_samples_of_a_pixel_that_see_the_same_face_share_a_receiver_at_their_mean(device, supersampling, wants_samples):
     positions, faces, matrices = two_triangles(device, 2)
-    found, fragments = receivers_of(positions, faces, matrices, wants_samples, across)
+    found, fragments = receivers_of(positions, faces, matrices, wants_samples, supersampling)
     face_ids = fragments.face_ids.numpy()
     is_own = (face_ids >= 0) & np.array(wants_samples)[face_ids]
     for own, attribute in ((found.points, positions), (found.normals, vertex_normals(positions, faces))):
         got = interpolate(found.fragments, found.faces, own).numpy()
         at_samples = interpolate(fragments, faces, attribute).numpy()
-        expected = np.where(is_own[..., None], means_over_pixels(at_samples, face_ids, across), at_samples)
+        expected = np.where(is_own[..., None], means_over_pixels(at_samples, face_ids, supersampling), at_samples)
         assert np.abs(got - expected).max() < FLOAT32
     own_count = found.points.shape[1] - 3 * (2 - sum(wants_samples))
-    assert is_own.sum(axis=(1, 2)).max() / across**2 < own_count < 0.8 * is_own.sum(axis=(1, 2)).max()
+    assert is_own.sum(axis=(1, 2)).max() / supersampling**2 < own_count < 0.8 * is_own.sum(axis=(1, 2)).max()
 
 
 def test_while_a_graph_is_captured_every_sample_has_room_for_a_receiver(device):
@@ -86,7 +92,7 @@ def test_while_a_graph_is_captured_every_sample_has_room_for_a_receiver(device):
     wants = np.array([True, False])
     numbering = number_receivers(faces, np.repeat(~wants, 3)[None])
     with wp.ScopedCapture(device=device) as capture:
-        found = find_receivers(positions, normals, faces, fragments, numbering, wants, across=2)
+        found = find_receivers(positions, normals, faces, fragments, numbering, wants, supersampling=2)
     wp.capture_launch(capture.graph)
     assert found.points.shape[1] == 3 + 12 * 12
     for own, others in ((found.points, expected.points), (found.normals, expected.normals)):
@@ -135,14 +141,14 @@ def test_no_vertex_has_a_part_in_an_image_of_nothing(device):
     assert not seen_vertices(fragments, find_silhouettes(fragments, faces, edges, clip), 6).any()
 
 
-@pytest.mark.parametrize("across", [1, 2])
-def test_gradients_through_receivers_are_central_differences(device, verified_tape, across):
+@pytest.mark.parametrize("supersampling", [1, 2])
+def test_gradients_through_receivers_are_central_differences(device, verified_tape, supersampling):
     """The samples of a moving mesh stay on their faces, and their receivers move along their rays."""
     positions, faces, matrices = two_triangles(device, 2, requires_grad=True)
     rng = np.random.default_rng(0)
 
     def loss(array):
-        found, _ = receivers_of(array, faces, matrices, (True, False), across)
+        found, _ = receivers_of(array, faces, matrices, (True, False), supersampling)
         return found.points, found.normals
 
     with wp.Tape() as tape:

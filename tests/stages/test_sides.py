@@ -11,8 +11,8 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
 from warpshadow.pipeline import view as view_module
-from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterize import rasterize
@@ -136,10 +136,10 @@ def test_free_light_falls_on_backs_as_known_light_does(method):
     coefficients = np.random.default_rng(2).uniform(0.1, 1, (9, 3)).astype(np.float32)
     images = []
     for mesh in (bowl(), turned_over(bowl())):
-        renderer = Renderer(bowl_scene(method, mesh=mesh), basis=HarmonicBasis(3))
+        renderer = SceneRenderer(bowl_scene(method, mesh=mesh), basis=HarmonicBasis(3))
         images.append(renderer.draw(wp.array(coefficients[None], dtype=wp.vec3)).numpy())
     assert_near(*images)
-    assert_near(images[0], Renderer(bowl_scene(method)).draw(coefficients).numpy(), 0.05)
+    assert_near(images[0], SceneRenderer(bowl_scene(method)).draw(coefficients).numpy(), 0.05)
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_cameras_see_both_sides_of_a_surface_at_once(method, receivers):
     cameras = [ABOVE, BELOW, INSIDE]
     cameras = [ws.Camera(c.intrinsics, c.rotation, c.translation, 24, 24) for c in cameras]
     scene = bowl_scene(method, receivers)
-    together = Renderer(scene, cameras=cameras).render()
+    together = SceneRenderer(scene, cameras=cameras).render()
     for camera, image in zip(cameras, together, strict=True):
         # ray-traced samples take their directions by the number of the receiver, which differs
         assert_near(image, ws.render(replace(scene, camera=camera)), 0.05 if method == "ray-traced" else FLOAT32)
@@ -180,7 +180,7 @@ def test_backs_that_stand_among_moving_bodies_are_lit_as_fronts_that_do(method, 
     """The bowl blocks light, so that rays start on the side that is seen; a second image is made of what is kept."""
     images = []
     for mesh in (bowl(), turned_over(bowl())):
-        renderer = Renderer(bowl_scene(method, mesh=mesh))
+        renderer = SceneRenderer(bowl_scene(method, mesh=mesh))
         light = None
         if is_free:
             values = np.random.default_rng(3).uniform(0.1, 1, (1, renderer.basis.size, 3))
@@ -191,7 +191,7 @@ def test_backs_that_stand_among_moving_bodies_are_lit_as_fronts_that_do(method, 
             images.append(renderer.draw(light, view=view).numpy())
     assert_near(images[0], images[2])
     assert_near(images[1], images[3])
-    whole = Renderer(bowl_scene(method))
+    whole = SceneRenderer(bowl_scene(method))
     if method == "none":
         assert_near(images[1], whole.draw(light).numpy())
 
@@ -203,14 +203,14 @@ def test_where_nothing_is_read_back_backs_are_lit_as_well(moving, monkeypatch):
     While a graph is captured it is not even known whether one does.
     """
     scene = bowl_scene("none")
-    expected = Renderer(scene).render()
+    expected = SceneRenderer(scene).render()
     monkeypatch.setattr(view_module, "is_readable", lambda device: False)
-    renderer = Renderer(scene)
+    renderer = SceneRenderer(scene)
     view = renderer.view(renderer.placed(moving=moving))
     vertex_counts = [body.mesh.vertex_count for body in scene.bodies]
     assert view.receivers.points.shape[1] + len(view.receivers.on_static) == 2 * vertex_counts[0] + vertex_counts[1]
     assert_near(renderer.draw(view=view).numpy()[0], expected)
-    front = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
+    front = SceneRenderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=turned_over(bowl())),), camera=INSIDE))
     assert front.view().receivers.points.shape[1] == vertex_counts[0]
 
 
@@ -344,14 +344,16 @@ def launches_of(monkeypatch, call) -> Counter:
 
 def test_closed_bodies_are_not_asked_which_side_is_seen(monkeypatch):
     scene = bowl_scene("directional")
-    renderer = Renderer(replace(scene, bodies=(replace(scene.bodies[0], mesh=ws.icosphere(1.0, 3), texture=None),)))
+    renderer = SceneRenderer(
+        replace(scene, bodies=(replace(scene.bodies[0], mesh=ws.icosphere(1.0, 3), texture=None),))
+    )
     monkeypatch.setattr(view_module, "find_sides", None)
     view = renderer.view()
-    vertex_count = len(renderer.assembly.body_of_vertex)
+    vertex_count = len(renderer.merged_scene.body_of_vertex)
     assert view.receivers.of_vertices.shape == (vertex_count,) and view.fragments.sides is None
-    assert view.receivers.faces.shape == renderer.assembly.faces.shape
+    assert view.receivers.faces.shape == renderer.merged_scene.faces.shape
     assert view.receivers.fragments is view.fragments
-    explained = Renderer(renderer.scene).explain()
+    explained = SceneRenderer(renderer.scene).explain()
     assert not explained["sides"] and "closed" in explained["sides"].forward.why
     assert f"up to {vertex_count} receivers" in explained["receivers"].items
 
@@ -361,10 +363,10 @@ def test_an_open_body_that_shows_its_front_alone_gets_no_receiver_more(mesh, cam
     """One launch finds that no face turns its back to the camera; or that some do, and a second that no sample sees."""
     scene = bowl_scene("none", mesh=mesh, camera=camera)
     scene = replace(scene, bodies=scene.bodies[:1])
-    renderer, one_sided = Renderer(scene), Renderer(scene)
+    renderer, one_sided = SceneRenderer(scene), SceneRenderer(scene)
     counts = launches_of(monkeypatch, renderer.view)
     with monkeypatch.context() as patch:
-        patch.setattr(Assembly, "is_two_sided", np.zeros(1, bool))
+        patch.setattr(MergedScene, "is_two_sided", np.zeros(1, bool))
         expected = launches_of(monkeypatch, one_sided.view)
     assert not expected - counts and (counts - expected).total() == more
     assert renderer.view().fragments.sides is None
@@ -403,7 +405,7 @@ def test_a_ground_that_goes_on_to_the_horizon_shows_its_front_alone():
         camera = ws.Camera.look_at((0, 0.01, 2), (0, 0, -1), size=(64, 64))
         body = ws.Body(ws.plane(size, 64), blockers=0, translation=(3e-3 * size, 0, 0))
         scene = ws.Scene((body,), SKY, camera, ws.Visibility("none"))
-        assert Renderer(scene).view().fragments.sides is None
+        assert SceneRenderer(scene).view().fragments.sides is None
 
 
 def test_a_surface_is_closed_where_two_faces_share_each_edge_and_look_outward():
@@ -415,6 +417,23 @@ def test_a_surface_is_closed_where_two_faces_share_each_edge_and_look_outward():
     opened = {"plane": ws.plane(), "hole": hole, "inside out": turned_over(ball), "bowl": bowl()}
     for name, mesh in (closed | opened).items():
         assert mesh.surface.is_closed == (name in closed), name
+
+
+def test_boxes_that_share_edges_are_closed():
+    """Four faces meet at the edges that steps of stairs share, and at the corners of a box of boards."""
+
+    def steps(upper: np.ndarray) -> ws.Mesh:
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
+        faces = np.concatenate([faces, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
+        higher = corners * (1, 2, 1) + (0, 0, 1)
+        return ws.Mesh(np.concatenate([corners, higher]), np.concatenate([faces, faces[upper] + 8]))
+
+    every = np.arange(12)
+    assert steps(every).surface.is_closed
+    assert (steps(every).surface.neighbors == -2).any()
+    assert not steps(every[:-1]).surface.is_closed
+    assert not turned_over(steps(every)).surface.is_closed
 
 
 def test_faces_that_wind_against_their_neighbors_are_turned_over_with_their_uvs():
@@ -431,9 +450,11 @@ def test_faces_that_wind_against_their_neighbors_are_turned_over_with_their_uvs(
 
 def test_a_strip_with_one_side_stays_as_it_is():
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    across = np.stack([np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1)
+    supersampling = np.stack(
+        [np.cos(angle / 2) * np.cos(angle), np.sin(angle / 2), np.cos(angle / 2) * np.sin(angle)], -1
+    )
     middle = 3 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
-    positions = np.concatenate([middle - across, middle + across])
+    positions = np.concatenate([middle - supersampling, middle + supersampling])
     low, high = np.arange(24), np.arange(24) + 24
     next_low, next_high = np.append(low[1:], high[0]), np.append(high[1:], low[0])
     faces = np.concatenate([np.stack([low, next_low, high], -1), np.stack([next_low, next_high, high], -1)])

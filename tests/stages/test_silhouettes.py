@@ -105,10 +105,10 @@ def pixel_area(positions, camera=CAMERA):
     return abs((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])) / 2
 
 
-def supersampled(found_at, across):
+def supersampled(found_at, supersampling):
     """Coverage by across² samples a pixel."""
-    fine = mask(found_at(CAMERA.resized(across)))[0]
-    return fine.reshape(CAMERA.height, across, CAMERA.width, across).mean((1, 3))
+    fine = mask(found_at(CAMERA.resized(supersampling)))[0]
+    return fine.reshape(CAMERA.height, supersampling, CAMERA.width, supersampling).mean((1, 3))
 
 
 PLANE = np.array([[-1.7, -0.5, -1.1], [1.6, -0.9, -0.9], [1.5, 1.1, 0.9], [-1.4, 0.8, 1.2]])
@@ -235,10 +235,10 @@ def test_the_edges_found_are_the_outline_of_a_convex_body(device):
     pixels = CAMERA.project(positions)
     sides = np.diff(pixels[mesh.faces], axis=1)
     is_front = np.linalg.det(sides) > 0
-    across = edge_neighbors(mesh.faces)
+    supersampling = edge_neighbors(mesh.faces)
     outline = [
         (mesh.faces[face, (k + 1) % 3], mesh.faces[face, (k + 2) % 3])
-        for face, k in np.argwhere(is_front[:, None] & ~is_front[across])
+        for face, k in np.argwhere(is_front[:, None] & ~is_front[supersampling])
     ]
     seen, expected = mask(found)[0], {}
     for pixel in range(CAMERA.width * CAMERA.height):
@@ -459,11 +459,11 @@ def test_nothing_seen_has_no_silhouettes(device):
 
 def test_edges_know_their_neighbors_by_position():
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [1, 3, 7], [7, 8, 9], [7, 8, 10], [7, 8, 11]])
-    across = edge_neighbors(faces)
-    assert across[0].tolist() == [1, -1, -1]  # edge 1-2 is opposite to corner 0
-    assert across[1].tolist() == [3, -1, 0]
-    assert across[2].tolist() == [-1, -1, -1]
-    assert [row[2] for row in across[4:].tolist()] == [-2, -2, -2]  # three faces meet at 7-8
+    supersampling = edge_neighbors(faces)
+    assert supersampling[0].tolist() == [1, -1, -1]  # edge 1-2 is opposite to corner 0
+    assert supersampling[1].tolist() == [3, -1, 0]
+    assert supersampling[2].tolist() == [-1, -1, -1]
+    assert [row[2] for row in supersampling[4:].tolist()] == [-2, -2, -2]  # three faces meet at 7-8
 
 
 def test_vertices_at_one_place_count_as_one_when_asked():
@@ -477,8 +477,8 @@ def test_vertices_at_one_place_count_as_one_when_asked():
 def test_a_face_without_area_between_two_others_does_not_part_them():
     """As at the pole of a sphere of longitudes and latitudes, whose rows of vertices meet there."""
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
-    across = edge_neighbors(np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4]]), positions)
-    assert across.tolist() == [[2, -1, -1], [-1, -1, -1], [-1, -1, 0]]
+    supersampling = edge_neighbors(np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4]]), positions)
+    assert supersampling.tolist() == [[2, -1, -1], [-1, -1, -1], [-1, -1, 0]]
 
 
 # ------------------------------------------------------------------------------------------------------- coverage

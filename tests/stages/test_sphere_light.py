@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from warpshadow.device import parallel
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.bounces import sphere_light as stage
-from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
+from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
 from warpshadow.stages.visibility import merging
 from warpshadow.stages.visibility.directional import transmittance
 
@@ -22,7 +22,7 @@ ADJOINT = 2e-3
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
-NAMES = ("points", "normals", "centers", "radii", "exitance", "passing", "unblocked")
+NAMES = ("points", "normals", "centers", "radii", "proxy_radiance", "passing", "unblocked")
 DTYPES = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.vec4, wp.float32, wp.float32)
 
 
@@ -36,10 +36,10 @@ def scene(seed, count=64, *, vertex_count=19, sphere_count=7):
     up = np.array([0.6, 0.8, 0])
     for sphere, distance in enumerate([1.004, 0.7, 0.15, 300]):
         points[sphere] = centers[sphere] + distance * radii[sphere] * up
-    exitance = rng.uniform(0.1, 1, (sphere_count, count, 4))
+    proxy_radiance = rng.uniform(0.1, 1, (sphere_count, count, 4))
     unblocked = rng.uniform(0.2, 1, (vertex_count, count))
     passing = unblocked * rng.uniform(0, 0.9, (vertex_count, count))
-    return points, normals, centers, radii, exitance, passing, unblocked
+    return points, normals, centers, radii, proxy_radiance, passing, unblocked
 
 
 def put(values, device, **options):
@@ -103,7 +103,7 @@ def test_the_adjoint_is_that_of_the_twin(name, device):
     assert np.linalg.norm(got - expected) < ADJOINT * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("shared", [(), ("exitance",), ("unblocked",), ("exitance", "unblocked")])
+@pytest.mark.parametrize("shared", [(), ("proxy_radiance",), ("unblocked",), ("proxy_radiance", "unblocked")])
 def test_a_batch_is_single_calls_and_gradients_of_what_they_share_add_up(shared, device):
     singles = [list(scene(seed, 16)) for seed in (5, 6, 7)]
     for single in singles:
@@ -136,9 +136,9 @@ def test_a_white_sphere_above_a_plane_sends_what_its_form_factor_says(count, err
     patches = rng.normal(size=(1, 40, 3))
     patches /= np.linalg.norm(patches, axis=-1, keepdims=True)
     white = wp.full((1, 40), wp.vec3(0.5, 1.0, 2.0), dtype=wp.vec3, device=device)
-    nodes = patches_of_nodes(np.zeros(40, int), np.zeros(1, int))
+    nodes = patches_of_clusters(np.zeros(40, int), np.zeros(1, int))
     shown = wp.array(np.maximum(-patches @ directions.T, 0), dtype=wp.float32, device=device)
-    table = sphere_exitance(white, shown, np.ones(40), *nodes)
+    table = find_proxy_radiance(white, shown, np.ones(40), *nodes)
     arrays = put([v[None] for v in (points, normals, center, np.array([radius]))] + [None] * 3, device)[:4]
     passing = transmittance(*arrays, directions)
     got = stage.sphere_light(*arrays, table, passing, None, directions).numpy()[0]
@@ -182,9 +182,9 @@ def merged(monkeypatch):
     normals = rng.normal(size=(6, 3)) - 3 * away
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     unblocked = rng.uniform(0.5, 1, (6, 16))
-    exitance = rng.uniform(0.1, 1, (6, 16, 4))
+    proxy_radiance = rng.uniform(0.1, 1, (6, 16, 4))
     passing = unblocked * rng.uniform(0, 0.9, (6, 16))
-    return [middle + extents / angles * away, normals, centers, radii, exitance, passing, unblocked]
+    return [middle + extents / angles * away, normals, centers, radii, proxy_radiance, passing, unblocked]
 
 
 def merging_twin(points, normals, centers, radii, *rest):
@@ -212,9 +212,9 @@ def test_the_adjoint_of_spheres_that_merge_is_that_of_the_twin(merged, device):
 
 
 def test_where_nothing_is_met_there_is_no_light_and_no_gradient(device):
-    points, normals, centers, radii, exitance, passing, _ = scene(10)
+    points, normals, centers, radii, proxy_radiance, passing, _ = scene(10)
     for radii_, passing_ in [(radii, np.ones_like(passing)), (0 * radii, passing)]:
-        values = [points, normals, centers, radii_, exitance, passing_, np.ones_like(passing)]
+        values = [points, normals, centers, radii_, proxy_radiance, passing_, np.ones_like(passing)]
         got, each = gradients([value[None] for value in values], np.ones((1, 19, 3)), 64, device)
         assert (got == 0).all()
         assert all((gradient == 0).all() for gradient in each)
@@ -244,8 +244,8 @@ HARD = twins.hard_scenes()
 def test_light_and_gradients_of_hard_scenes_are_finite(case, device):
     points, normals, centers, radii = HARD[case]
     rng = np.random.default_rng(0)
-    exitance = rng.uniform(0, 1, (1, len(radii), 64, 4))
-    arrays = put([v[None] for v in (points, normals, centers, radii)] + [exitance] + [None] * 2, device)[:5]
+    proxy_radiance = rng.uniform(0, 1, (1, len(radii), 64, 4))
+    arrays = put([v[None] for v in (points, normals, centers, radii)] + [proxy_radiance] + [None] * 2, device)[:5]
     for array in arrays:
         array.requires_grad = True
     with wp.Tape() as tape:
@@ -287,7 +287,7 @@ def test_one_lane_gives_what_sixteen_give(monkeypatch, device):
 
 def test_what_does_not_fit_is_refused(device):
     good = put([value[None] for value in scene(13)], device)
-    with pytest.raises(ValueError, match=r"exitance: got shape \(1, 6, 64\), expected \[1, 7, 64\]"):
+    with pytest.raises(ValueError, match=r"proxy_radiance: got shape \(1, 6, 64\), expected \[1, 7, 64\]"):
         stage.sphere_light(*good[:4], good[4][:, :6], *good[5:], fibonacci(64))
     with pytest.raises(ValueError, match=r"transmittance: got shape \(1, 19, 64\), expected \[1, 19, 32\]"):
         stage.sphere_light(*good[:4], good[4][:, :, :32].contiguous(), *good[5:], fibonacci(32))

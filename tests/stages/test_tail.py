@@ -1,4 +1,4 @@
-"""The tail of bounces: sums of geometric series, and their gradients."""
+"""The tail of bounces: light as a sum of geometric series, and its gradient."""
 
 import numpy as np
 import pytest
@@ -16,41 +16,55 @@ def put(values, device, **options):
     return [wp.array(value, dtype=wp.vec3, device=device, **options) for value in values]
 
 
+def series(scale, *ratios):
+    """Radiosities after 0 to 4 bounces of light that is a sum of geometric series in each color; and after all."""
+    shapes = scale * RANDOM.uniform(0.1, 1, (len(ratios), 2, 7, 3))
+    powers = [sum(shape * ratio**n for shape, ratio in zip(shapes, ratios, strict=True)) for n in range(5)]
+    return np.cumsum(powers, axis=0), sum(shape / (1 - ratio) for shape, ratio in zip(shapes, ratios, strict=True))
+
+
+def twin(radiosities):
+    """With 1e-7 on the diagonal left out."""
+    terms = np.diff(radiosities, axis=0)
+    products = np.einsum("ibpc,p,jbpc->bcij", terms[:3], AREAS, terms)
+    matrix = products[..., :3] - products[..., 1:]
+    coefficients = np.linalg.solve(matrix, products[..., :1])[..., 0]
+    return radiosities[1] + np.einsum("bcj,jbpc->bpc", coefficients, terms[1:])
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_a_geometric_series_is_summed_in_each_color(scale, device):
-    shape, ratio = RANDOM.uniform(0.1, 1, (2, 7, 3)), np.array([0.0, 0.5, 0.9])
-    radiosities = [scale * sum(shape * ratio**n for n in range(count)) for count in (1, 2, 3)]
-    got = with_tail(*put(radiosities, device), AREAS).numpy()
-    np.testing.assert_allclose(got, scale * shape / (1 - ratio), rtol=1e-4)
+@pytest.mark.parametrize("ratios", [[np.array([0.0, 0.5, 0.9])], [0.9, 0.5], [0.8, 0.3, -0.1]])
+def test_sums_of_geometric_series_are_exact(scale, ratios, device):
+    radiosities, all_of_it = series(scale, *ratios)
+    np.testing.assert_allclose(with_tail(put(radiosities, device), AREAS).numpy(), all_of_it, rtol=2e-3)
 
 
 def test_light_that_does_not_die_away_gets_forty_nine_more_terms(device):
     one = np.ones((1, 7, 3))
-    np.testing.assert_allclose(with_tail(*put([one, 2 * one, 3 * one], device), AREAS).numpy(), 52, rtol=1e-4)
-    dark = with_tail(*put([0 * one] * 3, device), AREAS).numpy()
+    found = with_tail(put([one, 2 * one, 3 * one, 4 * one, 5 * one], device), AREAS).numpy()
+    np.testing.assert_allclose(found, 54, rtol=1e-4)
+    dark = with_tail(put([0 * one] * 5, device), AREAS).numpy()
     assert (dark == 0).all()
 
 
-def test_the_gradient_is_that_of_differences(device):
-    first = RANDOM.uniform(0.5, 1, (1, 7, 3))
-    values = [first, first + RANDOM.uniform(0.3, 0.4, (1, 7, 3)), first + RANDOM.uniform(0.45, 0.55, (1, 7, 3))]
+def test_a_number_of_radiosities_other_than_five_is_refused(device):
+    with pytest.raises(ValueError, match=r"radiosities: got 3, expected 5"):
+        with_tail(put([np.ones((1, 7, 3))] * 3, device), AREAS)
+
+
+def test_light_is_that_of_a_twin_and_the_gradient_that_of_differences(device):
+    values = np.cumsum([RANDOM.uniform(0.5, 1, (1, 7, 3)) * ratio for ratio in (1, 0.5, 0.3, 0.2, 0.1)], axis=0)
     weights = RANDOM.normal(size=(1, 7, 3))
-
-    def twin(before, last, now):
-        old, new = last - before, now - last
-        ratio = (AREAS[:, None] * new * old).sum(axis=1) / (AREAS[:, None] * old**2).sum(axis=1)
-        return np.sum(weights * (now + ratio / (1 - ratio) * new))
-
     arrays = put(values, device, requires_grad=True)
     with wp.Tape() as tape:
-        result = with_tail(*arrays, AREAS)
+        result = with_tail(arrays, AREAS)
+    np.testing.assert_allclose(result.numpy(), twin(values), rtol=1e-5)
     result.grad.assign(weights.astype(np.float32))
     tape.backward()
     for number, array in enumerate(arrays):
         expected = np.zeros((1, 7, 3))
         for index in np.ndindex(expected.shape):
-            step = np.zeros((1, 7, 3))
-            step[index] = 1e-6
-            ends = [twin(*(v + sign * step * (k == number) for k, v in enumerate(values))) for sign in (1, -1)]
-            expected[index] = (ends[0] - ends[1]) / 2e-6
+            step = np.zeros((5, 1, 7, 3))
+            step[(number, *index)] = 1e-6
+            expected[index] = np.sum(weights * (twin(values + step) - twin(values - step))) / 2e-6
         np.testing.assert_allclose(array.grad.numpy(), expected, rtol=1e-3, atol=1e-4)

@@ -9,8 +9,8 @@ from test_point_sample import make_scene
 
 import warpshadow as ws
 from warpshadow.pipeline import directional
-from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning import timing
 from warpshadow.tuning.timing import image_times, median_times, whole_image
 
@@ -30,14 +30,14 @@ def test_a_slow_first_call_does_not_count():
 
 def test_each_image_is_of_bodies_that_have_moved_by_nothing_to_speak_of(monkeypatch):
     scene = make_scene()
-    placed, geometries = Assembly.placed, []
+    placed, geometries = MergedScene.placed, []
 
-    def noted(assembly, poses=None, rest=None, **options):
-        geometry = placed(assembly, poses, rest, **options)
+    def noted(merged_scene, poses=None, rest=None, **options):
+        geometry = placed(merged_scene, poses, rest, **options)
         geometries.extend([geometry] * (poses is not None))  # or the bodies are where the scene has them
         return geometry
 
-    monkeypatch.setattr(Assembly, "placed", noted)
+    monkeypatch.setattr(MergedScene, "placed", noted)
     draw = whole_image(ws.Renderer(scene))
     images = [draw().numpy()[0].copy() for _ in range(3)]
     first, second, third = (geometry.positions.numpy() for geometry in geometries)
@@ -76,8 +76,8 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
         receivers = view.receivers.points.shape[1]
         clock.append(receivers * (1.0 if self.scene.visibility.method == "none" else 4.0))
 
-    monkeypatch.setattr(Renderer, "shade", shade)
-    monkeypatch.setattr(Renderer, "draw", lambda self, view: clock.append(1000.0))
+    monkeypatch.setattr(SceneRenderer, "shade", shade)
+    monkeypatch.setattr(SceneRenderer, "draw", lambda self, view: clock.append(1000.0))
     monkeypatch.setattr(
         timing, "median_times", lambda functions, runs, **_: [(function(), clock[-1])[1] for function in functions]
     )
@@ -85,8 +85,10 @@ def test_what_shadows_add_on_a_sample_is_extrapolated_to_all_receivers(monkeypat
 
 
 def test_bodies_shadows_on_themselves_are_timed(monkeypatch):
-    gather_own, bodies = directional.gather_own, []
-    monkeypatch.setattr(directional, "gather_own", lambda *given: bodies.append(1) or gather_own(*given))
+    gather_self_transmittance, bodies = directional.gather_self_transmittance, []
+    monkeypatch.setattr(
+        directional, "gather_self_transmittance", lambda *given: bodies.append(1) or gather_self_transmittance(*given)
+    )
     monkeypatch.setattr(
         timing, "median_times", lambda functions, runs, **_: [function() and 1.0 for function in functions]
     )

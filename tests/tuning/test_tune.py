@@ -11,6 +11,7 @@ from test_point_sample import make_scene
 
 import warpshadow as ws
 from warpshadow.scene import blockers
+from warpshadow.spheres.refine import Refinement
 from warpshadow.tuning import tune
 from warpshadow.tuning.point_sample import PointSample
 from warpshadow.tuning.tune import Trial, pareto_front, resolved
@@ -187,7 +188,8 @@ def test_a_fit_that_is_kept_is_known_to_be(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     mesh = ws.icosphere(1.0, 1)
     assert not ws.spheres.is_fitted(mesh, 2)
-    monkeypatch.setattr("warpshadow.spheres.fit.Refinement.run", lambda self, spheres, steps: [spheres])
+    run = Refinement.run
+    monkeypatch.setattr(Refinement, "run", lambda self, start, steps: run(self, start, 1))  # of many steps, the first
     ws.fit_spheres(mesh, 2)
     assert ws.spheres.is_fitted(mesh, 2)
     assert ws.spheres.is_fitted(mesh.transformed(scale=3.0), 2)
@@ -229,6 +231,29 @@ def test_the_table_has_a_line_for_each_trial_and_marks_the_front_and_the_choice(
     assert f"{found.error:.2%}" in lines[found.trials.index(found.chosen)]
 
 
+def test_it_says_of_which_image_times_are(instant):
+    scene = make_scene()
+    found = ws.tune(scene, error=0.2)
+    head, table = str(found).split(found.table())
+    camera = scene.camera
+    assert f"{camera.width} × {camera.height}, {scene.supersampling} × {scene.supersampling} samples a pixel" in head
+    assert "after all bodies have moved" in head and "extrapolated" in head
+    assert "> chosen" in table
+    assert "> nearest" in str(dataclasses.replace(found, is_reached=False))
+    bounced = [trial._replace(scene=dataclasses.replace(scene, bounces=1)) for trial in found.trials]
+    assert "extrapolated" not in str(dataclasses.replace(found, trials=bounced))
+
+
+@pytest.mark.parametrize(("load", "is_busy"), [(1.9, False), (3.2, True)])
+def test_it_says_that_the_machine_is_busy(instant, monkeypatch, recwarn, load, is_busy):
+    monkeypatch.setattr(tune.os, "getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr(tune.os, "cpu_count", lambda: 2)
+    ws.tune(make_scene(), error=0.2)
+    said = [str(each.message) for each in recwarn if "busy" in str(each.message)]
+    assert len(said) == is_busy
+    assert all("load average 3.2 on 2 cores" in each for each in said)
+
+
 # ---------------------------------------------------------------------------------------------- "auto"
 
 
@@ -249,9 +274,14 @@ def test_auto_becomes_the_first_setting_that_reaches_the_error():
     assert resolved(auto(scene, 1.01 * errors[2])).visibility.directions == 64
 
 
-def test_another_method_stays_as_it_is():
-    scene = make_scene()
+@pytest.mark.parametrize("method", ["directional", "none", "ray-traced"])
+def test_another_method_stays_as_it_is(method):
+    scene = dataclasses.replace(make_scene(), visibility=ws.Visibility(method))
     assert resolved(scene) is scene
+
+
+def test_where_none_is_named_it_is_that_of_renderers_that_are_kept():
+    assert resolved(make_scene()).visibility.method == "directional"
 
 
 def test_the_choice_is_made_once_for_a_scene(monkeypatch):

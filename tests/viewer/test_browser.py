@@ -12,7 +12,7 @@ pytest.importorskip("viser", reason="viser is not installed")
 pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install playwright")
 chromium()
 
-from warpshadow.viewer.site import Site  # noqa: E402
+from warpshadow.viewer.app import ViewerApp  # noqa: E402
 
 WIDTH, HEIGHT = 900, 600
 PANEL = 560  # column where the panel begins
@@ -43,7 +43,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def site():
-    site = Site(scene(), host="127.0.0.1", port=0)
+    site = ViewerApp(scene(), host="127.0.0.1", port=0)
     yield site
     site.close()
 
@@ -106,10 +106,10 @@ def test_turning_the_light_moves_the_shadow_and_not_the_bunny(site, page):
     before = settled(page)
     enter(page, "Turn [°]", 180)
     end = time.monotonic() + PATIENCE
-    while site.loop.look.turn != 180 and time.monotonic() < end:
+    while site.loop.viewer_state.turn != 180 and time.monotonic() < end:
         page.wait_for_timeout(100)
     after = settled(page)
-    assert site.loop.look.turn == 180
+    assert site.loop.viewer_state.turn == 180
     assert center(shadow(before))[1] - center(red(before))[1] > 30  # the sun is on the left
     assert center(shadow(after))[1] - center(red(after))[1] < -30
     assert np.abs(center(red(after)) - center(red(before))).max() < 25  # its dark side is less red
@@ -136,5 +136,5 @@ def test_dragging_moves_the_body(site, page):
     page.mouse.up()
     site._panel._drag(None)
     after = settled(page)
-    assert site.loop.look.poses[0].translation[0] < -0.2
+    assert site.loop.viewer_state.poses[0].translation[0] < -0.2
     assert center(red(after))[1] < center(red(before))[1] - 40

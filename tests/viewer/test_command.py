@@ -67,7 +67,7 @@ def test_a_mistake_is_one_line(scene, tmp_path):
 
 
 def test_without_viser_it_says_what_to_install(scene, monkeypatch):
-    monkeypatch.setitem(sys.modules, "warpshadow.viewer.site", None)
+    monkeypatch.setitem(sys.modules, "warpshadow.viewer.app", None)
     message = r'the viewer needs the package viser: pip install "warpshadow\[viewer\]" \(.*viewer'
     with pytest.raises(ImportError, match=message):
         ws.view(ws.load_scene(scene))

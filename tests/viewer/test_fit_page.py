@@ -44,7 +44,7 @@ def viewer():
 
 @pytest.fixture
 def page(viewer):
-    page = look(viewer)
+    page = viewer_state(viewer)
     yield page
     page.close()
 
@@ -60,7 +60,7 @@ def problem():
 STAGES = inverse.Stage(8, learning_rate=1e-3, scale=0.5, candidates=2), inverse.Stage(8, learning_rate=1e-3)
 
 
-def look(viewer):
+def viewer_state(viewer):
     """A page that looks: until it says from where, it is none to the server."""
     page = WirePage(viewer.url)
     page.look_from()
@@ -191,7 +191,7 @@ def test_what_is_stopped_has_the_best_values_so_far(viewer, page):
 
 def test_a_closed_page_stops_nothing(viewer, page, waiting):
     page.close()
-    other = look(viewer)
+    other = viewer_state(viewer)
     press(other, "Go on")  # what the new page was told
     other.until(lambda message: "stage 2 of 2" in str(message))
     other.close()

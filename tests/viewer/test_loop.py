@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.viewer.look import Look
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import Frame
+from warpshadow.viewer.state import ViewerState
 
 REST = 0.05
 PATIENCE = 10.0  # seconds: a busy machine is slow, and what comes, comes at once
 
 
-def look():
+def viewer_state():
     body = ws.Body(ws.icosphere(subdivisions=1), blockers=1)
-    return Look.of(ws.Scene([body], ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 0, 5), (0, 0, 0))))
+    return ViewerState.of(ws.Scene([body], ws.EnvironmentMap.constant(1.0), ws.Camera.look_at((0, 0, 5), (0, 0, 0))))
 
 
 def camera(x=0.0):
@@ -65,10 +65,10 @@ class FakePainter:
         self.error = None
         self.at_once = 0
 
-    def __call__(self, look, page, quality, *, depth):
+    def __call__(self, viewer_state, page, quality, *, depth):
         self.at_once += 1
         assert self.at_once == 1, "two threads paint at once"
-        self.asked.append((look, page, quality, depth))
+        self.asked.append((viewer_state, page, quality, depth))
         self.begun.release()
         assert self.may_paint.wait(PATIENCE)
         self.at_once -= 1
@@ -84,7 +84,7 @@ def painter():
 
 @pytest.fixture
 def loop(painter):
-    loop = Loop(painter, look(), rest=REST)
+    loop = Loop(painter, viewer_state(), rest=REST)
     yield loop
     painter.may_paint.set()
     loop.close()
@@ -171,11 +171,11 @@ def test_an_error_is_shown_and_the_next_request_is_painted(loop, painter):
 
 
 def test_a_look_that_is_refused_changes_nothing(loop):
-    before = loop.look
+    before = loop.viewer_state
     for changes in ({"turn": float("nan")}, {"directions": 1 << 20}, {"method": "magic"}, {"scale": float("inf")}):
         with pytest.raises(ValueError, match=f"{next(iter(changes))}: got .*, expected"):
             loop.change(**changes)
-    assert loop.look is before
+    assert loop.viewer_state is before
 
 
 def test_a_page_that_left_is_sent_nothing(loop, painter):
@@ -238,11 +238,11 @@ def test_two_changes_at_once_both_count(loop):
     def nudge():
         barrier.wait()
         for _ in range(20):
-            loop.update(lambda look: dataclasses.replace(look, turn=look.turn + 1))
+            loop.update(lambda viewer_state: dataclasses.replace(viewer_state, turn=viewer_state.turn + 1))
 
     threads = [threading.Thread(target=nudge) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert loop.look.turn == 160
+    assert loop.viewer_state.turn == 160

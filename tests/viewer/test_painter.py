@@ -7,7 +7,6 @@ import pytest
 
 import warpshadow as ws
 from warpshadow.scene.scene import Visibility
-from warpshadow.viewer.look import ERROR, Look, Pose
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import (
     Painter,
@@ -20,6 +19,7 @@ from warpshadow.viewer.painter import (
     relative_error,
 )
 from warpshadow.viewer.quality import Quality
+from warpshadow.viewer.state import ERROR, BodyPose, ViewerState
 
 # float32 sums in another order, and a camera that went through a quaternion
 SAME_IMAGE = 2e-4
@@ -62,37 +62,37 @@ def difference(image, other):
 
 def test_a_picture_of_the_scene_as_it_is_is_that_of_the_renderer(scene, painter):
     page = own_page(scene, painter.page_scale)
-    assert difference(painter.image(Look.of(scene), page, FULL), ws.render(scene)) < SAME_IMAGE
+    assert difference(painter.image(ViewerState.of(scene), page, FULL), ws.render(scene)) < SAME_IMAGE
 
 
 def test_a_picture_of_what_was_changed_is_that_of_the_scene_so_changed(scene, painter):
-    look = dataclasses.replace(
-        Look.of(scene),
+    viewer_state = dataclasses.replace(
+        ViewerState.of(scene),
         turn=50.0,
         scale=0.5,
         directions=128,
         softness=0.6,
-        poses=(Pose((0, 30, 0), (0.5, 1.2, 0.2)), Pose((0, 0, 0), (0, 0, 0))),
+        poses=(BodyPose((0, 30, 0), (0.5, 1.2, 0.2)), BodyPose((0, 0, 0), (0, 0, 0))),
     )
     page = own_page(scene, painter.page_scale)
-    shown = look.scene(scene)
-    image = painter.image(look, page, FULL)
+    shown = viewer_state.scene(scene)
+    image = painter.image(viewer_state, page, FULL)
     assert difference(image, ws.render(shown)) < SAME_IMAGE
     assert difference(image, ws.render(scene)) > 0.1  # which is another picture
 
 
 def test_pages_of_other_sizes_share_a_renderer_and_see_what_one_of_their_own_would(scene, painter):
-    look = Look.of(scene)
+    viewer_state = ViewerState.of(scene)
     for size in ((64, 48), (40, 60), (64, 48)):
         page = dataclasses.replace(own_page(scene, painter.page_scale), width=size[0], height=size[1])
         camera = page.camera(size, page_scale=painter.page_scale, near=scene.camera.near)
         truth = ws.render(dataclasses.replace(scene, camera=camera))
-        assert difference(painter.image(look, page, FULL), truth) < SAME_IMAGE
+        assert difference(painter.image(viewer_state, page, FULL), truth) < SAME_IMAGE
 
 
 def test_a_moving_picture_costs_less_and_is_about_the_same(scene, painter):
     page = own_page(scene, painter.page_scale)
-    quick, full = (painter.paint(Look.of(scene), page, quality) for quality in (QUICK, FULL))
+    quick, full = (painter.paint(ViewerState.of(scene), page, quality) for quality in (QUICK, FULL))
     assert quick.cells == "32 directions" and full.cells == "64 directions"
     assert quick.rgb.size < full.rgb.size and full.rgb.shape == (48, 64, 3)
     assert abs(quick.rgb.mean() - full.rgb.mean()) < 0.05 * full.rgb.mean()
@@ -100,7 +100,7 @@ def test_a_moving_picture_costs_less_and_is_about_the_same(scene, painter):
 
 def test_distances_are_those_of_rays(scene, painter):
     page = own_page(scene, painter.page_scale)
-    frame = painter.paint(Look.of(scene), page, FULL, depth=True)
+    frame = painter.paint(ViewerState.of(scene), page, FULL, depth=True)
     camera = scene.camera
     eye, rays = camera.rays()
     along = rays @ camera.rotation[2]
@@ -116,23 +116,23 @@ def test_distances_are_those_of_rays(scene, painter):
     assert (np.isfinite(truth) == (frame.depth < 100)).mean() > 0.97  # but for pixels at edges
     error = np.abs(frame.depth - truth)[inside] / truth[inside]
     assert np.median(error) < 0.01  # the ball's faces are flat, and samples lie beside the middle
-    assert painter.paint(Look.of(scene), page, FULL).depth is None
+    assert painter.paint(ViewerState.of(scene), page, FULL).depth is None
 
 
 def test_distances_are_in_order_even_where_nothing_is(scene, painter):
     page = PageCamera((1, 0, 0, 0), (0, 0, 100), 40.0, 32, 24)  # looks away
-    frame = painter.paint(Look.of(scene), page, FULL, depth=True)
+    frame = painter.paint(ViewerState.of(scene), page, FULL, depth=True)
     assert (frame.depth == 160).all() and len(np.unique(frame.rgb)) == 1
 
 
 def test_error_against_rays_is_told_at_rest_alone(scene, painter):
-    look, page = dataclasses.replace(Look.of(scene), shows=ERROR), own_page(scene, painter.page_scale)
-    assert painter.paint(look, page, QUICK).error is None
-    told = painter.paint(look, page, FULL)
+    viewer_state, page = dataclasses.replace(ViewerState.of(scene), shows=ERROR), own_page(scene, painter.page_scale)
+    assert painter.paint(viewer_state, page, QUICK).error is None
+    told = painter.paint(viewer_state, page, FULL)
     rays = ws.render(dataclasses.replace(scene, visibility=Visibility("ray-traced", samples=4096)))
     truth = relative_error(ws.render(scene), rays)
     assert told.error == pytest.approx(truth, abs=0.02) and 0.005 < truth < 0.2  # 256 rays are noisy
-    shadowless = painter.paint(dataclasses.replace(look, method="none"), page, FULL)
+    shadowless = painter.paint(dataclasses.replace(viewer_state, method="none"), page, FULL)
     assert shadowless.error > 2 * told.error
 
 
@@ -165,12 +165,12 @@ def test_coarse_light_has_the_same_integral():
 
 
 def test_light_is_behind_the_bodies_as_the_scene_has_it(scene, painter):
-    look = dataclasses.replace(Look.of(scene), shows_light=True, turn=90.0)
+    viewer_state = dataclasses.replace(ViewerState.of(scene), shows_light=True, turn=90.0)
     page = dataclasses.replace(own_page(scene, painter.page_scale), position=(0, 0.5, 4), wxyz=(0, 1, 0, 0))  # level
     camera = page.camera((64, 48), page_scale=painter.page_scale, near=scene.camera.near)
-    turned = dataclasses.replace(look.scene(scene), camera=camera, supersampling=1)
+    turned = dataclasses.replace(viewer_state.scene(scene), camera=camera, supersampling=1)
     expected = ws.Picture(ws.render(turned), exposure=0.0, background=turned.background()).pixels.astype(int)
-    got = painter.paint(look, page, dataclasses.replace(FULL, supersampling=1)).rgb
+    got = painter.paint(viewer_state, page, dataclasses.replace(FULL, supersampling=1)).rgb
     assert np.abs(got - expected).max() <= 2 and len(np.unique(got[:5])) > 3  # codes
 
 
@@ -180,8 +180,8 @@ def test_a_light_in_harmonics_and_a_scene_of_one_point_are_painted():
     body = ws.Body(ws.icosphere(subdivisions=1), blockers=0, scale=1e-3)
     scene = ws.Scene([body], light, ws.Camera.look_at((0, 0, 5e-3), (0, 0, 0), size=(32, 32), near=1e-5))
     painter = Painter(scene)
-    look = dataclasses.replace(Look.of(scene, painter.natural_stops()), turn=30.0, shows_light=True)
-    frame = painter.paint(look, own_page(scene, painter.page_scale), FULL, depth=True)
+    viewer_state = dataclasses.replace(ViewerState.of(scene, painter.natural_stops()), turn=30.0, shows_light=True)
+    frame = painter.paint(viewer_state, own_page(scene, painter.page_scale), FULL, depth=True)
     assert frame.rgb[16, 16].min() > 200 and frame.depth.min() < 20
 
 
@@ -191,6 +191,6 @@ def test_distances_of_a_view_without_supersampling(scene):
 
 
 def test_spheres_are_those_of_the_bodies(scene, painter):
-    (centers, radii), (_, none) = painter.spheres(Look.of(scene))
+    (centers, radii), (_, none) = painter.spheres(ViewerState.of(scene))
     np.testing.assert_allclose(centers, [[0, 0, 0]])
     assert radii.tolist() == [1.0] and len(none) == 0

@@ -1,29 +1,29 @@
 """How good an image is made follows from what images took."""
 
-from warpshadow.viewer.quality import FEWEST, FULL, LONGEST, MOST, SECONDS, Pace
+from warpshadow.viewer.quality import FEWEST, FULL, LONGEST, MOST, SECONDS, FrameRate
 
 
 def test_a_slow_motion_gets_fewer_pixels_down_to_a_least_and_a_quick_one_more_up_to_a_most():
-    pace = Pace()
-    first = pace.moving().pixels
-    pace.took(SECONDS)
-    assert pace.moving().pixels == first
-    pace.took(2 * SECONDS)
-    assert pace.moving().pixels == first // 2
+    frame_rate = FrameRate()
+    first = frame_rate.moving().pixels
+    frame_rate.took(SECONDS)
+    assert frame_rate.moving().pixels == first
+    frame_rate.took(2 * SECONDS)
+    assert frame_rate.moving().pixels == first // 2
     for _ in range(20):
-        pace.took(10.0)
-    assert pace.moving().pixels == FEWEST
+        frame_rate.took(10.0)
+    assert frame_rate.moving().pixels == FEWEST
     for _ in range(20):
-        pace.took(0.0)
-    assert pace.moving().pixels == MOST
+        frame_rate.took(0.0)
+    assert frame_rate.moving().pixels == MOST
 
 
 def chain(seconds_a_pixel, canvas):
     """Pixels of the images of a page at rest, and what each takes."""
-    pace = Pace()
-    quality, seconds = pace.moving(), 0.0
+    frame_rate = FrameRate()
+    quality, seconds = frame_rate.moving(), 0.0
     pixels, times = [], []
-    while (quality := pace.better(quality, seconds, canvas)) is not None:
+    while (quality := frame_rate.better(quality, seconds, canvas)) is not None:
         seconds = seconds_a_pixel * quality.pixels
         pixels.append(quality.pixels)
         times.append(seconds)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.viewer.look import Look, Pose
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import own_page
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
+from warpshadow.viewer.state import BodyPose, ViewerState
 
 ROUNDING = 1e-6  # of float32 maps that were turned in one step or in two; whole pixels here
 
@@ -56,19 +56,19 @@ def path(tmp_path):
 
 def changed(scene):
     return dataclasses.replace(
-        Look.of(scene),
+        ViewerState.of(scene),
         turn=45.0,
         scale=0.5,
         directions=64,
         softness=0.5,
         receivers="pixel",
         bounces=2,
-        poses=(Pose((0, 30, 0), (0.1, 1.0, 0)), Pose((0, 0, 0), (0, 0, 0))),
+        poses=(BodyPose((0, 30, 0), (0.1, 1.0, 0)), BodyPose((0, 0, 0), (0, 0, 0))),
     )
 
 
 def assert_same(read, shown):
-    assert vars(read.visibility) == vars(shown.visibility)
+    assert vars(read.visibility.with_method()) == vars(shown.visibility.with_method())
     assert (read.bounces, read.supersampling) == (shown.bounces, shown.supersampling)
     np.testing.assert_allclose(read.light.radiance, shown.light.radiance, atol=ROUNDING)
     np.testing.assert_allclose(read.camera.clip_matrix(), shown.camera.clip_matrix(), atol=ROUNDING)
@@ -81,16 +81,16 @@ def assert_same(read, shown):
 
 def test_a_scene_file_comes_back_with_what_was_changed(path, tmp_path):
     scene = ws.load_scene(path)
-    look, page = changed(scene), own_page(scene, 2.0)
+    viewer_state, page = changed(scene), own_page(scene, 2.0)
     camera = saved_camera(scene, page, 2.0)
-    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, camera))
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, viewer_state, camera))
     assert 'envmap = "sky.exr"' in (tmp_path / "saved.toml").read_text()
-    assert_same(ws.load_scene(tmp_path / "saved.toml"), dataclasses.replace(look.scene(scene), camera=camera))
+    assert_same(ws.load_scene(tmp_path / "saved.toml"), dataclasses.replace(viewer_state.scene(scene), camera=camera))
 
 
 def test_a_scene_file_of_a_look_that_changes_nothing_is_the_same_scene(path, tmp_path):
     scene = ws.load_scene(path)
-    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, Look.of(scene), scene.camera))
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, ViewerState.of(scene), scene.camera))
     assert_same(ws.load_scene(tmp_path / "saved.toml"), scene)
 
 
@@ -98,28 +98,28 @@ def test_a_body_that_stood_and_a_camera_that_framed_are_where_they_were_moved_to
     standing = FILE.replace('name = "ball"', "translation = [1.0, 0.0, 0.0]\non_ground = {size = 3.0}")
     path.write_text(standing.replace("eye = [0.0, 2.0, 5.0]\ntarget = [0.0, 0.5, 0.0]", 'framing = "auto"'))
     scene = ws.load_scene(path)
-    start = Look.of(scene)
-    moved = dataclasses.replace(start, poses=(Pose((0, 30, 0), (0.1, 1.0, 0)), start.poses[1]))
-    for look in (start, moved):
-        (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, scene.camera))
+    start = ViewerState.of(scene)
+    moved = dataclasses.replace(start, poses=(BodyPose((0, 30, 0), (0.1, 1.0, 0)), start.poses[1]))
+    for viewer_state in (start, moved):
+        (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, viewer_state, scene.camera))
         read = ws.load_scene(tmp_path / "saved.toml")
-        assert_same(read, look.scene(scene))
+        assert_same(read, viewer_state.scene(scene))
         assert read.bodies[0].scale == pytest.approx(1.5)
 
 
 def test_other_numbers_of_spheres_take_the_place_of_given_ones(path, tmp_path):
     scene = ws.load_scene(path)
-    look = dataclasses.replace(Look.of(scene), spheres=32)
-    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, look, scene.camera))
+    viewer_state = dataclasses.replace(ViewerState.of(scene), spheres=32)
+    (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, viewer_state, scene.camera))
     assert [body.blockers for body in ws.load_scene(tmp_path / "saved.toml").bodies] == [32, 0]
 
 
 def test_an_archive_has_the_scene_and_all_that_it_names(path, tmp_path):
     scene = ws.load_scene(path)
-    look = changed(scene)
-    archive = zipfile.ZipFile(io.BytesIO(as_archive(scene, look, scene.camera)))
+    viewer_state = changed(scene)
+    archive = zipfile.ZipFile(io.BytesIO(as_archive(scene, viewer_state, scene.camera)))
     archive.extractall(tmp_path / "home")
-    assert_same(ws.load_scene(tmp_path / "home" / "scene.toml"), look.scene(scene))
+    assert_same(ws.load_scene(tmp_path / "home" / "scene.toml"), viewer_state.scene(scene))
 
 
 def test_a_saved_camera_is_as_high_as_the_scenes_and_as_wide_as_the_page(path):

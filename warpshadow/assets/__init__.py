@@ -1,1 +1,1 @@
-"""What a scene is made of: meshes, images, environment maps, cameras."""
+"""The assets of a scene: meshes, images, environment maps, cameras."""

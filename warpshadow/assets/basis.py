@@ -1,4 +1,4 @@
-"""What light is expressed in: spherical harmonics or cells of directions. Transfer vectors belong to one of them."""
+"""Bases of light: spherical harmonics, or cells of directions. Transfer vectors belong to one of them."""
 
 from dataclasses import dataclass
 
@@ -6,14 +6,25 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
+from warpshadow.assets.cells import spread_in_cells
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci
 
+_ROWS = 64  # of maps of harmonics: the last of eight bands loses 0.5% to the size of a pixel
+
 
 @dataclass(frozen=True)
 class HarmonicBasis:
-    """Real spherical harmonics of an order; the coefficients [order², 3] are those of the light's projection."""
+    """Real spherical harmonics of an order; the coefficients [order², 3] are the light's projection.
+
+    Coefficients are linear RGB, at index l² + l + m for band l and degree m, −l to l: orthonormal functions without the
+    Condon–Shortley phase, in the scene's axes, so that the first three after the constant one point along +y, +z, +x.
+    Light of radiance 1 from everywhere has √(4π) in the first and 0 in the others.
+
+    Args:
+        order: Number of bands n, 2 to 8.
+    """
 
     order: int
 
@@ -39,10 +50,32 @@ class HarmonicBasis:
         coefficients[:count] = light[:count]
         return coefficients
 
+    def to_map(self, coefficients: npt.ArrayLike) -> EnvironmentMap:
+        """Make a map of light in the basis, for functions that take maps alone: files, ``rotated``, the viewer, other
+        renderers.
+
+        Negative radiance becomes 0, as no map holds it, so light that rings is brighter as a map. A Scene and
+        ``ws.render`` also take the coefficients themselves, exactly. Where nothing is negative,
+        ``basis.coefficients(basis.to_map(c))`` is c to 0.5%.
+
+        Args:
+            coefficients: Linear RGB, shape [order², 3].
+        """
+        light = _checked_coefficients(self, coefficients)
+        return EnvironmentMap(np.maximum(sh.reconstruct_map(light, _ROWS), 0))
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class CellBasis:
-    """Cells around directions [direction, 3], one for those nearest to it; the coefficients are their mean radiance."""
+    """Cells of directions, each with the directions nearest to it; the coefficients are mean radiances.
+
+    Coefficients are linear RGB, in the order of the directions: light of radiance 1 from everywhere has 1 in each.
+    All cells count as equally large, 4π/Q, which Fibonacci directions nearly are.
+
+    Args:
+        directions: Unit vectors towards the light in the scene's axes, shape [direction, 3]; ``warpshadow.fibonacci``
+            makes them.
+    """
 
     directions: np.ndarray
 
@@ -73,6 +106,18 @@ class CellBasis:
         order = sh.order_of("light", light)
         return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
 
+    def to_map(self, coefficients: npt.ArrayLike) -> EnvironmentMap:
+        """Make a map of light in the basis, by which a Scene is lit, files are written, and other renderers, too.
+
+        Each cell is evenly bright and keeps its energy: ``basis.coefficients(basis.to_map(c))`` is c to rounding.
+        Negative radiance becomes 0, as no map holds it.
+
+        Args:
+            coefficients: Linear RGB, shape [direction, 3].
+        """
+        light = _checked_coefficients(self, coefficients)
+        return EnvironmentMap(np.maximum(spread_in_cells(light, self.directions), 0))
+
 
 Basis = HarmonicBasis | CellBasis
 
@@ -89,13 +134,22 @@ def check_basis(basis: object) -> None:
 
 
 def describe_coefficients(basis: Basis, count: int) -> str:
-    """What coefficients in a basis are, for messages to those who gave ``count`` of them."""
+    """Describe the coefficients of a basis, for messages to callers who gave ``count`` of them."""
     what = f"HarmonicBasis({basis.order})" if isinstance(basis, HarmonicBasis) else f"cells of {basis.size} directions"
     order = int(round(np.sqrt(count)))
     others = [f"HarmonicBasis({order})"] if order in sh.ORDERS and order**2 == count else []
     others += [f"CellBasis(warpshadow.fibonacci({count}))"] if count and not count % CHUNK else []
     remedy = f"; for {count} make the renderer with basis={' or '.join(others)}" if others else ""
     return f"coefficients in renderer.basis, {what}{remedy}"
+
+
+def _checked_coefficients(basis: Basis, coefficients: npt.ArrayLike) -> np.ndarray:
+    """Coefficients in a basis as float64 [coefficient, 3]; ValueError for others."""
+    expected = f"linear RGB in this basis [{basis.size}, 3]"
+    light = check.numbers("coefficients", coefficients, expected=expected, dtype=np.float64)
+    check.shape("coefficients", light.shape, (basis.size, 3))
+    check.finite("coefficients", light)
+    return light
 
 
 def conversion(basis: Basis, other: Basis) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""What takes long to find is kept on disk, by a hash of all that it depends on."""
+"""The cache on disk: results that take long to compute, finished or interrupted, by a hash of all their inputs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ KINDS: Mapping[Kind, str] = {
     "own_shadows": "shadows of bodies on themselves",
     "form_factors": "form factors of bounces within bodies",
 }
-"""What is kept, by the folder that it is in."""
+"""Kinds of cached results, by folder."""
 
 
-_OWN_NAME = re.compile(r"[0-9a-f]{32,}\.npz|\.[0-9a-f]{12}\.unfinished\.npz")
-"""Names of what is kept, and of what a killed process left: nothing else in the folders is ours."""
+_OWN_NAME = re.compile(r"[0-9a-f]{32,}(\.part)?\.npz|\.[0-9a-f]{12}\.unfinished\.npz")
+"""Names of cached files, and of partial files from killed processes: nothing else in the folders is ours."""
 
 
 def cache_folder() -> Path:
@@ -43,15 +43,63 @@ def cache_path(kind: Kind, key: str) -> Path:
 
 
 def cached_files(kind: Kind) -> list[Path]:
-    """What is kept of a kind, and what a killed process left half written."""
-    found = (cache_folder() / kind).glob("*.npz")
-    return sorted(path for path in found if _OWN_NAME.fullmatch(path.name) and path.is_file())
+    """List the cached files of a kind, and the partial files that a killed process left."""
+    result = (cache_folder() / kind).glob("*.npz")
+    return sorted(path for path in result if _OWN_NAME.fullmatch(path.name) and path.is_file())
 
 
-def remembered(
+class Unfinished:
+    """How far the work on something is that is to be cached; an interrupt leaves it for the next call.
+
+    Attributes:
+        before: Arrays that an interrupted call left; none where the work begins.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path.with_suffix(".part.npz")
+        self._arrays: Callable[[], Mapping[str, np.ndarray]] | None = None
+        self._done = ""
+        self.before: dict[str, np.ndarray] = {}
+        # ignore a damaged file, whatever error it raises
+        with contextlib.suppress(Exception), self._path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            self.before = dict(stored)
+
+    def keep(self, arrays: Callable[[], Mapping[str, np.ndarray]], done: str) -> None:
+        """Note how far the work is.
+
+        Args:
+            arrays: Makes the arrays from which a later call goes on to the same bits; called at an interrupt.
+            done: How far it is, for people, such as "2,048 of 10,327 points".
+        """
+        self._arrays, self._done = arrays, done
+
+    def write(self, what: str) -> str:
+        """Write the last partial result; return a line that says so, or nothing if there is none."""
+        if self._arrays is None:
+            return ""
+        try:
+            _write(self._path, self._arrays())
+        except OSError as problem:
+            check.warn(f"the unfinished {what} could not be cached in {self._path.parent} ({problem})")
+            return ""
+        return f"{self._done} of the {what} are kept, and the next call goes on from there"
+
+    def remove(self) -> None:
+        """Remove the partial result of an interrupted call, since the work is done."""
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+
+def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with files.whole(path) as unfinished:
+        np.savez(unfinished, allow_pickle=False, **arrays)
+
+
+def load_or_compute(
     path: Path,
     read: Callable[[Mapping[str, np.ndarray]], Item],
-    make: Callable[[], Item],
+    make: Callable[[Unfinished], Item],
     arrays: Callable[[Item], Mapping[str, np.ndarray]],
     *,
     what: str,
@@ -61,9 +109,12 @@ def remembered(
     Args:
         path: From :func:`cache_path`.
         read: Makes it of the arrays in the file.
-        make: Makes it anew.
+        make: Makes it anew, from where an interrupt left it.
         arrays: The arrays that are kept of it.
-        what: What it is, for warnings, such as "fit".
+        what: Noun for warnings, such as "fit".
+
+    Raises:
+        KeyboardInterrupt: at an interrupt; it says how much is kept.
     """
     with contextlib.ExitStack() as held:
         if not path.exists():
@@ -74,13 +125,18 @@ def remembered(
             try:
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                     return read(stored)
-            except Exception as problem:  # whatever a damaged file raises: it can always be made again
+            except Exception as problem:  # any error of a damaged file: the result can be computed again
                 check.warn(f"cached {what} {path} cannot be read ({problem}); it is made again")
-        made = make()
+        unfinished = Unfinished(path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with files.whole(path) as unfinished:
-                np.savez(unfinished, allow_pickle=False, **arrays(made))
+            made = make(unfinished)
+        except (KeyboardInterrupt, SystemExit) as interrupt:
+            if (note := unfinished.write(what)) and isinstance(interrupt, KeyboardInterrupt):
+                interrupt.args = (note,)
+            raise
+        try:
+            _write(path, arrays(made))
+            unfinished.remove()
         except OSError as problem:
             check.warn(f"the {what} could not be cached in {path.parent} ({problem})")
     return made

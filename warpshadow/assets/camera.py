@@ -21,6 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
+from warpshadow.assets import camera_conventions
+from warpshadow.assets.camera_conventions import Y_DOWN
 from warpshadow.maths.plane import is_flat
 
 # Rotations read from a file are often rounded to six digits.
@@ -32,19 +34,19 @@ _NARROW = 1.6
 # Part of the image that stays free in turntables for which a camera has to go back.
 _AROUND = 0.05
 
-# Near plane of a framing camera, as a part of the depth of what is nearest.
+# Near plane of a framing camera, as a fraction of the distance to the nearest point.
 _NEAR = 0.01
 
 
 class Placed(Protocol):
-    """What has a place in the world: a :class:`Mesh` as it is, a Body where it stands."""
+    """An object placed in the world: a :class:`Mesh` as it is, or a Body in its pose."""
 
     def world_points(self) -> np.ndarray:
         """Points that cover it [scene units], shape [point, 3]."""
 
 
 class HasBodies(Protocol):
-    """What holds bodies: a Scene."""
+    """A container of bodies: a Scene."""
 
     @property
     def bodies(self) -> Iterable[Placed]:
@@ -53,7 +55,13 @@ class HasBodies(Protocol):
 
 @dataclass(frozen=True, eq=False, init=False)
 class Camera:
-    """A pinhole camera (conventions: see the module).
+    """A pinhole camera, of any focal lengths, skew and principal point.
+
+    ``K (R p + t)`` are the pixel coordinates of a world point p, times its depth: x is right, y down, z forward. The
+    center of the top left pixel is at (0.5, 0.5), and (0, 0) is its corner. Intrinsics of OpenCV, ROS and RealSense,
+    in which pixel centers are at whole numbers, differ from these by half a pixel: :meth:`from_opencv` adds it. There
+    are :meth:`from_opengl`, :meth:`from_pytorch3d` and :meth:`from_colmap`, too, and :func:`warpshadow.load_cameras`
+    reads the cameras of NeRF's ``transforms.json`` and of COLMAP. (Clip space: see the module.)
 
     Args:
         intrinsics: K [pixels], shape [3, 3], last row (0, 0, 1).
@@ -61,7 +69,7 @@ class Camera:
         translation: t [scene units], world to camera, shape [3].
         width: Image width [pixels].
         height: Image height [pixels].
-        near: Distance of the near plane along z [scene units]; what is nearer is not drawn.
+        near: Distance of the near plane along z [scene units]; nearer surfaces are not drawn.
     """
 
     intrinsics: np.ndarray
@@ -153,12 +161,14 @@ class Camera:
 
         Args:
             shown: A mesh, a body, several, or a scene. Flat ones, grounds and walls, count where all are flat.
-            direction: From what is shown to the camera, shape [3], any length; the default looks down from the front.
+            direction: From the framed bodies to the camera, shape [3], any length; the default looks down from the
+                front.
             up: Direction that points up in the image, shape [3], any length.
             fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
             size: Width and height [pixels].
-            margin: Part of the image that stays free around what is shown, 0 or more and below 1; shadows want some.
-            near: Distance of the near plane [scene units]; by default 1% of the way to what is shown.
+            margin: Fraction of the image that stays free around the framed bodies, 0 or more and below 1; leave some
+                for shadows.
+            near: Distance of the near plane [scene units]; by default 1% of the distance to the framed bodies.
 
         Raises:
             ValueError: when up is parallel to the direction, or all that is shown is one point.
@@ -182,13 +192,95 @@ class Camera:
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         x, z = (points - middle) @ rotation[:2].T, (points - middle) @ rotation[2]
         tangents = (1.0 - margin) * np.array([width, height]) / (2.0 * intrinsics[0, 0])
-        least, most = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
-        depth = ((most - least) / (2.0 * tangents)).min()
+        minimum, maximum = (x - z[:, None] * tangents).max(axis=0), (x + z[:, None] * tangents).min(axis=0)
+        depth = ((maximum - minimum) / (2.0 * tangents)).min()
         if not depth < z.min() - 1e-9 * np.ptp(points, axis=0).max():
             raise ValueError(f"shown: got what is a point or a line along {away.tolist()}, expected a surface")
-        eye = np.array([*(least + most) / 2, depth])
+        eye = np.array([*(minimum + maximum) / 2, depth])
         near = _NEAR * (z.min() - depth) if near is None else near
         return cls(intrinsics, rotation, -eye - rotation @ middle, width, height, near)
+
+    @classmethod
+    def from_opencv(
+        cls,
+        rvec: npt.ArrayLike,
+        tvec: npt.ArrayLike,
+        K: npt.ArrayLike | object,
+        size: tuple[int, int] | None = None,
+        distortion: npt.ArrayLike | None = None,
+        *,
+        near: float = 0.01,
+    ) -> Camera:
+        """Convert a calibrated camera of OpenCV, ROS or RealSense; K changes by half a pixel, see :class:`Camera`.
+
+        Args:
+            rvec: World to camera, as of ``cv2.solvePnP``: axis-angle vector [radians], [3], [3, 1] or [1, 3], or the
+                rotation matrix, [3, 3].
+            tvec: World to camera [scene units], [3], [3, 1] or [1, 3].
+            K: OpenCV's camera matrix [pixels], [3, 3], with pixel centers at whole numbers; or a ROS ``CameraInfo`` or
+                RealSense ``intrinsics``, which have the size and the distortion, too. (Of ROS's rectified images the
+                camera matrix is ``np.reshape(info.p, (3, 4))[:, :3]``.)
+            size: Width and height [pixels].
+            distortion: Coefficients of the lens; None or zeros, since ``cv2.undistort`` makes images without.
+            near: Distance of the near plane [scene units].
+        """
+        result, (width, height) = camera_conventions.from_opencv(rvec, tvec, K, size, distortion)
+        return cls(*result, width, height, near)
+
+    @classmethod
+    def from_pytorch3d(
+        cls,
+        R: npt.ArrayLike,
+        T: npt.ArrayLike,
+        focal_length: npt.ArrayLike | None = None,
+        principal_point: npt.ArrayLike | None = None,
+        *,
+        fov: float | None = None,
+        size: tuple[int, int] = (256, 256),
+        in_ndc: bool = True,
+        near: float = 0.01,
+    ) -> Camera:
+        """Convert a perspective camera of PyTorch3D (x left, y up, z forward; row vectors, ``p @ R + T``).
+
+        Args:
+            R: World to camera, [3, 3] or [1, 3, 3], as of ``look_at_view_transform``.
+            T: World to camera [scene units], [3] or [1, 3].
+            focal_length: Of ``PerspectiveCameras``, one number or one for x and one for y.
+            principal_point: Of ``PerspectiveCameras``, [2] or [1, 2]; by default the middle of the image.
+            fov: In place of ``focal_length``: that of ``FoVPerspectiveCameras`` [degrees], across the shorter side.
+            size: Width and height [pixels] (PyTorch3D's ``image_size`` is height and width).
+            in_ndc: Whether focal length and principal point are in NDC, ±1 at the ends of the shorter side, +x left and
+                +y up; else in pixels, +x right and +y down.
+            near: Distance of the near plane [scene units].
+        """
+        width, height = check.image_size(size)
+        check.flag("in_ndc", in_ndc)
+        arguments = R, T, focal_length, principal_point, fov, (width, height), in_ndc
+        return cls(*camera_conventions.from_pytorch3d(*arguments), width, height, near)
+
+    @classmethod
+    def from_colmap(
+        cls,
+        qvec: npt.ArrayLike,
+        tvec: npt.ArrayLike,
+        model: str,
+        params: npt.ArrayLike,
+        size: tuple[int, int],
+        *,
+        near: float = 0.01,
+    ) -> Camera:
+        """Convert a camera of COLMAP; :func:`warpshadow.load_cameras` reads all of a folder.
+
+        Args:
+            qvec: World to camera, a unit quaternion QW, QX, QY, QZ.
+            tvec: World to camera [scene units], TX, TY, TZ.
+            model: "SIMPLE_PINHOLE" or "PINHOLE"; ``colmap image_undistorter`` makes such of others.
+            params: f, cx, cy, or fx, fy, cx, cy [pixels]; pixel centers are at +0.5, as here.
+            size: Width and height [pixels].
+            near: Distance of the near plane [scene units].
+        """
+        width, height = check.image_size(size)
+        return cls(*camera_conventions.from_colmap(qvec, tvec, model, params), width, height, near)
 
     @classmethod
     def from_opengl(
@@ -205,7 +297,7 @@ class Camera:
         Args:
             view: World to eye, a rotation and a translation [scene units], shape [4, 4].
             projection: Perspective projection to OpenGL's clip space, shape [4, 4]; off-center ones are
-                welcome.
+                welcome. Either order of the two will do: only one of them can be a projection.
             fov_y: In place of ``projection``: vertical field of view [degrees].
             size: Width and height [pixels].
             near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with
@@ -213,33 +305,30 @@ class Camera:
         Raises:
             ValueError: when the view is not rigid or the projection not a perspective.
         """
-        view = check.array("view", view, (4, 4))
-        if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
-            raise ValueError(f"view: got last row {view[3].tolist()}, expected [0, 0, 0, 1]")
-        _check_rotation("view", view[:3, :3])
         width, height = check.image_size(size)
         if (projection is None) == (fov_y is None):
             raise ValueError("projection, fov_y: expected exactly one of them")
+        view = check.array("view", view, (4, 4))
         if fov_y is not None:
             intrinsics = _centered_intrinsics(fov_y, width, height)
             near = 0.01 if near is None else near
         else:
             projection = check.array("projection", projection, (4, 4))
-            if not np.array_equal(projection[3], (0.0, 0.0, -1.0, 0.0)) or projection[:2, 3].any():
+            if _is_perspective(view) and not _is_perspective(projection):
+                view, projection = projection, view
+            if not _is_perspective(projection) or projection[:2, 3].any():
                 raise ValueError(
                     f"projection: got {projection.tolist()}, expected a perspective, last row [0, 0, -1, 0] "
                     "and no translation of x and y"
                 )
-            # ndc = (P c) / c_z with c in OpenGL's axes; then u = (1 + x) width/2 and v = (1 - y) height/2.
-            half = np.array([[0.5 * width], [-0.5 * height]])
-            center = np.array([0.5 * width, 0.5 * height])
-            intrinsics = np.eye(3)
-            intrinsics[:2] = half * projection[:2, :3] * (1.0, -1.0, -1.0)
-            intrinsics[:2, 2] += center
+            intrinsics = camera_conventions.opengl_intrinsics(projection, (width, height))
             if near is None:
                 near = projection[2, 3] / (projection[2, 2] - 1.0)
-        flip = np.diag([1.0, -1.0, -1.0])
-        return cls(intrinsics, flip @ view[:3, :3], flip @ view[:3, 3], width, height, near)
+        if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
+            raise ValueError(f"view: got last row {view[3].tolist()}, expected [0, 0, 0, 1]")
+        _check_rotation("view", view[:3, :3])
+        rotation, translation = Y_DOWN @ view[:3, :3], Y_DOWN @ view[:3, 3]
+        return cls(intrinsics, rotation, translation, width, height, near)
 
     @property
     def eye(self) -> np.ndarray:
@@ -262,7 +351,7 @@ class Camera:
         return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
 
     def around(self, shown: Placed | Iterable[Placed] | HasBodies, count: int) -> list[Camera]:
-        """Cameras for a turntable: this one, turned about the vertical through the middle of what is shown.
+        """Cameras for a turntable: this one, turned about the vertical through the center of the framed bodies.
 
         If this one shows all of it, all do: they are so far away, along their views, that they do.
 
@@ -276,10 +365,10 @@ class Camera:
         cameras = [self.turned(angle, middle) for angle in angles]
         if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
             return cameras
-        back = np.array([0.0, 0.0, max(0.0, *(each._missing_distance(points, margin=_AROUND) for each in cameras))])
+        back = np.array([0.0, 0.0, max(0.0, *(camera._missing_distance(points, margin=_AROUND) for camera in cameras))])
         return [
-            Camera(self.intrinsics, each.rotation, each.translation + back, self.width, self.height, self.near)
-            for each in cameras
+            Camera(self.intrinsics, camera.rotation, camera.translation + back, self.width, self.height, self.near)
+            for camera in cameras
         ]
 
     def _missing_distance(self, points: np.ndarray, margin: float = 0.0) -> float:
@@ -340,7 +429,7 @@ class Camera:
 
 
 def framed_points(shown: Any) -> np.ndarray:
-    """Points of what a camera is to show, float64: of what is not flat, if there is any."""
+    """Points that a framing camera must show, float64: of the bodies that are not flat, or of all if all are flat."""
     placed = getattr(shown, "bodies", shown)
     placed = (placed,) if hasattr(placed, "world_points") else placed
     check.instance("shown", placed, Iterable, "a mesh, a body, several, or a scene")
@@ -381,6 +470,10 @@ def _centered_intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
         )
     focal = 0.5 * height / np.tan(np.radians(0.5 * fov_y))
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+
+
+def _is_perspective(matrix: np.ndarray) -> bool:
+    return np.array_equal(matrix[3], (0.0, 0.0, -1.0, 0.0))
 
 
 def _check_rotation(name: str, matrix: np.ndarray) -> None:

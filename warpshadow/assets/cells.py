@@ -22,37 +22,48 @@ class CellLight(NamedTuple):
     Args:
         radiance: Mean radiance, L_q = Q/4π ∫_cell L dω, so that Σ_q (4π/Q) L_q = ∫ L dω; float32 [direction, 3].
         directions: Mean directions, weighted with luminance; float32 [direction, 3].
-        spreads: Half-angles of the evenly bright caps whose mean vectors are as long: 0 for a point, about 2/√Q for an
-            even cell [radians]; float32 [direction].
+        spots: Mean directions, weighted with the square of luminance: of a sun, where it is, whatever sky is around
+            it; float32 [direction, 3].
+        spreads: Half-angles of the evenly bright caps whose mean vectors with that weight are as long: 0 for a point,
+            about 2/√Q for an even cell [radians]; float32 [direction].
     """
 
     radiance: np.ndarray
     directions: np.ndarray
+    spots: np.ndarray
     spreads: np.ndarray
 
 
 def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:
     """Gather the light of the cells around directions: every pixel belongs to the nearest one.
 
-    The cells are taken to be of one size, 4π/Q, as those of Fibonacci directions nearly are; pixels that are not
-    much smaller than a cell are split. A dark cell gets its own direction and the spread of a cap of 4π/Q.
+    All cells count as 4π/Q in size, which Fibonacci directions nearly have; pixels that are not much smaller than a
+    cell are split. A dark cell gets its own direction and the spread of a cap of 4π/Q.
 
     Args:
         radiance: An equirectangular map, shape [height, 2·height, 3].
         directions: Unit vectors, shape [direction, 3].
     """
-    energy, moment = _cell_integrals(radiance, directions)
-    power, length = energy @ LUMINANCE, np.linalg.norm(moment, axis=1)
-    lit = length > 0
-    mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
-    concentration = np.where(lit, length / np.where(lit, power, 1), 1 - 1 / len(energy))
+    energy, moment, square, square_moment = _cell_integrals(radiance, directions)
+    mean, _ = _means(moment, energy @ LUMINANCE, directions)
+    spots, concentration = _means(square_moment, square, directions)
     spreads = np.arccos(np.clip(2 * concentration - 1, -1, 1))
     per_cell = energy * (len(energy) / (4 * np.pi))
-    return CellLight(per_cell.astype(np.float32), mean.astype(np.float32), spreads.astype(np.float32))
+    return CellLight(*(array.astype(np.float32) for array in (per_cell, mean, spots, spreads)))
 
 
-def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Over every cell, ∫ L dω [direction, RGB] and ∫ luminance d dω [direction, 3], float64."""
+def _means(moment: np.ndarray, total: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean directions [direction, 3], and lengths of the mean vectors; of dark cells those of even ones."""
+    length = np.linalg.norm(moment, axis=1)
+    lit = length > 0
+    mean = np.where(lit[:, None], moment / np.where(lit, length, 1)[:, None], directions)
+    return mean, np.where(lit, length / np.where(lit, total, 1), 1 - 1 / len(moment))
+
+
+def _cell_integrals(
+    radiance: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Over every cell, with luminance Y: ∫ L dω, ∫ Y d dω, ∫ Y² dω and ∫ Y² d dω, float64, an item for each."""
     directions = np.asarray(directions, dtype=np.float64)
     check.shape("directions", directions.shape, ("direction", 3))
     if not len(directions) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-3):
@@ -61,18 +72,38 @@ def _cell_integrals(radiance: np.ndarray, directions: np.ndarray) -> tuple[np.nd
     split = _split(height, count)
     owners = _cells_of_pixels(height * split, directions.astype(np.float32).tobytes())
     weights, towards = sh.pixel_solid_angles(height * split), sh.equirectangular_directions(height * split)
-    integrals = np.zeros((6, count))
+    integrals = np.zeros((10, count))
     at_once = max(_AT_ONCE // count, 1)
     for first in range(0, height * split, at_once):
         rows = np.arange(first, min(first + at_once, height * split))
         power = weights[rows, None, None] * np.repeat(radiance[rows // split], split, axis=1).astype(np.float64)
-        values = np.concatenate([power, (power @ LUMINANCE)[..., None] * towards[rows]], axis=2)
+        luminance = (power @ LUMINANCE)[..., None]
+        squared = luminance**2 / weights[rows, None, None]
+        values = np.concatenate([power, luminance * towards[rows], squared, squared * towards[rows]], axis=2)
         cells = (owners[rows] + count * np.arange(len(rows))[:, None]).ravel()
-        for integral, value in zip(integrals, values.reshape(-1, 6).T, strict=True):
+        for integral, value in zip(integrals, values.reshape(-1, 10).T, strict=True):
             of_rows = np.bincount(cells, value, minlength=count * len(rows)).reshape(len(rows), count)
             of_rows[0] += integral
             integral[:] = of_rows.sum(axis=0)
-    return integrals[:3].T, integrals[3:].T
+    return integrals[:3].T, integrals[3:6].T, integrals[6], integrals[7:].T
+
+
+def spread_in_cells(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Make a map of even cells around directions, of which :func:`gather_cells` gathers the same radiance again.
+
+    Args:
+        radiance: Mean radiance L_q, as in a :class:`CellLight`; shape [direction, 3].
+        directions: Unit vectors, shape [direction, 3].
+
+    Returns:
+        Radiance of a map in which no pixel is split, float64 of shape [height, 2·height, 3].
+    """
+    height = int(np.ceil(4 * np.pi * np.sqrt(len(directions))))
+    owners = _cells_of_pixels(height, directions.astype(np.float32).tobytes())
+    weights = np.repeat(sh.pixel_solid_angles(height), 2 * height)
+    solid_angles = np.bincount(owners.ravel(), weights, minlength=len(directions))
+    per_pixel = 4 * np.pi / len(directions) / np.maximum(solid_angles, weights.min())  # two equal directions: one owns
+    return (radiance * per_pixel[:, None])[owners]
 
 
 def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarray, count: int) -> np.ndarray:

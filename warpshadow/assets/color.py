@@ -9,7 +9,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 
 
 def auto_exposure(image: np.ndarray) -> float:
-    """Exposure [stops] at which the brightest 1% of pixels saturate, of those that are covered if it has coverage.
+    """Exposure [stops] at which the brightest 1% of pixels, covered ones if there is coverage, saturate.
 
     Args:
         image: Linear, shape [..., 4] with coverage, or [..., 3] or [..., 1] without.

@@ -15,15 +15,16 @@ from warpshadow.check import AnyPath
 def whole(path: AnyPath) -> Iterator[Path]:
     """Give a new empty file beside ``path`` to write to, which takes its place if the block ends without an error.
 
-    Otherwise it is removed, and what was at ``path`` stays. It has the suffix of ``path``, by which libraries tell
-    formats, and the permissions of what it replaces, or those that the user's umask gives any new file.
+    On an error the new file is removed and the old file at ``path`` stays. The temporary file has the suffix of
+    ``path``, by which libraries tell formats, and the permissions of the file it replaces, or the user's umask for a
+    new one.
 
     Raises:
-        OSError: where it cannot be written, such as on a full disk; of ``path``, whatever the file beside it is called.
+        OSError: where it cannot be written, such as on a full disk; the message names ``path``, not the temporary file.
     """
     if not Path(path).parent.is_dir():
         raise FileNotFoundError(f"{Path(path).parent}: no such folder")
-    path = Path(os.path.realpath(path))  # a link stays, and what it names is written
+    path = Path(os.path.realpath(path))  # a link stays, and its target is written
     unfinished = path.with_name(f".{uuid.uuid4().hex[:12]}.unfinished{path.suffix}")
     try:
         unfinished.touch(exist_ok=False)
@@ -35,7 +36,7 @@ def whole(path: AnyPath) -> Iterator[Path]:
         finally:
             unfinished.unlink(missing_ok=True)
     except OSError as error:
-        if error.errno is None:  # not the system's: it says itself what it is about
+        if error.errno is None:  # not the system's: the message already names its file
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
@@ -49,13 +50,13 @@ def locked(path: Path, *, timeout: float = -1) -> Iterator[None]:
     """
     from filelock import FileLock
 
-    beside = path.with_name(f".{path.name}.lock")
-    with FileLock(beside, timeout=timeout):
+    lock_path = path.with_name(f".{path.name}.lock")
+    with FileLock(lock_path, timeout=timeout):
         try:
             yield
         finally:
             with contextlib.suppress(OSError):  # of Windows, where filelock removes it
-                beside.unlink()
+                lock_path.unlink()
 
 
 def check_file(path: Path) -> None:

@@ -22,7 +22,7 @@ from warpshadow.check import AnyPath
 
 
 class ImageError(ValueError):
-    """A picture, or a file of one, that cannot be used; the message says what was found and is accepted."""
+    """A picture, or an image file, that cannot be used; the message says what was found and what is accepted."""
 
 
 def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
@@ -41,7 +41,7 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
         float32 [height, width, channel] with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGB, alpha) channels.
 
     Raises:
-        ImageError: for what is not such a file, is truncated, deep, too large, or has other channels.
+        ImageError: for a file of another format, truncated, deep or too large, or with other channels.
         FileNotFoundError: when the file does not exist.
     """
     path = check.path("path", path)
@@ -121,7 +121,7 @@ def exr_channels(content: bytes) -> dict[str, np.ndarray]:
     """All channels of an OpenEXR file in memory, as :func:`exr_bytes` makes one.
 
     Raises:
-        ImageError: for what is none, or is truncated.
+        ImageError: for a file of another format, or a truncated one.
     """
     import OpenEXR
 
@@ -139,7 +139,7 @@ def png_codes(content: bytes) -> np.ndarray:
         uint8 of shape [height, width, 1, 3 or 4], or uint16 of shape [height, width, 1].
 
     Raises:
-        ImageError: for what is none, or is truncated.
+        ImageError: for a file of another format, or a truncated one.
     """
     from PIL import Image
 
@@ -159,7 +159,7 @@ def _no_layers(path: Path, layers: object) -> None:
 
 
 def _checked_layers(layers: Mapping[str, np.ndarray], pixels: np.ndarray) -> dict[str, np.ndarray]:
-    """Further channels as float32, beside those of an image."""
+    """Further channels as float32, beside the image's own."""
     channels = {}
     for name, values in layers.items():
         if not isinstance(name, str) or not name or name in _CHANNELS[pixels.shape[2]]:

@@ -1,4 +1,4 @@
-"""Distant light: equirectangular environment maps, and what they project to.
+"""Distant light: equirectangular environment maps, and their projections.
 
 Pixel (row, col) of a map of H × 2H looks along θ = π(row+½)/H, φ = 2π(col+½)/W,
 
@@ -26,14 +26,14 @@ from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 
-# Degrees about +y that turn a map of the convention into ours, and so what its center shows.
+# Degrees about +y that turn a map of the convention into ours, and so the direction that its center shows.
 CONVENTIONS = {"mitsuba": 0, "openexr": 0, "usd": 0, "blender": 90, "three.js": 90, "debevec": 180}
 
 LIGHT = (
     "an EnvironmentMap (EnvironmentMap.read(path), EnvironmentMap(pixels) of [height, 2·height, 3], "
     "EnvironmentMap.constant(1.0)), or SH coefficients [order², 3], such as 9 rows"
 )
-"""What functions that take known light say they expect."""
+"""The types of known light that functions accept, for messages."""
 
 _DRAWN_ROWS = 256  # of a map in a notebook, and less than twice as many
 
@@ -48,6 +48,10 @@ def check_coefficients(name: str, values: np.ndarray) -> None:
 @dataclass(frozen=True, eq=False, init=False)
 class EnvironmentMap:
     """Light from infinitely far away, as an equirectangular map, validated; the array is a read-only copy.
+
+    The world is right-handed with y up. Pixel (row, col) of H × 2H covers a rectangle around the direction
+    (sin φ sin θ, cos θ, −cos φ sin θ) of its center, θ = π(row+½)/H, φ = π(col+½)/H: the top row looks up along +y, the
+    center of the map along +z, the middle of its left half along +x (Mitsuba's convention; :meth:`read` takes others).
 
     Args:
         radiance: Linear RGB, 0 to 1e18, float32, shape [height, 2·height, 3].
@@ -90,8 +94,8 @@ class EnvironmentMap:
 
         Args:
             path: An .exr or .hdr file, or any other that :func:`warpshadow.read_image` reads.
-            sanitize: What becomes of NaN, Inf, negative values and those beyond 1e18: None raises, "zero" makes them 0,
-                "neighbors" the mean of the good values among the eight pixels around, spreading inward.
+            sanitize: How to treat NaN, Inf, negative values and values beyond 1e18: None raises, "zero" makes them 0,
+                "neighbors" takes the mean of the good values among the eight pixels around, spreading inward.
             part: Name or index of the part of a multi-part OpenEXR file.
             convention: Where the center of the file and its right quarter look, in a world with y up:
                 "mitsuba", "openexr" and "usd" (DomeLight): +z, then -x;
@@ -99,7 +103,7 @@ class EnvironmentMap:
                 "debevec" (light probe gallery, HDRShop): -z, then +x.
 
         Raises:
-            ImageError: for what is not a usable map; cube maps are named as such.
+            ImageError: for a file that is not a usable map; cube maps are named as such.
         """
         check.choice("sanitize", sanitize, [None, "zero", "neighbors"])
         check.choice("convention", convention, CONVENTIONS)
@@ -132,7 +136,7 @@ class EnvironmentMap:
         return hashlib.sha256(f"{self.radiance.shape}".encode() + self.radiance.tobytes()).hexdigest()
 
     def rotated(self, degrees: float) -> EnvironmentMap:
-        """Turn the light about +y, counter-clockwise seen from above: +90 takes what is at +z to +x.
+        """Turn the light about +y, counter-clockwise seen from above: +90 takes light from +z to +x.
 
         Whole pixels are exact; between them columns are interpolated linearly, which blurs a map of few columns. Either
         way the energy is kept.
@@ -154,11 +158,11 @@ class EnvironmentMap:
         return EnvironmentMap(self.radiance * _color("factor", factor))
 
     def _repr_png_(self) -> bytes:
-        """What notebooks draw: the map, of at most some 512 columns, at its automatic exposure."""
+        """The map as notebooks draw it: at most some 512 columns, at its automatic exposure."""
         height, width, _ = self.radiance.shape
         step = max(1, height // _DRAWN_ROWS)
-        kept = self.radiance[: height // step * step, : width // step * step].astype(np.float64)
-        blocks = kept.reshape(height // step, step, width // step, step, 3)
+        cropped = self.radiance[: height // step * step, : width // step * step].astype(np.float64)
+        blocks = cropped.reshape(height // step, step, width // step, step, 3)
         return Picture(blocks.mean(axis=(1, 3)))._repr_png_()
 
     def towards(self, directions: np.ndarray) -> np.ndarray:
@@ -191,7 +195,7 @@ class EnvironmentMap:
         return sh.pixel_solid_angles(len(self.radiance))
 
     def sh(self, order: int) -> np.ndarray:
-        """Project onto spherical harmonics: the integral over what the pixels cover, however few they are.
+        """Project onto spherical harmonics: the integral over the solid angles of the pixels, however few they are.
 
         Args:
             order: Number of bands n.
@@ -199,13 +203,13 @@ class EnvironmentMap:
         Returns:
             Coefficients, index l² + l + m, float32, shape [order², 3], not writable.
         """
-        if order not in self._kept_sh:
-            self._kept_sh[order] = sh.project_map(self.radiance, order).astype(np.float32)
-            self._kept_sh[order].setflags(write=False)
-        return self._kept_sh[order]
+        if order not in self._cached_sh:
+            self._cached_sh[order] = sh.project_map(self.radiance, order).astype(np.float32)
+            self._cached_sh[order].setflags(write=False)
+        return self._cached_sh[order]
 
     @functools.cached_property
-    def _kept_sh(self) -> dict[int, np.ndarray]:
+    def _cached_sh(self) -> dict[int, np.ndarray]:
         return {}
 
     def cells(self, directions: np.ndarray) -> CellLight:
@@ -218,14 +222,14 @@ class EnvironmentMap:
             The cells; the arrays are not writable.
         """
         key = np.asarray(directions, np.float64).tobytes()
-        if key not in self._kept_cells:
-            self._kept_cells[key] = gather_cells(self.radiance, directions)
-            for array in self._kept_cells[key]:
+        if key not in self._cached_cells:
+            self._cached_cells[key] = gather_cells(self.radiance, directions)
+            for array in self._cached_cells[key]:
                 array.setflags(write=False)
-        return self._kept_cells[key]
+        return self._cached_cells[key]
 
     @functools.cached_property
-    def _kept_cells(self) -> dict[bytes, CellLight]:
+    def _cached_cells(self) -> dict[bytes, CellLight]:
         return {}
 
     def statistics(self) -> dict[str, object]:
@@ -259,7 +263,7 @@ def _check_aspect(pixels: np.ndarray) -> None:
     height, width, _ = pixels.shape
     if width != 2 * height:
         faces_or_crosses = [(6, 1), (1, 6), (4, 3), (3, 4)]
-        is_cube = any(width * down == height * across for across, down in faces_or_crosses)
+        is_cube = any(width * down == height * columns for columns, down in faces_or_crosses)
         cube = ", which looks like a cube map" if is_cube else ""
         raise ImageError(
             f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
@@ -282,7 +286,7 @@ def _bad_values(radiance: np.ndarray) -> np.ndarray:
 
 
 def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
-    """Replace what no map may hold."""
+    """Replace values that no map may hold."""
     bad = _bad_values(radiance)
     values = np.where(bad, 0, radiance)
     if how == "zero" or not bad.any():
@@ -300,6 +304,6 @@ def _sanitized(radiance: np.ndarray, how: str) -> np.ndarray:
 
 def _around(image: np.ndarray) -> np.ndarray:
     """Sum over each pixel and the eight around it; columns wrap around, rows end at the poles."""
-    across = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
-    padded = np.pad(across, ((1, 1), (0, 0), (0, 0)))
+    row_sums = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
+    padded = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))
     return padded[:-2] + padded[1:-1] + padded[2:]

@@ -21,7 +21,7 @@ from warpshadow.assets import files
 from warpshadow.assets.color import linear_to_srgb
 from warpshadow.assets.topology import (
     CREASE,
-    Surface,
+    MeshTopology,
     creases,
     is_listed_first,
     join_faces,
@@ -33,19 +33,23 @@ from warpshadow.maths.plane import plane_normal
 
 
 class MeshError(ValueError):
-    """A mesh, or a mesh file, that cannot be used; the message says what is wrong and where."""
+    """A mesh, or a mesh file, that cannot be used; the message names the fault and its place."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A triangle mesh on the host, validated; its arrays are read-only copies.
 
+    Positions are in units and axes of the mesh's own, right-handed; a :class:`warpshadow.Body` places them in the
+    world, whose y is up. Normals point to the side from which faces are counter-clockwise. At a vertex they are the
+    mean of its faces' normals, so edges look smooth unless :meth:`creased` parts them.
+
     Args:
         positions: Vertex positions [scene units], float32, shape [vertex, 3].
         faces: Indices of positions, counter-clockwise seen from outside, int32, shape [face, 3].
         uvs: Texture coordinates, origin at the lower left of the image, float32, shape [uv, 2], or None.
-        uv_faces: Indices of uvs, int32, shape [face, 3], or None.
-        name: What messages call the mesh.
+        uv_faces: Indices of uvs, int32, shape [face, 3]; None, where uvs are one for each vertex, for the faces'.
+        name: Name of the mesh in messages.
         origins: Where :meth:`creased` parted vertices, the one of the mesh before that each is a copy of, int32, shape
             [vertex]: ``values[mesh.origins]``. Files do not have it. By default None.
         colors: Reflectance at vertices, linear RGB in [0, 1], float32, shape [vertex, 3], or None. It is the default of
@@ -80,14 +84,19 @@ class Mesh:
         origins: npt.ArrayLike | None = None,
         colors: npt.ArrayLike | None = None,
     ):
-        if (uvs is None) != (uv_faces is None):
-            missing = "uvs" if uvs is None else "uv_faces"
-            raise MeshError(f"{missing}: got None, expected both uvs and uv_faces or neither")
+        if uvs is None and uv_faces is not None:
+            raise MeshError("uvs: got None beside uv_faces, expected the uvs that those are indices of")
         held: dict[str, np.ndarray | None] = {"uvs": None, "uv_faces": None, "origins": None, "colors": None}
         held["positions"] = vertices = _coordinates("positions", positions, 3, "vertex")
         held["faces"] = indices = checked_indices("faces", faces, len(vertices), "vertex")
-        if uvs is not None and uv_faces is not None:
+        if uvs is not None:
             held["uvs"] = corners = _coordinates("uvs", uvs, 2, "uv")
+            if uv_faces is None and len(corners) != len(vertices):
+                raise MeshError(
+                    f"uvs: got {len(corners)} for {len(vertices)} vertices, expected one for each, or uv_faces, which "
+                    "say which uvs each face has"
+                )
+            uv_faces = indices if uv_faces is None else uv_faces
             held["uv_faces"] = uv_indices = checked_indices("uv_faces", uv_faces, len(corners), "uv")
             if len(uv_indices) != len(indices):
                 raise MeshError(f"uv_faces: got {len(uv_indices)} faces, expected {len(indices)}")
@@ -145,7 +154,7 @@ class Mesh:
         return digest.hexdigest()
 
     @functools.cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> MeshTopology:
         """How its faces are joined."""
         return join_faces(self.positions, self.faces, self.uv_faces)
 
@@ -230,10 +239,10 @@ class Mesh:
             unfinished.write_text("\n".join(lines) + "\n")
 
 
-def _coordinates(name: str, given: npt.ArrayLike, width: int, item: str) -> np.ndarray:
+def _coordinates(name: str, array: npt.ArrayLike, width: int, item: str) -> np.ndarray:
     """Copy to float32 [item, width]; MeshError when empty, of another shape, not finite or too large."""
     expected = f"an array [{item}, {width}]; load_mesh(path) reads a file"
-    values = check.numbers(name, given, expected=expected, error=MeshError)
+    values = check.numbers(name, array, expected=expected, error=MeshError)
     if values.ndim != 2 or values.shape[1] != width or len(values) == 0:
         raise MeshError(f"{name}: got shape {values.shape}, expected [{item}, {width}] with at least one {item}")
     bad = np.flatnonzero(~(np.abs(values) <= check.LARGEST).all(axis=1))
@@ -245,10 +254,10 @@ def _coordinates(name: str, given: npt.ArrayLike, width: int, item: str) -> np.n
     return values
 
 
-def checked_indices(name: str, given: npt.ArrayLike, count: int, item: str) -> np.ndarray:
+def checked_indices(name: str, array: npt.ArrayLike, count: int, item: str) -> np.ndarray:
     """Copy to int32 [face, 3]; MeshError when empty, of another shape, or out of range."""
-    check.numbers(name, given, expected="integers [face, 3]", error=MeshError)
-    faces = np.asarray(given)
+    check.numbers(name, array, expected="integers [face, 3]", error=MeshError)
+    faces = np.asarray(array)
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
         polygons = "; triangulate other polygons" if faces.ndim == 2 and faces.shape[1] > 3 else ""
         raise MeshError(f"{name}: got shape {faces.shape}, expected [face, 3] with at least one face{polygons}")
@@ -276,8 +285,8 @@ class BaseColor(NamedTuple):
 class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
-    ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` are those of its
-    materials, None for one that has none.
+    ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` has one for each
+    material, None for a material without one.
     """
 
     positions: np.ndarray

@@ -26,7 +26,7 @@ class OfTrimesh(Protocol):
 
     @property
     def metadata(self) -> Mapping[str, object]:
-        """What trimesh knows of it, such as the file."""
+        """Metadata that trimesh has of it, such as the file."""
 
 
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
@@ -36,7 +36,7 @@ NO_FACTORS: Factors = {}
 """Of meshes whose file is not known."""
 
 MeshSource = AnyPath | OfTrimesh
-"""What is read as a mesh."""
+"""Accepted sources of a mesh."""
 
 
 def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
@@ -45,8 +45,8 @@ def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
     return trimesh is not None and isinstance(value, (trimesh.Trimesh, trimesh.Scene))
 
 
-class _Found(NamedTuple):
-    """A mesh, the picture that all its faces have, and remarks on what may surprise: on its shape, and on colors."""
+class _LoadedMesh(NamedTuple):
+    """A mesh, the picture that all its faces share, and remarks on surprises: on its shape, and on colors."""
 
     mesh: Mesh
     picture: BaseColor | None
@@ -55,53 +55,52 @@ class _Found(NamedTuple):
 
 
 def load_mesh(path: MeshSource) -> Mesh:
-    """Read an OBJ, PLY, STL, GLB/glTF or USD file, or take what trimesh has, as one mesh.
+    """Read an OBJ, PLY, STL, GLB/glTF or USD file, or trimesh's objects, as one mesh.
 
-    Vertices keep the file's order and none is merged or dropped; but those of STL, where each face has three of its
-    own, are merged where edges bend by 30° or less. Faces that are listed twice are dropped. Polygons become fans of
+    Vertices keep the file's order and none is merged or dropped; but STL, where each face has three vertices of its
+    own, is welded where edges bend by 30° or less. Faces that are listed twice are dropped. Polygons become fans of
     triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
     faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same
     normal where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does
-    not break the shading; without uvs they stay as they are.
-    A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
-    uvs are kept only when every face has them. Textures are not read: they are a body's, and ``Body(path)`` takes them.
+    not break the shading; without uvs they stay as they are. A USD stage is read at its earliest time, z-up turned to
+    y-up, subdivision surfaces as their control cage. uvs are kept only when every face has them. Textures are not read:
+    they are a body's, and ``Body(path)`` takes them.
 
-    Colors are, where each vertex has one: those of vertices; of faces, where no vertex has faces of two colors; and the
-    base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and USD
-    (``displayColor``) have linear values; so have meshes of trimesh whose ``source`` is glTF, but not copies of them.
-    Transparency does not count, nor the ``Kd`` of .mtl files.
+    Colors are read where each vertex gets one: from vertices; from faces, where no vertex has faces of two colors; and
+    from the base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and
+    USD (``displayColor``) have linear values; so have meshes of trimesh whose ``source`` is glTF, but not copies of
+    them. Transparency does not count, nor the ``Kd`` of .mtl files.
 
     Args:
-        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the
-            meshes of a ``trimesh.Scene``, which are taken as those of files are.
+        path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the meshes
+            of a ``trimesh.Scene``, which are treated like files.
 
     Returns:
         The mesh, named after the file.
 
     Raises:
-        MeshError: for what is not such a file, or holds no usable triangles.
+        MeshError: for a file of another format, or without usable triangles.
         FileNotFoundError: when the file does not exist.
         ImportError: for USD without the package usd-core.
 
-    Warns:
-        Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and what was dropped: uvs
-        that some faces lack, textures, and colors that vertices cannot have.
+    Warns: Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and the attributes that
+    were dropped: uvs that some faces lack, textures, and colors that vertices cannot have.
     """
-    found = _read(path)
-    of_texture = ["its texture dropped, which Body(path) takes"] if found.picture is not None else []
-    _remark(path, [*found.remarks, *found.of_colors, *of_texture])
-    return found.mesh
+    result = _read(path)
+    of_texture = ["its texture dropped, which Body(path) takes"] if result.picture is not None else []
+    _remark(path, [*result.remarks, *result.of_colors, *of_texture])
+    return result.mesh
 
 
-def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, np.ndarray | None]:
+def load_textured_mesh(path: MeshSource, *, reads_texture: bool = True) -> tuple[Mesh, np.ndarray | None]:
     """Read a mesh as :func:`load_mesh` does, and the texture that the file names or holds.
 
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
-    have the same one, and uvs. Those of USD are not read.
+    have the same one, and uvs. USD colors are not read.
 
     Args:
         path: As there.
-        wanted: Whether the texture is to be read, and what of textures and colors is dropped is to be warned of.
+        reads_texture: Whether to read the texture, and to warn of dropped textures and colors.
 
     Returns:
         The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
@@ -111,14 +110,14 @@ def load_textured_mesh(path: MeshSource, *, wanted: bool = True) -> tuple[Mesh, 
     """
     mesh, picture, remarks, of_colors = _read(path)
     texture = None
-    if wanted and picture is not None:
+    if reads_texture and picture is not None:
         try:
             texture = _texels(picture)
             if mesh.colors is not None:
                 of_colors.append("colors of vertices do not count beside its texture")
         except (OSError, ValueError) as error:
             of_colors.append(f"its texture dropped ({error})")
-    _remark(path, remarks + of_colors if wanted else remarks)
+    _remark(path, remarks + of_colors if reads_texture else remarks)
     return mesh, texture
 
 
@@ -127,7 +126,7 @@ def _remark(path: MeshSource, remarks: list[str]) -> None:
         check.warn(f"{path if check.is_path(path) else 'mesh'}: {', '.join(remarks)}")
 
 
-def _read(source: MeshSource) -> _Found:
+def _read(source: MeshSource) -> _LoadedMesh:
     if is_of_trimesh(source):
         return _concatenate(_trimesh_parts(source), Path(source.metadata.get("file_name") or "mesh").stem)
     path = check.path("path", source)
@@ -152,12 +151,13 @@ def _texels(picture: BaseColor) -> np.ndarray:
     return (srgb_to_linear(codes / 255) * picture.factor).astype(np.float32)
 
 
-def _concatenate(parts: list[MeshPart], name: str) -> _Found:
+def _concatenate(parts: list[MeshPart], name: str) -> _LoadedMesh:
     """Join parts into one mesh, and find the picture that all have."""
     vertex_count = sum(len(part.positions) for part in parts)
     parts = [part for part in parts if len(part.faces)]
     if not parts:
-        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle")
+        cause = "; is it a cloud of points, or cut off?" if vertex_count else ""
+        raise MeshError(f"faces: got none ({vertex_count} vertices), expected at least one triangle{cause}")
     positions, faces = _stack((part.positions, part.faces) for part in parts)
     textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
     uvs, uv_faces = _stack(textured) if len(textured) == len(parts) else (None, None)
@@ -182,7 +182,7 @@ def _concatenate(parts: list[MeshPart], name: str) -> _Found:
     if any(pictures) and not is_one:
         why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_colors.append(f"textures dropped, {why}")
-    return _Found(mesh, pictures[0] if is_one else None, remarks, of_colors)
+    return _LoadedMesh(mesh, pictures[0] if is_one else None, remarks, of_colors)
 
 
 def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:
@@ -234,7 +234,7 @@ def _joined_normals(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
         first[place[left[::-1]]] = left[::-1]
         of_first = normals[first[place[left]]]
         is_close = (normals[left] * of_first).sum(axis=1) >= np.cos(np.radians(CREASE))
-        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # those of no face are zero
+        is_close |= (first[place[left]] == left) | ~normals[left].any(axis=1)  # vertices of no face get zero
         joined[left[is_close]] = of_first[is_close]
         left = left[~is_close]
     return joined
@@ -313,7 +313,7 @@ def _read_obj(path: Path) -> list[MeshPart]:
 
 
 def _obj_pictures(libraries: list[Path]) -> dict[str, BaseColor]:
-    """The diffuse pictures of the materials of MTL files, those that are there."""
+    """The diffuse pictures of the materials of MTL files, as far as the files exist."""
     pictures, material = {}, ""
     for library in filter(Path.is_file, libraries):
         for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -340,21 +340,37 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded, of_file=True, factors=_base_color_factors(tree))
     if path.suffix.lower() == ".stl":
+        if not any(len(part.faces) for part in parts):
+            raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
         return [_merged(part) for part in parts]
     if _cuts_colors(tree):
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
 
 
+def _stl_fault(content: bytes) -> str:
+    """Why an STL file has no faces, for messages: it is often cut off, as by a download that was not whole."""
+    if content[:5] == b"solid" and b"facet" in content:
+        return "" if b"endsolid" in content else "; the file is cut off: it has no endsolid"
+    count = int.from_bytes(content[80:84], "little")
+    size = 84 + 50 * count
+    if len(content) >= max(size, 84):
+        return ""
+    has_header = len(content) >= 84
+    return f"; the file is cut off: got {len(content)} bytes" + (
+        f", and its header says {count} triangles, which are {size}" if has_header else ", fewer than its header has"
+    )
+
+
 def _merged(part: MeshPart) -> MeshPart:
-    """Make one vertex of those at the same place and of the same color, where every face has three of its own.
+    """Weld vertices of the same place and color, where every face has three of its own.
 
     Edges that are sharp keep two.
     """
-    told = [] if part.colors is None else [part.colors]
+    vertex_attributes = [] if part.colors is None else [part.colors]
     is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
     remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
-    used, faces = np.unique(_weld(part.faces[is_first], part.positions, *told), return_inverse=True)
+    used, faces = np.unique(_weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
     positions, faces = part.positions[used], faces.reshape(-1, 3)
     faces, origins = part_at_creases(faces, join_faces(positions, faces, None), positions, CREASE)
     colors = None if part.colors is None else part.colors[used][origins]
@@ -370,20 +386,20 @@ def _gltf_tree(path: Path) -> dict:
 
 
 def _cuts_colors(tree: dict) -> bool:
-    """Whether trimesh would take the lower half of 16-bit colors: those of a glTF file that no material goes with."""
+    """Whether trimesh would take the lower half of 16-bit colors: in a glTF file without a material for them."""
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
-    colors = [each["attributes"].get("COLOR_0") for each in primitives if "material" not in each]
+    colors = [item["attributes"].get("COLOR_0") for item in primitives if "material" not in item]
     return any(color is not None and tree["accessors"][color]["componentType"] == 5123 for color in colors)
 
 
 def _base_color_factors(tree: dict) -> Factors:
     """Factors of a glTF file's materials by the codes that trimesh rounds them to; the mean where several have one."""
-    found: dict[tuple[int, ...], list[np.ndarray]] = {}
+    result: dict[tuple[int, ...], list[np.ndarray]] = {}
     for material in tree.get("materials", []):
         factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1.0, 1.0, 1.0))
         exact = np.clip(np.array(factor[:3], np.float64), 0.0, 1.0)
-        found.setdefault(tuple((255 * exact).round().astype(int).tolist()), []).append(exact)
-    return {codes: tuple(np.mean(factors, axis=0).tolist()) for codes, factors in found.items()}
+        result.setdefault(tuple((255 * exact).round().astype(int).tolist()), []).append(exact)
+    return {codes: tuple(np.mean(factors, axis=0).tolist()) for codes, factors in result.items()}
 
 
 def _base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
@@ -396,14 +412,14 @@ def _base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
 
 
 def _trimesh_parts(
-    given: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: Factors = NO_FACTORS
+    source: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: Factors = NO_FACTORS
 ) -> list[MeshPart]:
     """The meshes of a scene of trimesh in world space; or one mesh, as it is."""
     import trimesh
 
-    if isinstance(given, trimesh.Trimesh):
-        return [_trimesh_part(given, of_file, factors)]
-    scene, parts = given, []
+    if isinstance(source, trimesh.Trimesh):
+        return [_trimesh_part(source, of_file, factors)]
+    scene, parts = source, []
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
         shape = scene.geometry[geometry]
@@ -423,12 +439,12 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     uvs = getattr(shape.visual, "uv", None)
     if uvs is None:
         return part
-    told = [] if part.colors is None else [part.colors]
-    if not of_file:  # its normals may be those of a file, or computed; these differ a little at seams
-        told.append(_joined_normals(positions, shape.vertex_normals))
+    vertex_attributes = [] if part.colors is None else [part.colors]
+    if not of_file:  # its normals may be read from a file, or computed; these differ a little at seams
+        vertex_attributes.append(_joined_normals(positions, shape.vertex_normals))
     elif "vertex_normals" in shape._cache:  # the file's: none were computed yet
-        told.append(shape.vertex_normals)
-    welded = _weld(faces, positions, *told)
+        vertex_attributes.append(shape.vertex_normals)
+    welded = _weld(faces, positions, *vertex_attributes)
     lost = len(np.unique(faces)) - len(np.unique(welded))
     return part._replace(faces=welded, uvs=uvs, uv_faces=faces, welded=lost)
 
@@ -480,7 +496,7 @@ def _ply_corner_uvs(shape) -> np.ndarray | None:
     axes = [np.ravel(raw["vertex"]["data"][axis]) for axis in "xyz"]
     points = np.stack(axes, axis=-1).astype(np.float32)
     if corners is None or not np.array_equal(points[_ply_values(corners)], shape.triangles.astype(np.float32)):
-        return None  # the faces are no longer those of the file
+        return None  # the faces no longer match the file's
     return _ply_values(data["texcoord"]).reshape(-1, 2)
 
 
@@ -555,4 +571,4 @@ _READERS: dict[str, Callable[[Path], list[MeshPart]]] = {
 }
 
 MESH_SUFFIXES = tuple(_READERS)
-"""What files of meshes are called."""
+"""Suffixes of mesh files."""

@@ -15,12 +15,12 @@ from warpshadow.assets.color import auto_exposure, filmic, linear_to_srgb, srgb_
 from warpshadow.check import AnyPath
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-"""What files of pictures are called."""
+"""Suffixes of picture files."""
 
 MOST_STOPS = 100  # 2 to it is a float32
 
 TONES: dict[str, Callable[[np.ndarray], np.ndarray]] = {"clip": lambda color: color, "filmic": filmic}
-"""What becomes of exposed color before it is cut off at 1."""
+"""Tone curves of exposed color before it is clipped at 1."""
 
 
 class Picture:
@@ -29,12 +29,12 @@ class Picture:
     Args:
         image: Linear values: RGB and coverage, premultiplied, as :func:`warpshadow.render` returns them, shape
             [height, width, 4]; RGB [height, width, 3]; or gray [height, width] or [height, width, 1].
-        exposure: Factor of the image, in stops; by default the brightest 1% of what is covered just saturate.
-        tone: What becomes of bright color: "clip" cuts it off at 1, "filmic" bends it towards 1 (Narkowicz's fit of
-            the ACES curve, 2016).
-        background: What shows where the image covers nothing: None for transparent; a color of the picture, linear RGB
-            [3] or as CSS names it, "white" or "#ffcc00"; or an image of radiance, [height, width, 3], which is exposed
-            like the rest: ``scene.background()`` is the light itself.
+        exposure: Factor of the image, in stops; by default the brightest 1% of covered pixels just saturate.
+        tone: Tone curve of bright color: "clip" cuts it off at 1, "filmic" bends it towards 1 (Narkowicz's fit of the
+            ACES curve, 2016).
+        background: Shown where the image covers nothing: None for transparent; a color of the picture, linear RGB [3]
+            or as CSS names it, "white" or "#ffcc00"; or an image of radiance, [height, width, 3], which is exposed like
+            the rest: ``scene.background()`` is the light itself.
 
     Attributes:
         pixels: uint8 of shape [height, width, 3], [height, width, 4] with straight alpha where it is transparent, or
@@ -84,7 +84,7 @@ class Picture:
         return f"Picture({width} × {height}, {self.exposure:+.2f} stops)"
 
     def _repr_png_(self) -> bytes:
-        """What notebooks draw."""
+        """The picture as notebooks draw it."""
         return png_bytes(self.pixels)
 
     def opaque(self) -> np.ndarray:
@@ -146,7 +146,7 @@ def _behind(background: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     behind = check.numbers("background", background, expected=expected, dtype=np.float64)
     if behind.shape not in ((3,), shape):
         raise ValueError(f"background: got shape {behind.shape}, expected {expected}")
-    check.finite("background", behind, least=0.0, most=1.0 if behind.ndim == 1 else check.LARGEST)
+    check.finite("background", behind, minimum=0.0, maximum=1.0 if behind.ndim == 1 else check.LARGEST)
     return behind
 
 

@@ -49,7 +49,7 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
     to their distance. It ends 10⁴ sizes away. Framings leave it out, as they do all flat bodies.
 
     Args:
-        size: Diameter of the disc [scene units], such as that of what stands there with its shadow.
+        size: Diameter of the disc [scene units], such as the extent of the bodies on it with their shadows.
         segments: Faces around the origin, 8 to 4096: in the disc they are π size / segments long.
     """
     if not (check.is_number(size) and 0 < size <= check.LARGEST / _REACH):
@@ -61,13 +61,13 @@ def infinite_ground(size: float = 2.0, segments: int = 64) -> Mesh:
     outer = np.geomspace(0.5, _REACH, int(np.ceil(np.log(2 * _REACH) / np.log1p(step))) + 1)[1:]
     radii = size * np.concatenate([inner, outer])
     angles = step * np.arange(segments)
-    around = np.stack([np.cos(angles), np.zeros(segments), -np.sin(angles)], axis=-1)
-    positions = np.concatenate([np.zeros((1, 3)), (radii[:, None, None] * around).reshape(-1, 3)])
+    rim = np.stack([np.cos(angles), np.zeros(segments), -np.sin(angles)], axis=-1)
+    positions = np.concatenate([np.zeros((1, 3)), (radii[:, None, None] * rim).reshape(-1, 3)])
     first = 1 + segments * np.arange(len(radii))
-    here, beside = np.arange(segments), np.roll(np.arange(segments), -1)
-    fan = np.stack([np.zeros(segments, int), first[0] + here, first[0] + beside], axis=-1)
-    a, b = first[:-1, None] + here, first[:-1, None] + beside
-    c, d = first[1:, None] + here, first[1:, None] + beside
+    here, following = np.arange(segments), np.roll(np.arange(segments), -1)
+    fan = np.stack([np.zeros(segments, int), first[0] + here, first[0] + following], axis=-1)
+    a, b = first[:-1, None] + here, first[:-1, None] + following
+    c, d = first[1:, None] + here, first[1:, None] + following
     rings = np.stack([a, c, d, a, d, b], axis=-1).reshape(-1, 3)
     return Mesh(positions, np.concatenate([fan, rings]), name="infinite_ground")
 

@@ -22,7 +22,7 @@ def read_radiance(path: Path, check_size: Callable[[int, int], None]) -> np.ndar
         Linear RGB with row 0 at the top and the exposure divided out, float32 [height, width, 3].
 
     Raises:
-        ValueError: for what is not such a file, or truncated; the message leaves the path out.
+        ValueError: for a file of another format, or a truncated one; the message leaves the path out.
     """
     with path.open("rb") as file:
         if not file.readline(80).startswith((b"#?RADIANCE", b"#?RGBE")):

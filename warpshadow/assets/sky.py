@@ -23,7 +23,7 @@ def synthetic_sky(
 ) -> EnvironmentMap:
     """Make a clear daylight sky with a sun, over a diffuse ground.
 
-    The unit is what the sky alone does: its irradiance on the ground is π in luminance; white ground looks 1.
+    The unit is set by the sky without its sun: its irradiance on the ground is π in luminance; white ground looks 1.
     The sky is the CIE standard clear sky (ISO 15469, type 12), blue with a pale haze at the horizon; the sun
     reddens as it sinks. The ground is as bright as sky and sun make it, and fades into the haze.
 

@@ -18,8 +18,8 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
     """Find the face on the other side of each edge.
 
     Args:
-        faces: Indices of positions, shape [face, 3]: edges belong together by position topology, whatever the uvs.
-        positions: Vertices, shape [vertex, 3]; when given, those at the same place count as one, as a mesh needs
+        faces: Indices of positions, shape [face, 3]: faces are joined where edges share positions, whatever the uvs.
+        positions: Vertices, shape [vertex, 3]; when given, vertices at the same place count as one, as a mesh needs
             whose faces have vertices of their own.
 
     Returns:
@@ -29,7 +29,7 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
     """
     check.shape("faces", faces.shape, ("face", 3))
     faces = faces.astype(np.int64) if positions is None else _places(positions)[faces]
-    across = np.full(faces.shape, -1, np.int32)
+    neighbor = np.full(faces.shape, -1, np.int32)
     proper = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
     ends = np.sort(np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1)
     first, last = ends.reshape(-1, 2).T
@@ -37,36 +37,38 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
     owner = np.repeat(proper, 3)
     total = np.zeros(len(sharing), np.int64)
     np.add.at(total, edge, owner)
-    found = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
-    across[proper] = found.reshape(-1, 3)
-    return across
+    result = np.where(sharing[edge] == 2, total[edge] - owner, np.where(sharing[edge] == 1, -1, _NOT_MANIFOLD))
+    neighbor[proper] = result.reshape(-1, 3)
+    return neighbor
 
 
 def _places(positions: np.ndarray) -> np.ndarray:
-    """Number the places of vertices, the same for those at the same, shape [vertex]."""
-    order = np.lexsort(positions.T)
-    is_new = (np.diff(positions[order], axis=0) != 0).any(axis=1)
+    """Number the distinct positions of vertices: vertices at the same position share a number, shape [vertex]."""
+    permutation = np.lexsort(positions.T)
+    is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
     places = np.zeros(len(positions), np.int64)
-    places[order[1:]] = np.cumsum(is_new)
+    places[permutation[1:]] = np.cumsum(is_new)
     return places
 
 
 def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make one vertex of those at the same place, and leave out those without faces: positions, faces.
+    """Weld vertices at the same position, and drop vertices without faces: positions, faces.
 
-    The first of them stays, in order: so parted vertices become what they were.
+    The first of each stays, in order: so split vertices become one again.
     """
     used = np.unique(faces)
     places = _places(positions[used])
     _, first, place = np.unique(places, return_index=True, return_inverse=True)
-    kept = np.sort(first)
-    number = np.searchsorted(kept, first)[place]
+    first_vertices = np.sort(first)
+    number = np.searchsorted(first_vertices, first)[place]
     renumbered = np.zeros(len(positions), np.int32)
     renumbered[used] = number
-    return positions[used[kept]], renumbered[faces]
+    return positions[used[first_vertices]], renumbered[faces]
 
 
-def part_at_creases(faces: np.ndarray, surface: Surface, positions: np.ndarray, angle: float) -> tuple[np.ndarray, ...]:
+def part_at_creases(
+    faces: np.ndarray, surface: MeshTopology, positions: np.ndarray, angle: float
+) -> tuple[np.ndarray, ...]:
     """Part the vertices of faces along sharp edges.
 
     Faces that meet in a vertex keep it together where edges that are not sharp lead from one to the other around it.
@@ -83,14 +85,14 @@ def part_at_creases(faces: np.ndarray, surface: Surface, positions: np.ndarray, 
     """
     places, normals = _places(positions)[surface.faces], face_normals(positions[surface.faces])
     face, edge = np.nonzero(surface.neighbors >= 0)
-    across = surface.neighbors[face, edge]
-    is_smooth = np.einsum("ij,ij->i", normals[face], normals[across]) >= np.cos(np.radians(angle))
-    face, edge, across = face[is_smooth], edge[is_smooth], across[is_smooth]
+    neighbor = surface.neighbors[face, edge]
+    is_smooth = np.einsum("ij,ij->i", normals[face], normals[neighbor]) >= np.cos(np.radians(angle))
+    face, edge, neighbor = face[is_smooth], edge[is_smooth], neighbor[is_smooth]
     links = []
     for end in (1, 2):
         corner = (edge + end) % 3
-        other = (places[across] == places[face, corner][:, None]).argmax(axis=1)
-        links.append((3 * face + corner, 3 * across + other))
+        other = (places[neighbor] == places[face, corner][:, None]).argmax(axis=1)
+        links.append((3 * face + corner, 3 * neighbor + other))
     ends, other_ends = np.concatenate(links, axis=1)
     count = 3 * len(faces)
     fan = _connected(ends, other_ends, count).reshape(-1, 3)
@@ -104,49 +106,60 @@ def part_at_creases(faces: np.ndarray, surface: Surface, positions: np.ndarray, 
     return vertex[number].reshape(-1, 3).astype(np.int32), origins.astype(np.int32)
 
 
-def rounds_edges(surface: Surface, positions: np.ndarray) -> bool:
+def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     """Whether many sharp edges have faces that share vertices, and so normals.
 
-    Edges of more than 50° are longer in all than the diagonal of the bounds, and ten times as long as those of 20° to
-    50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as long (bunny, cow, monkey,
-    man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
+    Those of a piece are many if edges of more than 50° are longer in all than the diagonal of its bounds, and ten times
+    as long as those of 20° to 50°. In organic meshes, where angles of all sizes occur, they are at most 2.6 times as
+    long (bunny, cow, monkey, man). In voxels, whose steps normals round on purpose, they are longer than 25 diagonals.
+    Such pieces, as many boxes are, have most of the sharp edges, longer in all than the diagonal of the mesh.
     """
     corners = positions[surface.faces].astype(np.float64)
-    face, edge, across, is_parted = _inner_edges(surface)
-    is_rounded = ~is_parted & (face < across)
-    face, edge, across = face[is_rounded], edge[is_rounded], across[is_rounded]
+    face, edge, neighbor, is_parted = _inner_edges(surface)
+    is_rounded = ~is_parted & (face < neighbor)
+    face, edge, neighbor = face[is_rounded], edge[is_rounded], neighbor[is_rounded]
     normals = face_normals(corners)
-    cosines = np.einsum("ij,ij->i", normals[face], normals[across])
+    cosines = np.einsum("ij,ij->i", normals[face], normals[neighbor])
     lengths = np.linalg.norm(np.subtract(*corners[face, (edge + [[1], [2]]) % 3]), axis=1)
-    sharp, bent = (lengths[cosines < np.cos(np.radians(angle))].sum() for angle in (50, 20))
-    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
-    return bool(diagonal < sharp < 25 * diagonal and bent - sharp < 0.1 * sharp)
+    linked_face, edge = np.nonzero(surface.neighbors >= 0)
+    pieces = _connected(linked_face, surface.neighbors[linked_face, edge], len(surface.faces))
+    count = int(pieces.max()) + 1
+    sharp, bent = (
+        np.bincount(pieces[face], lengths * (cosines < np.cos(np.radians(angle))), count) for angle in (50, 20)
+    )
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, pieces, corners.min(axis=1))
+    np.maximum.at(high, pieces, corners.max(axis=1))
+    diagonals = np.linalg.norm(high - low, axis=1)
+    is_many = (diagonals < sharp) & (sharp < 25 * diagonals) & (bent - sharp < 0.1 * sharp)
+    diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
+    return bool(sharp[is_many].sum() > max(diagonal, sharp.sum() / 2))
 
 
-def creases(surface: Surface, positions: np.ndarray) -> np.ndarray:
+def creases(surface: MeshTopology, positions: np.ndarray) -> np.ndarray:
     """Find the edges across which color jumps: their faces bend by more than a degree, and do not share both ends.
 
-    A jump of the normal by a degree changes what a face receives by up to 1.7% of the light.
+    A jump of the normal by a degree changes the light that a face receives by up to 1.7%.
 
     Returns:
         2ᵏ for the edge opposite to corner k of each face, int32 of shape [face].
     """
-    face, edge, across, is_parted = _inner_edges(surface)
-    face, edge, across = face[is_parted], edge[is_parted], across[is_parted]
-    normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, across))
+    face, edge, neighbor, is_parted = _inner_edges(surface)
+    face, edge, neighbor = face[is_parted], edge[is_parted], neighbor[is_parted]
+    normals = (face_normals(positions[surface.faces[numbers]]) for numbers in (face, neighbor))
     is_bent = np.einsum("ij,ij->i", *normals) < np.cos(np.radians(1.0))
-    found = np.zeros(surface.faces.shape, np.int32)
-    found[face[is_bent], edge[is_bent]] = 1
-    return found @ np.array([1, 2, 4], np.int32)
+    result = np.zeros(surface.faces.shape, np.int32)
+    result[face[is_bent], edge[is_bent]] = 1
+    return result @ np.array([1, 2, 4], np.int32)
 
 
-def _inner_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _inner_edges(surface: MeshTopology) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Edges with a face across: face, opposite corner, face across, and whether an end is a vertex of one face only."""
     face, edge = np.nonzero(surface.neighbors >= 0)
-    across = surface.neighbors[face, edge]
+    neighbor = surface.neighbors[face, edge]
     ends = surface.faces[face, (edge + [[1], [2]]) % 3]
-    is_shared = [(surface.faces[across] == vertex[:, None]).any(axis=1) for vertex in ends]
-    return face, edge, across, ~np.logical_and(*is_shared)
+    is_shared = [(surface.faces[neighbor] == vertex[:, None]).any(axis=1) for vertex in ends]
+    return face, edge, neighbor, ~np.logical_and(*is_shared)
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:
@@ -157,8 +170,8 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return normals / np.where(lengths > 0, lengths, 1)
 
 
-class Surface(NamedTuple):
-    """How the faces of a mesh are joined, and what they enclose.
+class MeshTopology(NamedTuple):
+    """Topology of a mesh: how its faces are joined, and the volume they enclose.
 
     Faces joined along an edge wind alike: where some wind against most of their piece, they are turned over. So normals
     of neighbors add up, and one side of a piece is its front, all over. On a one-sided piece (a Möbius strip) they
@@ -172,7 +185,8 @@ class Surface(NamedTuple):
     neighbors: np.ndarray
     """Face across each edge, :func:`edge_neighbors` of vertices by their places, int32 of shape [face, 3]."""
     is_closed: bool
-    """Whether no face shows its back to those outside: two share each edge and wind alike, and pieces look outward.
+    """Whether no face shows its back to those outside: two or more share each edge, half of them run along it either
+    way, and pieces look outward.
 
     A shell that is hollow inside does not count as closed: it costs a launch more, and gets the same image.
     """
@@ -184,46 +198,49 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Faces without area are not compared.
     """
     corners = np.sort(_places(positions)[faces], axis=1)
-    order = np.lexsort(corners.T)  # which keeps the order of equal ones
-    is_equal = (corners[order[1:]] == corners[order[:-1]]).all(axis=1) & (np.diff(corners[order[1:]], axis=1) != 0).all(
-        1
-    )
+    permutation = np.lexsort(corners.T)  # which keeps the order of equal ones
+    is_equal = (corners[permutation[1:]] == corners[permutation[:-1]]).all(axis=1) & (
+        np.diff(corners[permutation[1:]], axis=1) != 0
+    ).all(1)
     is_first = np.ones(len(faces), bool)
-    is_first[order[1:]] = ~is_equal
+    is_first[permutation[1:]] = ~is_equal
     return is_first
 
 
-def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> Surface:
+def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
     """Join faces of which none is listed twice."""
     neighbors, places = edge_neighbors(faces, positions), _places(positions)[faces]
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
-    across = np.maximum(neighbors, 0)
-    runs_back = (first[across] == last[:, :, None]) & (last[across] == first[:, :, None])
+    neighbor = np.maximum(neighbors, 0)
+    runs_back = (first[neighbor] == last[:, :, None]) & (last[neighbor] == first[:, :, None])
     winds_alike = runs_back.any(axis=2) | (neighbors < 0)
     if not winds_alike.all():
         is_turned = _turned(neighbors, winds_alike)
-        winds_alike ^= is_turned[:, None] ^ is_turned[across]
+        winds_alike ^= is_turned[:, None] ^ is_turned[neighbor]
         winds_alike |= neighbors < 0
         faces, neighbors = (_with_turned(values, is_turned) for values in (faces, neighbors))
         uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
-    is_proper = (places != first).all(axis=1)
-    has_no_border = winds_alike.all() and (neighbors[is_proper] >= 0).all()
-    is_closed = has_no_border and (_volumes(positions, faces[is_proper], neighbors, is_proper) > 0).all()
-    return Surface(faces, uv_faces, neighbors, bool(is_closed))
+    return MeshTopology(faces, uv_faces, neighbors, bool(winds_alike.all()) and _is_closed(positions, faces))
 
 
-def _volumes(positions: np.ndarray, faces: np.ndarray, neighbors: np.ndarray, is_proper: np.ndarray) -> np.ndarray:
-    """What each piece of a mesh without borders encloses, negative where its faces look inward."""
-    a, b, c = np.moveaxis((positions - positions[0].astype(np.float64))[faces], 1, 0)
-    parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-    _, piece = np.unique(_pieces_of(neighbors)[is_proper], return_inverse=True)
-    return np.bincount(piece, weights=parts)
+def _is_closed(positions: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether as many faces run along each edge one way as the other, and each piece encloses a positive volume.
 
-
-def _pieces_of(neighbors: np.ndarray) -> np.ndarray:
-    """Number of the piece that each face belongs to; those joined across an edge belong together."""
-    face, edge = np.nonzero(neighbors >= 0)
-    return _connected(face, neighbors[face, edge], len(neighbors))
+    So boxes that share an edge, at which four faces meet, are closed as each of them is.
+    """
+    places = _places(positions)[faces]
+    is_proper = (places != np.roll(places, 1, axis=1)).all(axis=1)
+    places, corners = places[is_proper], (positions - positions[0].astype(np.float64))[faces[is_proper]]
+    starts, ends = places.ravel(), np.roll(places, -1, axis=1).ravel()
+    lines = np.minimum(starts, ends) * (places.max(initial=0) + 1) + np.maximum(starts, ends)
+    _, edge = np.unique(lines, return_inverse=True)
+    if np.bincount(edge, np.where(starts < ends, 1, -1)).any():
+        return False
+    count = len(places)
+    piece = _connected(np.repeat(np.arange(count), 3), count + edge, count + len(edge))[:count]
+    _, piece = np.unique(piece, return_inverse=True)
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return bool((np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c))) > 0).all())
 
 
 def _connected(ends: np.ndarray, other_ends: np.ndarray, count: int) -> np.ndarray:
@@ -247,12 +264,14 @@ def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     ends = np.concatenate([face, face + count]), np.concatenate([other, (other + count) % (2 * count)])
     part = _connected(*ends, 2 * count)
     as_it_is, over = part[:count], part[count:]
-    kept = np.bincount(as_it_is, minlength=len(part))
-    return (kept[as_it_is] < kept[over]) | ((kept[as_it_is] == kept[over]) & (as_it_is > over))
+    unturned_count = np.bincount(as_it_is, minlength=len(part))
+    return (unturned_count[as_it_is] < unturned_count[over]) | (
+        (unturned_count[as_it_is] == unturned_count[over]) & (as_it_is > over)
+    )
 
 
 def _with_turned(values: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
-    """What faces have for each corner, [face, 3], with that of some faces the other way round."""
+    """Reverse the corner order [face, 3] of some faces."""
     turned = np.where(is_turned[:, None], values[:, ::-1], values)
     turned.setflags(write=False)
     return turned

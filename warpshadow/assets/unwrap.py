@@ -68,7 +68,7 @@ _SAME_SIDE = 0.5
 
 
 def _pieces(corners: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
-    """Faces [face, 3, 3] that xatlas may have at once, given those across their edges: all of them, as a rule.
+    """Faces [face, 3, 3] that xatlas may chart at once, given the neighbors across their edges: all of them, as a rule.
 
     It cuts nothing where neighbors are all but coplanar, and crashes where these close around a round, finely
     tessellated body. Such a mesh comes in six pieces, by the axis that a face looks along.

@@ -14,7 +14,7 @@ from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 
 _STEPS = {".gif": 10, ".webp": 1}
-"""What a frame's duration is a multiple of [ms]."""
+"""Unit of a frame's duration [ms]."""
 
 _FASTEST = {".mp4": 1000, ".gif": 50, ".webp": 90}
 """Most frames a second; browsers show frames of 10 ms and less, of .gif and .webp, for 100 ms."""
@@ -22,7 +22,7 @@ _FASTEST = {".mp4": 1000, ".gif": 50, ".webp": 90}
 _SLOWEST = 0.1
 
 VIDEO_SUFFIXES = tuple(_FASTEST)
-"""What files of videos are called."""
+"""Suffixes of video files."""
 
 
 def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: float = 24.0) -> None:
@@ -32,7 +32,7 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
         path: A .gif or .webp file, or an .mp4 file (H.264), for which ``imageio-ffmpeg`` must be installed (the extra
             "video").
         frames: Pictures of one size, or images as :class:`Picture` takes them, which then all have the automatic
-            exposure of the first. What is transparent is white.
+            exposure of the first. Transparent pixels become white.
         fps: Frames a second, 0.1 to 1000; up to 90 of .webp, and 50 of .gif, whose frames last 10 ms, 20 ms and so on:
             the next is shown when its time is nearest.
 
@@ -63,9 +63,9 @@ def check_video(path: Path, fps: float) -> None:
     """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(VIDEO_SUFFIXES)}")
-    most = _FASTEST[path.suffix.lower()]
-    if not (check.is_number(fps) and _SLOWEST <= fps <= most):
-        raise ValueError(f"fps: got {check.described(fps)}, expected {_SLOWEST} to {most} for {path.suffix}")
+    maximum = _FASTEST[path.suffix.lower()]
+    if not (check.is_number(fps) and _SLOWEST <= fps <= maximum):
+        raise ValueError(f"fps: got {check.described(fps)}, expected {_SLOWEST} to {maximum} for {path.suffix}")
     if path.suffix.lower() == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401

@@ -1,7 +1,7 @@
-"""Data sets: images of random scenes, with what they show, in shards for WebDataset and torch's loaders.
+"""Data sets: images of random scenes, with labels, in shards for WebDataset and torch's loaders.
 
-A :class:`Recipe` says what is drawn, :func:`load_recipe` reads one; a :class:`DataSet` draws its scenes, by their
-numbers, and :func:`write_shards` renders them; :func:`read_shard` reads what that wrote.
+A :class:`Recipe` describes the data set, :func:`load_recipe` reads one; a :class:`DataSet` draws its scenes, by their
+numbers, and :func:`write_shards` renders them; :func:`read_shard` reads a shard back.
 """
 
 from warpshadow.dataset.data_set import DataSet

@@ -35,7 +35,7 @@ _SAID_FAULTS = 10
 
 
 class Stock(NamedTuple):
-    """What a split draws from."""
+    """Assets that a split draws from."""
 
     meshes: tuple[str, ...]
     """Names of files in the folder of meshes, or of simple shapes."""
@@ -46,19 +46,19 @@ class Stock(NamedTuple):
 class DataSet:
     """The scenes of a recipe. To make one reads each mesh and map once, and fits the spheres that are not fitted yet.
 
-    A mesh or map belongs to a split by a hash of the seed and of what is in it. So a copy under another name is in the
-    same split, and files that are added move no others. To send a data set to other processes is cheap: they read what
-    their scenes have.
+    A mesh or map belongs to a split by a hash of the seed and of its content. So a copy under another name is in the
+    same split, and files that are added move no others. Sending a data set to other processes is cheap: they read the
+    files themselves.
 
     Args:
-        recipe: What it consists of.
+        recipe: Its recipe.
         device: Where spheres are fitted and images rendered.
         progress: Show progress where something takes longer than a second.
 
     Attributes:
-        recipe: What it consists of.
+        recipe: Its recipe.
         device: Name of the device.
-        stocks: What each split draws from, by its name.
+        stocks: The assets of each split, by its name.
         hashes: Of each mesh and map, by ``meshes`` and ``maps`` and then by names.
 
     Raises:
@@ -72,11 +72,11 @@ class DataSet:
         for split in recipe.splits:
             if not self.numbers(split):
                 raise RecipeError(f"[splits]: {split} got none of the {recipe.images} images, expected one or more")
-        for kept in (_read_body, _read_map):
-            kept.cache_clear()  # of files as they were
+        for cache in (_read_body, _read_map):
+            cache.cache_clear()  # of files as they were
         fits = recipe.visibility.method in (*SPHERE_METHODS, AUTO) or "spheres" in recipe.layers
-        given = {"blockers": recipe.blockers, "creased": recipe.creased, "fits": fits, "device": self.device}
-        self._read_mesh = functools.partial(_read_body, **given)
+        arguments = {"blockers": recipe.blockers, "creased": recipe.creased, "fits": fits, "device": self.device}
+        self._read_mesh = functools.partial(_read_body, **arguments)
         self.hashes: dict[str, dict[str, str]] = {}
         if recipe.meshes is None:
             self.hashes["meshes"] = {body.called: body.mesh.content_hash for body in primitives()}
@@ -96,13 +96,13 @@ class DataSet:
         return f"DataSet({splits} images of {self.recipe.size[0]} × {self.recipe.size[1]})"
 
     def _stock(self, split: str) -> Stock:
-        """What a split draws from; RecipeError where that is nothing."""
+        """The assets of a split; RecipeError if there are none."""
         names = {}
         for kind, hashes in self.hashes.items():
             owners = {name: _split_of(self.recipe, content) for name, content in hashes.items()}
             names[kind] = tuple(name for name, owner in owners.items() if owner == split)
             if not names[kind]:
-                counts = ", ".join(f"{each} {list(owners.values()).count(each)}" for each in self.recipe.splits)
+                counts = ", ".join(f"{item} {list(owners.values()).count(item)}" for item in self.recipe.splits)
                 raise RecipeError(
                     f"[splits]: {split} got none of the {len(hashes)} {kind} ({counts}), expected one or more: try "
                     "another seed, a larger part, or more files"
@@ -110,7 +110,7 @@ class DataSet:
         return Stock(names["meshes"], names.get("maps"))
 
     def numbers(self, split: str) -> range:
-        """Numbers of the images of a split; those of all splits follow each other."""
+        """Numbers of the images of a split; splits follow one another."""
         check.choice("split", split, self.recipe.splits)
         ends = [round(self.recipe.images * part) for part in itertools.accumulate(self.recipe.splits.values())]
         starts = dict(zip(self.recipe.splits, itertools.pairwise([0, *ends]), strict=True))
@@ -130,8 +130,8 @@ class DataSet:
         else:
             bodies = _ReadWhenAsked(recipe.meshes, stock.meshes, lambda path: self._read_mesh(path).body)
         maps = None if recipe.maps is None else _ReadWhenAsked(recipe.maps, stock.maps or (), _read_map)
-        given = recipe.visibility, recipe.supersampling, maps, recipe.ranges, recipe.bounces
-        return RandomScenes(recipe.seed, recipe.images, recipe.size, bodies, *given)
+        arguments = recipe.visibility, recipe.supersampling, maps, recipe.ranges, recipe.bounces
+        return RandomScenes(recipe.seed, recipe.images, recipe.size, bodies, *arguments)
 
     def draw(self, number: int) -> Drawn:
         """Draw the scene of an image."""
@@ -143,7 +143,7 @@ class DataSet:
 
 
 def _split_of(recipe: Recipe, content: str) -> str:
-    """The split that what has this hash belongs to."""
+    """The split that a content hash belongs to."""
     place = int(hashlib.sha256(f"{recipe.seed} {content}".encode()).hexdigest()[:16], 16) / 16**16
     ends = itertools.accumulate(recipe.splits.values())
     return next((split for split, end in zip(recipe.splits, ends, strict=True) if place < end), [*recipe.splits][-1])
@@ -153,7 +153,7 @@ def _split_of(recipe: Recipe, content: str) -> str:
 
 
 class _ReadWhenAsked(Sequence[Item], Generic[Item]):
-    """What is in files of a folder."""
+    """Hash the files of a folder."""
 
     def __init__(self, folder: Path, names: Sequence[str], read: Callable[[Path], Item]):
         self._folder, self._names, self._read = folder, names, read
@@ -163,7 +163,7 @@ class _ReadWhenAsked(Sequence[Item], Generic[Item]):
 
     def __getitem__(self, place):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is to be said of a file was said when the data set was made
+            warnings.simplefilter("ignore")  # all warnings about a file were given when the data set was made
             return self._read(self._folder / self._names[place])
 
 
@@ -173,7 +173,7 @@ class _Read(NamedTuple):
     body: Body
     """With its spheres, creased if that is wanted."""
     content_hash: str
-    """Of what is in the file, colors and texture among it, however it is creased."""
+    """Hash the file's content, with its colors and texture, but not how it is creased."""
 
 
 @functools.lru_cache(_KEPT_BODIES)
@@ -188,7 +188,7 @@ def _read_body(path: Path, blockers: int | str, creased: float | None, fits: boo
 
 
 def _fitted(body: Body, device: str) -> Body:
-    """The body with its spheres; but in place of those of a flat one, what it blocks is found by how it lies."""
+    """The body with its fitted spheres; a flat body has none and blocks as a plane."""
     if isinstance(body.blockers, Spheres) or body.mesh.is_flat:
         return body
     return replace(body, blockers=fit_spheres(body.mesh, body.blockers, device=device).spheres)
@@ -202,12 +202,12 @@ def _read_map(path: Path) -> EnvironmentMap:
 def _hashes(
     folder: Path, what: str, suffixes: Sequence[str], hash_of: Callable[[Path], str], progress: bool
 ) -> dict[str, str]:
-    """Hashes of what is in the files below a folder, by their names in it; RecipeError names all faults."""
+    """Hashes of the files below a folder, by their names in it; RecipeError names all faults."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     if not paths:
         raise RecipeError(f"{what}: got the folder {folder} without any, expected files {', '.join(suffixes)}")
     hashes, faults = {}, []
-    with progress_bar(len(paths), f"reading {what}", "file", wanted=progress) as bar:
+    with progress_bar(len(paths), f"reading {what}", "file", shows=progress) as bar:
         for path in paths:
             try:
                 with check.located(str(path)):
@@ -217,6 +217,6 @@ def _hashes(
             bar.update()
     if faults:
         more = f"\nand {len(faults) - _SAID_FAULTS} more" * (len(faults) > _SAID_FAULTS)
-        said = "\n".join(faults[:_SAID_FAULTS])
-        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{said}{more}")
+        messages = "\n".join(faults[:_SAID_FAULTS])
+        raise RecipeError(f"{what}: got {len(faults)} of {len(paths)} that cannot be used:\n{messages}{more}")
     return hashes

@@ -1,4 +1,4 @@
-"""Layers of pixels: what an image of a data set may show. ``LAYERS`` says how each is found, and how PNG has it."""
+"""Layers of pixels: the images that a data set may hold. ``LAYERS`` says how each is found, and how PNG has it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from warpshadow.scene.scene import Scene
 from warpshadow.tuning.renderer import Renderer
 
 
-class Shown:
-    """What an image shows; each part is found when a layer asks for it, once.
+class LazyLayers:
+    """Lazy layers of one image: each is computed when first asked for, once.
 
     Args:
         scene: The scene.
         device: Where it is rendered.
-        most_bodies: There are masks for so many, so that images can be stacked; those of no body are 0.
+        most_bodies: Number of masks, so that images can be stacked; masks of missing bodies are 0.
     """
 
     def __init__(self, scene: Scene, device: str, most_bodies: int):
@@ -28,7 +28,7 @@ class Shown:
 
     @functools.cached_property
     def _channels(self) -> Channels:
-        """Those of the renderer's layers, as it calls them."""
+        """Layers of the renderer, by its own names."""
         return self.renderer.layers().channels()
 
     def color(self) -> Channels:
@@ -36,7 +36,7 @@ class Shown:
         return _named("RGBA", self.renderer.render())
 
     def shadow(self) -> Channels:
-        """Direct light on the bodies over that which they would get if nothing blocked any."""
+        """Direct light on the bodies, divided by the same light without blockers."""
         return _named([f"shadow.{color}" for color in "RGB"], self.renderer.shadow())
 
     def some(self, *names: str) -> Channels:
@@ -59,7 +59,7 @@ def _named(names: Sequence[str], values: np.ndarray) -> Channels:
 class Layer(NamedTuple):
     """A layer of pixels."""
 
-    find: Callable[[Shown], Channels]
+    find: Callable[[LazyLayers], Channels]
     """Find its channels."""
     coding: Coding
     """How PNG has their numbers."""
@@ -74,11 +74,11 @@ class Layer(NamedTuple):
 
 
 LAYERS = {
-    "color": Layer(Shown.color, Srgb()),
-    "shadow": Layer(Shown.shadow, Even(8)),
+    "color": Layer(LazyLayers.color, Srgb()),
+    "shadow": Layer(LazyLayers.shadow, Even(8)),
     "depth": Layer(lambda shown: shown.some("Z"), Even(16)),
     "normals": Layer(lambda shown: shown.some("N.X", "N.Y", "N.Z"), Even(8, low=-128 / 127)),  # 128 is 0
     "bodies": Layer(lambda shown: shown.some("body"), Even(8, low=-1, high=254)),
-    "masks": Layer(Shown.masks, Even(8), is_apart=True),
+    "masks": Layer(LazyLayers.masks, Even(8), is_apart=True),
 }
 """The layers, by the names that recipes have for them."""

@@ -1,7 +1,7 @@
 """Channels as pictures in PNG, and back.
 
-PNG has whole numbers, codes. What they stand for differs from image to image; it is said beside each picture, so that
-the channels can be had again, but for rounding:
+PNG has whole numbers, codes. The range of the codes differs from image to image; it is stored beside each picture, so
+that the channels can be decoded, but for rounding:
 
     values = (low (most − code) + high code) / most,   of most = 255 or 65535, range = [low, high]
     color  = alpha sRGB⁻¹(code / 255) / 2^exposure,    alpha = code / 255
@@ -31,7 +31,7 @@ class Coding(Protocol):
     """How the channels of a picture become codes."""
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """The codes of values [height, width, channel], and what is said of them."""
+        """Encode values [height, width, channel]; return the codes and their range."""
         ...
 
 
@@ -41,8 +41,8 @@ class Even:
 
     Args:
         bits: Of a code, 8 or 16.
-        low: What code 0 stands for; less, where an image has less.
-        high: What the largest code stands for; more, where an image has more.
+        low: The value of code 0; lower, where an image goes lower.
+        high: The value of the largest code; higher, where an image goes higher.
     """
 
     bits: int = 8
@@ -51,12 +51,12 @@ class Even:
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """As :class:`Coding` says."""
-        most = 2**self.bits - 1
-        rounding = (self.high - self.low) / most / 2
-        least, largest = float(values.min()), float(values.max())
-        low = least if least < self.low - rounding else self.low
+        maximum = 2**self.bits - 1
+        rounding = (self.high - self.low) / maximum / 2
+        minimum, largest = float(values.min()), float(values.max())
+        low = minimum if minimum < self.low - rounding else self.low
         high = largest if largest > self.high + rounding else self.high
-        codes = np.rint((values.astype(np.float64) - low) / (high - low) * most).clip(0, most)
+        codes = np.rint((values.astype(np.float64) - low) / (high - low) * maximum).clip(0, maximum)
         return codes.astype(np.uint8 if self.bits == 8 else np.uint16), {"range": [low, high]}
 
 
@@ -75,24 +75,24 @@ class Srgb:
 
 
 def as_png(channels: Channels, coding: Coding) -> tuple[bytes, dict[str, Any]]:
-    """A PNG file of channels, 1, 3 or 4 of them; and what is to be said beside it."""
+    """Encode 1, 3 or 4 channels as a PNG file; return it and the range of its codes."""
     codes, about = coding.codes(np.stack([*channels.values()], axis=-1))
     return png_bytes(codes), {"channels": list(channels), **about}
 
 
 def from_png(content: bytes, about: Mapping[str, Any]) -> Channels:
-    """The channels of a PNG file, from what is said beside it.
+    """Decode the channels of a PNG file, given the range of its codes.
 
     Raises:
-        ImageError: for what is no PNG file, or is truncated.
+        ImageError: for a file that is no PNG, or is truncated.
     """
     codes = png_codes(content)
     check.shape("a PNG file of a sample", codes.shape, ("height", "width", len(about["channels"])))
-    most, codes = np.iinfo(codes.dtype).max, codes.astype(np.float64)
+    maximum, codes = np.iinfo(codes.dtype).max, codes.astype(np.float64)
     if "range" in about:
         low, high = about["range"]
-        values = (low * (most - codes) + high * codes) / most
+        values = (low * (maximum - codes) + high * codes) / maximum
     else:
-        color, alpha = codes[..., :3] / most, codes[..., 3:] / most
+        color, alpha = codes[..., :3] / maximum, codes[..., 3:] / maximum
         values = np.concatenate([alpha * srgb_to_linear(color) / 2 ** about["exposure"], alpha], axis=-1)
     return {name: values[..., k].astype(np.float32) for k, name in enumerate(about["channels"])}

@@ -1,4 +1,4 @@
-"""Recipes: TOML that says what a data set consists of, checked key by key (README.md lists the keys)."""
+"""Recipes: TOML files that describe a data set, checked key by key (README.md lists the keys)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility, check_bounc
 from warpshadow.scene.toml_tables import Table
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
-"""What JSON has."""
+"""Values that JSON has."""
 
 _LAYERS = (*LAYERS, "spheres", "light")
-"""What may be written of each scene."""
+"""Parts of each scene that may be written."""
 
 FORMATS = ("exr", "png")
-"""What layers of pixels may be kept as."""
+"""File formats of layers."""
 
 _KEYS = {
     "bodies": ("meshes", "blockers", "creased", "count", "size", "upright", "gap", "albedo", "ground_albedo"),
@@ -37,28 +37,28 @@ _KEYS = {
 
 
 class RecipeError(ValueError):
-    """A recipe that cannot be used: the message says where and what is accepted."""
+    """A recipe that cannot be used: the message names the place and the accepted values."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """What a data set consists of.
+    """Description of a data set.
 
     Args:
         images: Number of images in all splits together.
         seed: Number of the data set, 0 or more.
         shard: Images in a shard; the last one of a split has fewer.
-        layers: What is written of each scene: some of those of :mod:`warpshadow.dataset.layers`, "spheres", "light".
+        layers: Written for each scene: some of :mod:`warpshadow.dataset.layers`, "spheres", "light".
         format: Of the layers of pixels: "exr", as they are, or "png", in 8 and 16 bits.
         splits: Part of the images, and about that part of the meshes and maps, by the name of the split; their sum
             is 1.
-        meshes: Folder of meshes, those in its folders, too; None for simple shapes.
+        meshes: Folder of meshes, searched recursively; None for simple shapes.
         blockers: Spheres that are fitted to each mesh of the folder, or "auto" for as many as it needs.
         creased: The meshes of the folder are parted where faces bend by more [degrees], 0 to 180; None for nowhere. See
             :meth:`warpshadow.Mesh.creased`.
         maps: Folder of environment maps; None for skies and lamps that are drawn.
         size: Width and height of the images [pixels].
-        ranges: What poses, colors, light and cameras are drawn from.
+        ranges: Ranges of poses, colors, light and cameras.
         visibility, supersampling, bounces: As of a :class:`warpshadow.Scene`.
     """
 
@@ -80,7 +80,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         check.whole("images", self.images)
-        check.whole("seed", self.seed, least=0)
+        check.whole("seed", self.seed, minimum=0)
         check.whole("shard", self.shard, what="images")
         check.instance("layers", self.layers, (list, tuple), f"a list of some of {', '.join(map(repr, _LAYERS))}")
         for layer in self.layers:
@@ -91,18 +91,19 @@ class Recipe:
         check.choice("format", self.format, FORMATS)
         object.__setattr__(self, "splits", _checked_splits(self.splits))
         if self.blockers != AUTO:
-            check.whole("blockers", self.blockers, least=0)
+            check.whole("blockers", self.blockers, minimum=0)
         if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
             raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
+        object.__setattr__(self, "visibility", self.visibility.with_method())
         object.__setattr__(self, "size", check.image_size(self.size))
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
 
     def plain(self) -> dict[str, Plain]:
         """All that decides the bits of the images but the files' contents, as JSON has it."""
-        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("meshes", "maps")}
+        table = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in ("meshes", "maps")}
         tables = {"ranges": vars(self.ranges), "visibility": vars(self.visibility), "splits": dict(self.splits)}
-        plain: dict[str, Plain] = json.loads(json.dumps(given | tables))
+        plain: dict[str, Plain] = json.loads(json.dumps(table | tables))
         return plain
 
 
@@ -128,7 +129,7 @@ def load_recipe(path: AnyPath) -> Recipe:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
 
     Raises:
-        RecipeError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
+        RecipeError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file or folder that is not there.
     """
     path = check.path("path", path)
@@ -136,44 +137,44 @@ def load_recipe(path: AnyPath) -> Recipe:
         return _recipe(toml_tables.read(path, "recipe"), path.parent)
 
 
-def _recipe(given: Table, folder: Path) -> Recipe:
+def _recipe(table: Table, folder: Path) -> Recipe:
     plain = ("images", "seed", "shard", "layers", "format")
-    check.known_keys("the recipe", given, (*plain, *_KEYS))
-    bodies, light, camera, visibility, splits = (dict(_table(given, name)) for name in _KEYS)
-    recipe = toml_tables.make(Recipe, _taken(dict(given), *plain))
+    check.known_keys("the recipe", table, (*plain, *_KEYS))
+    bodies, light, camera, visibility, splits = (dict(_table(table, name)) for name in _KEYS)
+    recipe = toml_tables.make(Recipe, _pop_keys(dict(table), *plain))
     with check.located("[bodies]"):
-        found = _taken(bodies, "blockers", "creased")
+        result = _pop_keys(bodies, "blockers", "creased")
         if "meshes" in bodies:
-            found["meshes"] = _folder(bodies, "meshes", folder)
-        elif found:
-            raise ValueError(f"{next(iter(found))}: got it without meshes, for which it is")
-        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **bodies))
+            result["meshes"] = _folder(bodies, "meshes", folder)
+        elif result:
+            raise ValueError(f"{next(iter(result))}: got it without meshes, for which it is")
+        recipe = replace(recipe, **result, ranges=replace(recipe.ranges, **bodies))
     with check.located("[light]"):
-        found = _taken(light, "bounces")
+        result = _pop_keys(light, "bounces")
         if "maps" in light:
-            found["maps"] = _folder(light, "maps", folder)
+            result["maps"] = _folder(light, "maps", folder)
         elif "rotation" in light:
             raise ValueError("rotation: got it without maps, which it turns")
-        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **light))
+        recipe = replace(recipe, **result, ranges=replace(recipe.ranges, **light))
     with check.located("[camera]"):
-        found = _taken(camera, "size", "supersampling")
-        recipe = replace(recipe, **found, ranges=replace(recipe.ranges, **camera))
+        result = _pop_keys(camera, "size", "supersampling")
+        recipe = replace(recipe, **result, ranges=replace(recipe.ranges, **camera))
     with check.located("[visibility]"):
         recipe = replace(recipe, visibility=Visibility.of(visibility))
-    if "splits" in given:
+    if "splits" in table:
         with check.located("[splits]"):
             recipe = replace(recipe, splits=splits)
     return recipe
 
 
-def _taken(table: Table, *keys: str) -> Table:
-    """Take what a table has of some keys out of it."""
+def _pop_keys(table: Table, *keys: str) -> Table:
+    """Pop some keys from a table and return them."""
     return {key: table.pop(key) for key in keys if key in table}
 
 
-def _table(given: Table, name: str) -> Table:
+def _table(values: Table, name: str) -> Table:
     with check.located(f"[{name}]"):
-        table: Table = given.get(name, {})
+        table: Table = values.get(name, {})
         toml_tables.check_table(table)
         known = _KEYS[name]
         if known is not None:

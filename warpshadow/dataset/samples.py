@@ -1,10 +1,10 @@
-"""Samples: an image and what it shows, as the files that a shard has of it; written and read.
+"""Samples: an image and its labels, as files of a shard; written and read.
 
 A sample has a key, the number of its image in nine digits, and these files:
 
     KEY.exr          layers of pixels, as channels; or, where the recipe says so, KEY.color.png, KEY.depth.png, …
-    KEY.spheres.npy  what stands in for the bodies, float32 of shape [sphere, 5]: center, radius, number of the body
-    KEY.json         how the scene was drawn; README.md says what it has
+    KEY.spheres.npy  the bodies' spheres, float32 of shape [sphere, 5]: center, radius, number of the body
+    KEY.json         how the scene was drawn; README.md lists its keys
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from warpshadow.assets.image import exr_bytes, exr_channels
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.check import AnyPath
 from warpshadow.dataset.data_set import DataSet
-from warpshadow.dataset.layers import LAYERS, Shown
+from warpshadow.dataset.layers import LAYERS, LazyLayers
 from warpshadow.dataset.png import Channels, as_png, from_png
 from warpshadow.dataset.recipe import Plain
 from warpshadow.scene.files import camera_table
@@ -36,7 +36,7 @@ LIGHT_ORDER = 4
 
 
 class Sample(NamedTuple):
-    """An image and what it shows, as read from a shard."""
+    """An image and its labels, as read from a shard."""
 
     key: str
     """Number of the image, in nine digits."""
@@ -64,17 +64,17 @@ class Sample(NamedTuple):
 def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     """Render an image of a data set: its files, by the ends of their names.
 
-    The bits depend on the recipe, the number, and what is in the meshes and maps of the scene; neither on what was
-    rendered before nor on the number of threads.
+    The bits depend on the recipe, the number, and the content of the scene's meshes and maps; neither on earlier
+    renders nor on the number of threads.
     """
     recipe, drawn = data_set.recipe, data_set.draw(number)
-    shown = Shown(drawn.scene, data_set.device, recipe.ranges.count[1] + 1)
-    found = {name: layer.find(shown) for name, layer in LAYERS.items() if name in recipe.layers}
+    shown = LazyLayers(drawn.scene, data_set.device, recipe.ranges.count[1] + 1)
+    result = {name: layer.find(shown) for name, layer in LAYERS.items() if name in recipe.layers}
     about, files = _about(data_set, number, drawn), {}
-    if found and recipe.format == "exr":
-        files["exr"] = exr_bytes({name: values for layer in found.values() for name, values in layer.items()})
-    elif found:
-        files, about["png"] = _pictures(found)
+    if result and recipe.format == "exr":
+        files["exr"] = exr_bytes({name: values for layer in result.values() for name, values in layer.items()})
+    elif result:
+        files, about["png"] = _pictures(result)
     if "spheres" in recipe.layers:
         stream = io.BytesIO()
         np.save(stream, _spheres(drawn.scene))
@@ -83,11 +83,11 @@ def render_sample(data_set: DataSet, number: int) -> dict[str, bytes]:
     return files
 
 
-def _pictures(found: dict[str, Channels]) -> tuple[dict[str, bytes], dict[str, Plain]]:
-    """PNG files of layers, by the ends of their names; and what is said of each."""
+def _pictures(result: dict[str, Channels]) -> tuple[dict[str, bytes], dict[str, Plain]]:
+    """PNG files of layers, by suffix; and the range of the codes of each."""
     files: dict[str, bytes] = {}
     about: dict[str, Plain] = {}
-    for name, channels in found.items():
+    for name, channels in result.items():
         for ending, shown in LAYERS[name].pictures(name, channels).items():
             files[ending], about[ending] = as_png(shown, LAYERS[name].coding)
     return files, about
@@ -147,7 +147,7 @@ def read_shard(path: AnyPath) -> Iterator[Sample]:
         path: A .tar file that :func:`warpshadow.dataset.write_shards` wrote.
 
     Raises:
-        ValueError: for what is not a shard, or is damaged.
+        ValueError: for a file that is no shard, or is damaged.
         FileNotFoundError: for a file that is not there.
     """
     path = check.file("path", path)

@@ -27,7 +27,7 @@ from warpshadow.device.workers import run_tasks
 from warpshadow.spheres.fit import ALGORITHM_VERSION
 
 INDEX = "dataset.json"
-"""The file beside the shards that says what they hold."""
+"""Index file beside the shards."""
 
 
 class Shard(NamedTuple):
@@ -52,24 +52,24 @@ def shards_of(data_set: DataSet) -> list[Shard]:
 def write_shards(
     data_set: DataSet, folder: AnyPath, *, workers: int | None = None, progress: bool = True
 ) -> list[Path]:
-    """Render the images of a data set into shards, those that are not there yet; bits are the same for any workers.
+    """Render the missing shards of a data set; the bits do not depend on the workers.
 
-    A shard has a temporary name until it is whole. So what was interrupted goes on, at the shards that were begun. Each
+    A shard has a temporary name until it is whole. An interrupted run resumes at the unfinished shards. Each
     kind of warning is said once, with the number of the first image that draws it.
 
     Args:
-        data_set: What is drawn.
-        folder: Made if it is not there. It gets the shards and ``dataset.json``, which says what they hold.
+        data_set: The data set to render.
+        folder: Made if it is not there. It gets the shards and ``dataset.json``, their index.
         workers: Processes that render, which share the threads; by default one for each thread, on a GPU one. 1 is this
             process, on all threads.
         progress: Show progress.
 
     Returns:
-        The shards, also those that were there.
+        All shards, including the ones already there.
 
     Raises:
         FileExistsError: for a folder of another data set, and for one into which another process writes.
-        ChildProcessError: for an image that a worker could not render; what was written before stays.
+        ChildProcessError: for an image that a worker could not render; finished shards stay.
     """
     check.instance("data_set", data_set, DataSet, "a DataSet, as DataSet(load_recipe(path)) makes one")
     folder = check.path("folder", folder)
@@ -79,13 +79,13 @@ def write_shards(
         _begin(folder, describe(data_set))
         missing = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing for number in shard.numbers]
-        rendered, said = _rendered(data_set, numbers, _worker_count(data_set, workers)), set[str]()
-        with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", wanted=progress) as bar:
+        rendered, messages = _rendered(data_set, numbers, _worker_count(data_set, workers)), set[str]()
+        with contextlib.closing(rendered), progress_bar(len(numbers), "rendering", "image", shows=progress) as bar:
             for shard in missing:
                 with _new_archive(folder / shard.name) as archive:
                     for number in shard.numbers:
                         sample, remarks = next(rendered)
-                        _say(remarks, number, said)
+                        _say(remarks, number, messages)
                         _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
@@ -98,7 +98,7 @@ def _worker_count(data_set: DataSet, workers: int | None) -> int:
 
 
 class _Rendered(NamedTuple):
-    """An image, and what was said meanwhile."""
+    """A rendered image, and the warnings it gave."""
 
     files: dict[str, bytes]
     """By the ends of their names."""
@@ -110,18 +110,18 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         files = render_sample(data_set, number)
-    gc.collect()  # renderers refer to themselves: those of many images would wait to be collected, in 1 GB
-    gc.freeze()  # what is left stays, and is not looked through after the next image
-    return _Rendered(files, [str(each.message) for each in caught])
+    gc.collect()  # renderers are reference cycles: without a collection, those of many images pile up to 1 GB
+    gc.freeze()  # freeze the remaining objects: later collections skip them
+    return _Rendered(files, [str(item.message) for item in caught])
 
 
-def _say(remarks: list[str], number: int, said: set[str]) -> None:
-    """Warn of what was not said of another image; names and numbers make no difference."""
+def _say(remarks: list[str], number: int, messages: set[str]) -> None:
+    """Give each warning once for all images, ignoring names and numbers."""
     for remark in remarks:
         kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
-        if not kinds <= said:
+        if not kinds <= messages:
             check.warn(f"image {number}: {remark}")
-        said.update(kinds)
+        messages.update(kinds)
 
 
 def _rendered(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:
@@ -162,7 +162,7 @@ def _add(archive: tarfile.TarFile, number: int, sample: dict[str, bytes]) -> Non
 
 
 def describe(data_set: DataSet) -> dict[str, Plain]:
-    """What decides the bits of all shards, and what they hold, as ``dataset.json`` has it."""
+    """Everything that decides the bits of the shards, as stored in ``dataset.json``."""
     shards = shards_of(data_set)
     splits: dict[str, Plain] = {}
     for split, (meshes, maps) in data_set.stocks.items():
@@ -194,17 +194,17 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _begin(folder: Path, about: dict[str, Plain]) -> None:
-    """Write the index, or compare it; clear away what was interrupted."""
+    """Write the index, or compare it; remove partial files of an interrupted run."""
     path = folder / INDEX
     if path.exists():
         with check.located(str(path)):
-            found = json.loads(path.read_text("utf-8"))
-        if difference := _difference(found, about):
+            result = json.loads(path.read_text("utf-8"))
+        if difference := _difference(result, about):
             raise FileExistsError(
                 f"{folder}: got shards of another data set ({difference}), expected those of this one, or a new folder"
             )
     else:
-        if others := sorted(each.name for each in folder.iterdir() if not each.name.startswith(".")):
+        if others := sorted(item.name for item in folder.iterdir() if not item.name.startswith(".")):
             raise FileExistsError(f"{folder}: got a folder with {others[0]} in it, expected a new one or one of shards")
         with files.whole(path) as unfinished:
             unfinished.write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -212,13 +212,13 @@ def _begin(folder: Path, about: dict[str, Plain]) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _difference(found: Plain, wanted: Plain, where: str = "") -> str:
+def _difference(result: Plain, requested: Plain, where: str = "") -> str:
     """The first difference of two indices, in words; nothing if there is none."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in [*wanted, *(key for key in found if key not in wanted)]:
-            if key not in found or key not in wanted:
-                return f"{where}{key} is {'new' if key in wanted else 'gone'}"
-            if difference := _difference(found[key], wanted[key], f"{where}{key}: "):
+    if isinstance(result, dict) and isinstance(requested, dict):
+        for key in [*requested, *(key for key in result if key not in requested)]:
+            if key not in result or key not in requested:
+                return f"{where}{key} is {'new' if key in requested else 'gone'}"
+            if difference := _difference(result[key], requested[key], f"{where}{key}: "):
                 return difference
         return ""
-    return "" if found == wanted else f"{where}was {check.described(found)}, is {check.described(wanted)}"
+    return "" if result == requested else f"{where}was {check.described(result)}, is {check.described(requested)}"

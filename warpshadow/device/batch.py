@@ -20,10 +20,10 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
     first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
     for name, got in counts.items():
         if got not in (1, count):
-            each, whole = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
+            item, whole = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
             raise ValueError(
                 f"{name}: got a batch of {got}, expected 1 or {count}, as {first} has; for all {got * count} pairs "
-                f"repeat each of {each} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {whole} "
+                f"repeat each of {item} {got} times in a row, in torch repeat_interleave({got}, 0), and all of {whole} "
                 f"{count} times, repeat({count}, 1, …)"
             )
     return count

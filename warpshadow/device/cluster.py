@@ -1,4 +1,4 @@
-"""Ray clusters: tasks as those of :mod:`warpshadow.device.workers`, shared out among the machines of a cluster."""
+"""Ray clusters: run the tasks of :mod:`warpshadow.device.workers` on the machines of a cluster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterable
 from typing import Any, TypeVar
 
 from warpshadow import check
-from warpshadow.device.workers import Ended, PackError, WorkerDied, answer, pack, set_up, unpack
+from warpshadow.device.workers import PackError, TaskResult, WorkerDied, answer, pack, set_up, unpack
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -28,11 +28,11 @@ def run_on_ray(
     workers: int | None = None,
     attempts: int = 2,
     is_on_gpu: bool = False,
-) -> Generator[Ended[Task, Result], None, None]:
+) -> Generator[TaskResult[Task, Result], None, None]:
     """Do tasks on a Ray cluster, each on one core, and one GPU if it needs it.
 
     Args:
-        function: What does a task.
+        function: Called for each task.
         tasks: Taken one by one as cores are free.
         address: Of the cluster: "HOST:PORT", or "auto" for that of which this machine is part.
         workers: How many tasks at a time, at most; by default one for each of the cluster's cores.
@@ -65,24 +65,24 @@ def run_on_ray(
         while True:
             _await(head)
             # some more than there are cores for, so that none waits for us
-            most = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
-            for task in itertools.islice(remaining, max(0, most - len(pending))):
+            maximum = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
+            for task in itertools.islice(remaining, max(0, maximum - len(pending))):
                 try:
                     pending[remote.remote(function, pack(task, ray.cloudpickle.dumps))] = task
                 except PackError as error:
-                    yield Ended(task, None, error)
+                    yield TaskResult(task, None, error)
             if not pending:
                 return
             for reference in ray.wait([*pending], timeout=_PATIENCE / 2)[0]:
                 task = pending.pop(reference)
                 try:
-                    ended = Ended(task, *unpack(ray.get(reference)))
+                    ended = TaskResult(task, *unpack(ray.get(reference)))
                 except ray.exceptions.LocalRayletDiedError as error:
                     raise ConnectionError("ray: this machine's node has died") from error
                 except ray.exceptions.RayTaskError as error:
-                    ended = Ended(task, None, RuntimeError(str(error).splitlines()[-1]))
+                    ended = TaskResult(task, None, RuntimeError(str(error).splitlines()[-1]))
                 except ray.exceptions.RayError as error:
-                    ended = Ended(task, None, WorkerDied(f"{str(error).splitlines()[0]} ({attempts} times)"))
+                    ended = TaskResult(task, None, WorkerDied(f"{str(error).splitlines()[0]} ({attempts} times)"))
                 yield ended
     finally:
         if is_ours:
@@ -108,4 +108,4 @@ def _alone(function: Callable[[Any], Any], packed: bytes) -> bytes:
     import ray
 
     set_up(1)
-    return answer(function, packed, ray.cloudpickle.dumps, Exception)  # what else is raised ends tasks for Ray
+    return answer(function, packed, ray.cloudpickle.dumps, Exception)  # other exceptions end the task for Ray

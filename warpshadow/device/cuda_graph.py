@@ -9,10 +9,10 @@ they take to run. A CUDA graph holds all of them, forward and backward, and is l
         loss = step()
         optimizer.step([turn.grad.flatten()])   # writes to turn where it is
 
-What is captured is what is launched, on arrays where they are in memory: what changes from one call to the next has to
-be written into the same arrays (``array.assign``, ``wp.copy``), and what Python decides is decided at the capture. So
-nothing is read back meanwhile: inputs are not checked for NaN and indices, and images have room for as many silhouettes
-as there can be. A function of other shapes takes a graph of its own.
+A capture records launches on arrays at their addresses: an input that changes between calls has to be written into the
+same array (``array.assign``, ``wp.copy``), and decisions in Python are fixed at the capture. So nothing is read back
+meanwhile: inputs are not checked for NaN and indices, and images have room for as many silhouettes as there can be. A
+function of other shapes takes a graph of its own.
 
 Memory that is allocated inside belongs to the graph (by CUDA's stream-ordered allocator, Warp's default), so tapes and
 arrays that the function makes and lets go cost nothing at a replay.
@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 
 
 def is_readable(device: wp.Device) -> bool:
-    """Whether arrays can be read without waiting: on a CPU, unless what would fill them is only being captured."""
+    """Whether arrays can be read without waiting: on a CPU, unless their launches are only being captured."""
     return device.is_cpu and not device.is_capturing
 
 
@@ -43,11 +43,11 @@ def is_captured(device: wp.Device) -> bool:
 class Captured(Generic[Result]):
     """A function that is called as it is at first, captured at the second call, and replayed from then on.
 
-    The first call compiles kernels, checks inputs and fills what is kept between calls, none of which a capture can do.
+    The first call compiles kernels, checks inputs and fills caches, none of which a capture can do.
     Each call runs the function's launches once.
 
     Args:
-        function: What to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
+        function: The function to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
         device: Where it launches.
 
     Raises:
@@ -89,7 +89,7 @@ def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) 
 
     Args:
         loss: Evaluates to a float32 array of one item, by launches that a tape records.
-        variables: Arrays that require a gradient; what was in their gradients is overwritten.
+        variables: Arrays that require a gradient; their gradients are overwritten.
 
     Returns:
         A function that returns the loss, as an array on its device.

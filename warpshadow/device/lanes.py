@@ -9,7 +9,7 @@ Small functions on structs are inlined by force. Otherwise LLVM calls them, and 
 kernels of visibility take 1.1 to 1.35 times as long.
 
 How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times what else could be chosen.
+are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times the alternatives.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from warpshadow.maths.directions import CHUNK
 
 LANES_VARIABLE = "WARPSHADOW_LANES"
 BITS_VARIABLE = "WARPSHADOW_VECTOR_BITS"
-"""Environment variables: lanes, and bits of a vector register, in place of those that follow from the CPU."""
+"""Environment variables: lanes, and bits of a vector register, instead of the CPU's own."""
 
 LANE_COUNTS = (1, 2, 4, 8, 16)
 REGISTER_BITS = (128, 256, 512)
@@ -63,21 +63,21 @@ def cpu_name() -> str:
 
 
 def _cpu_features() -> frozenset[str]:
-    """What LLVM finds that the CPU can do, by its names; empty where Warp does not tell."""
+    """CPU features that LLVM detects, by its names; empty where Warp does not tell."""
     return frozenset(_diagnostics().get("cpu_features", ()))
 
 
 def _own_flags() -> str:
-    """Warp's flags for all CPU kernels, which those of a module replace."""
+    """Warp's flags for all CPU kernels, which a module's own flags replace."""
     flags = getattr(wp.config, "cpu_compiler_flags", None)
     return _HOST_FLAG if flags is None else flags
 
 
 def _from_environment(name: str, choices: tuple[int, ...]) -> int | None:
-    """What an environment variable says; None if it says nothing.
+    """Parse an environment variable; None if it is unset or empty.
 
     Raises:
-        ValueError: for what is not among the choices.
+        ValueError: for a value that is not among the choices.
     """
     text = os.environ.get(name)
     if not text:
@@ -105,8 +105,8 @@ def lane_count(device: wp.DeviceLike) -> int:
 def compiler_flags(lanes: int) -> str:
     """The compiler's flags for CPU kernels with a number of lanes.
 
-    Loops are left whole where those over lanes fit a register, and so do those over bands, of which there are 8 at
-    most. Elsewhere Warp's own flags unroll them: with registers of 128 bits they are up to twice as fast.
+    Loops over lanes that fit a register are not unrolled, nor are loops over bands, of which there are 8 at most.
+    Elsewhere Warp's own flags unroll them: with registers of 128 bits they are up to twice as fast.
     """
     own, bits = _own_flags(), register_bits()
     if _HOST_FLAG not in own.split():
@@ -118,7 +118,7 @@ def compiler_flags(lanes: int) -> str:
 
 @functools.cache
 def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
-    """Join flags, but for those that the compiler refuses, of which a warning tells."""
+    """Join flags, without the ones that the compiler refuses, of which a warning tells."""
     if _builds(" ".join((base, *flags))):
         return " ".join((base, *flags))
     refused = [flag for flag in flags if not _builds(f"{base} {flag}")]
@@ -130,13 +130,13 @@ def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
 def _make_empty(flags: str) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={"cpu_compiler_flags": flags}, enable_backward=False)
     def do_nothing():
-        """What the compiler makes of the flags is all that matters."""
+        """Only the compiler's output matters."""
 
     return do_nothing
 
 
 def _builds(flags: str) -> bool:
-    """Whether a CPU kernel can be built with flags. Warp keeps what it builds, so that is quick the next time."""
+    """Whether a CPU kernel can be built with flags. Warp caches builds, so the next time is quick."""
     try:
         wp.launch(_make_empty(flags), dim=1, device="cpu", record_tape=False)
     except Exception:  # Warp raises no other
@@ -161,7 +161,7 @@ def use_vector_registers(module_name: str) -> None:
     wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
 
 
-def group_count(vertex_count: int, lanes: int) -> int:
+def block_count(vertex_count: int, lanes: int) -> int:
     """Groups, and so threads, that ``vertex_count`` receivers take."""
     return -(-vertex_count // lanes)
 
@@ -190,13 +190,14 @@ class LaneFunctions(NamedTuple):
     """Kernel functions on lanes that Warp's vectors lack."""
 
     is_any_above: wp.Function
+    bits_above: wp.Function
     dot: wp.Function
-    along: wp.Function
+    dot_direction: wp.Function
     offset: wp.Function
     scale: wp.Function
     add: wp.Function
     subtract: wp.Function
-    find_group: wp.Function
+    find_block: wp.Function
     load: wp.Function
     load_products: wp.Function
     add_vectors: wp.Function
@@ -223,6 +224,14 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     def is_any_above(value: Lane, limit: float) -> bool: ...  # type: ignore[empty-body]
 
     @wp.func_native(f"""
+    unsigned bits = 0;
+    for (int lane = 0; lane < {lanes}; ++lane)
+        bits |= value.c[lane] > limit ? 1u << lane : 0u;
+    return (int)bits;
+    """)
+    def bits_above(value: Lane, limit: float) -> int: ...  # type: ignore[empty-body]
+
+    @wp.func_native(f"""
     float part[{lanes}];
     for (int lane = 0; lane < {lanes}; ++lane)
         part[lane] = value.c[lane];
@@ -238,7 +247,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         return wp.cw_mul(a.x, b.x) + wp.cw_mul(a.y, b.y) + wp.cw_mul(a.z, b.z)
 
     @wp.func(inline=True)
-    def along(direction: wp.vec3, a: Vectors):
+    def dot_direction(direction: wp.vec3, a: Vectors):
         """Dot products with one direction."""
         return direction[0] * a.x + direction[1] * a.y + direction[2] * a.z
 
@@ -260,7 +269,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         return Vectors(a.x - b.x, a.y - b.y, a.z - b.z)
 
     @wp.func
-    def find_group(row: int, vertex_count: int):
+    def find_block(row: int, vertex_count: int):
         """Instance and group of a row, where the groups of all instances follow each other."""
         return split_row(row, (vertex_count + (lanes - 1)) // lanes)
 
@@ -347,13 +356,14 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
 
     return LaneFunctions(
         is_any_above,
+        bits_above,
         dot,
-        along,
+        dot_direction,
         offset,
         scale,
         add,
         subtract,
-        find_group,
+        find_block,
         load,
         load_products,
         add_vectors,
@@ -367,7 +377,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
 
 
 def as_chunks(rows: wp.array | None) -> wp.array | None:
-    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; what is left over is not in it."""
+    """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; the remainder is left out."""
     if rows is None:
         return None
     instances, row_count, count = rows.shape

@@ -1,8 +1,8 @@
-"""Launching: kernels run here, and get on the tape what their gradients need.
+"""Launching: run kernels, and record on the tape what their gradients need.
 
-A kernel has either Warp's own adjoint, which Warp's tape plays back, or one written by hand as another kernel
-(``enable_backward=False``), which :func:`differentiable` pairs with it. Either way a result requires a gradient if an
-array that it depends on does, and nothing is recorded if none does.
+A kernel has either Warp's own adjoint, which the tape plays back, in slices where the kernel runs in slices; or one
+written by hand as another kernel (``enable_backward=False``), which :func:`differentiable` pairs with it. Either way a
+result requires a gradient if an array that it depends on does, and nothing is recorded if none does.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warpshadow.device.memory import in_huge_pages, require_gradient
-from warpshadow.device.parallel import Scratch, launch_slices
+from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint
 from warpshadow.device.warp_internals import is_view, scalar_type
 
@@ -25,11 +25,11 @@ def launch(
     sums: Sequence[wp.array | None] = (),
     scratch: Sequence[Scratch] = (),
     cost: float | None = None,
+    shared: Sequence[wp.array | None] = (),
 ) -> None:
     """Launch a kernel on the device of its arrays.
 
-    Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded. One
-    that has a cost has no adjoint of Warp's: :func:`differentiable` pairs it with another.
+    Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded.
 
     Args:
         kernel: Its arguments are inputs, scratch memory, outputs and sums; before them ``first_row`` and ``worker`` if
@@ -37,22 +37,28 @@ def launch(
         dim: Threads in Warp's sense; if the kernel has a cost, the first dimension is that of rows, which write to
             different places.
         inputs, outputs: Arguments. An output that is to require a gradient must not be a view made before it does.
-        sums: Outputs that all rows add to; None for those that are not wanted.
+        sums: Outputs that all rows add to; None to skip one.
         scratch: Memory for a kernel that has a cost: a row for each worker on a CPU, and for each thread on a GPU.
         cost: Roughly how long a thread takes [ns]: on a CPU the launch is cut into slices if they are worth it, which
             run on all cores (:mod:`warpshadow.device.parallel`). None runs it on one.
+        shared: Inputs that several rows read, of a kernel that has a cost and Warp's own adjoint: all rows add to their
+            gradients. To a place in the gradient of another input only one row may add.
     """
     device = next(value.device for value in (*outputs, *sums, *inputs) if isinstance(value, wp.array))
-    if cost is not None:
-        assert kernel.options.get("enable_backward") is False, f"{kernel.key}: slices are not recorded"
-        launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
-        return
     is_wanted = kernel.options.get("enable_backward") is not False and varies(inputs)
     if is_wanted:
         for output in outputs:
             if output is not None:
-                _require_gradient(output, kernel)
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[*outputs, *sums], device=device, record_tape=is_wanted)
+                _require_gradient(in_huge_pages(output), kernel)
+    if cost is None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[*outputs, *sums], device=device, record_tape=is_wanted)
+        return
+    launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
+    if is_wanted:
+        assert not (scratch or sums), f"{kernel.key}: Warp's adjoint knows neither scratch memory nor sums"
+        options = {"cost": 2 * cost, "inputs": inputs, "outputs": outputs, "shared": shared, "device": device}
+        arrays = [value for value in (*inputs, *outputs) if isinstance(value, wp.array)]
+        record_adjoint(lambda: launch_adjoint_slices(kernel, dim, **options), arrays)
 
 
 def differentiable(
@@ -65,11 +71,11 @@ def differentiable(
 
     Args:
         forward: Launches that write the result, which they get.
-        adjoint: Launches that add to the gradients of the variables, those that have one; they get the result's. It is
+        adjoint: Launches that add to the gradients of the variables that have one; they get the result's. It is
             called whenever the tape plays back, and not at all where no variable requires a gradient.
         result: Memory for the result: ``wp.empty`` if it is large, since memory that was written to stays in small
             pages. It requires a gradient if a variable does.
-        variables: What the result depends on differentiably; None is passed over.
+        variables: Arrays that the result depends on differentiably; None is skipped.
 
     Returns:
         The result.

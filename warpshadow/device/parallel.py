@@ -1,14 +1,14 @@
 """All cores: kernels that take long on a CPU run in slices, on threads of a pool.
 
 Warp runs a CPU kernel on the thread that launches it, one item after another. It calls the kernel through ctypes, which
-lets go of Python's lock; so the rows of a launch are cut into slices that several threads run at once. What a kernel
-needs for that is in its first two arguments:
+lets go of Python's lock; so the rows of a launch are cut into slices that several threads run at once. The first two
+arguments of a kernel serve this:
 
     first_row   the slice's first row, to which it adds the row that Warp tells it
     worker      which thread runs it, so which scratch memory is its own; -1 on a GPU, where each row has some
 
 Where rows add to the same numbers, each slice adds to numbers of its own, which are then summed in the slices' order.
-So results are the same to the bit whatever the number of threads. A GPU gets the whole launch as one slice.
+So results are bit-equal for any number of threads. A GPU gets the whole launch as one slice.
 """
 
 import collections
@@ -27,10 +27,10 @@ from warpshadow.device.warp_internals import resized_launch
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
 _LEAST_WORK = 4.0e5
-"""Nanoseconds of work that a slice has at least: waking a thread and fetching what it reads take a tenth of that."""
+"""Minimum work of a slice [ns]: waking a thread and fetching its inputs take a tenth of that."""
 
 _SLICES_PER_THREAD = 4
-"""Rows differ in how long they take; threads that are done early take what slices are left."""
+"""Rows differ in cost; threads that finish early take the remaining slices."""
 
 _SUMMED_SLICES = 16
 """Most slices of a launch whose sums are its slices' own."""
@@ -57,7 +57,7 @@ def set_thread_count(count: int | None) -> None:
     """Set how many threads kernels run on on a CPU; results do not depend on it.
 
     Args:
-        count: Positive; None for what the environment variable WARPSHADOW_NUM_THREADS says, or all cores.
+        count: Positive; None for the environment variable WARPSHADOW_NUM_THREADS, or all cores.
 
     Raises:
         ValueError: for another count.
@@ -105,6 +105,21 @@ def run_length(device: wp.Device, width: int) -> int:
     return 1 if device.is_cuda else width
 
 
+def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[int, int]:
+    """Dimensions of a launch over runs of samples of all instances; :func:`find_run` says which run a thread owns.
+
+    On a CPU a slice has all instances of a run, so no other adds to the gradient of what serves them all. On a GPU
+    neighboring threads own neighboring samples.
+    """
+    return (instances, run_count) if device.is_cuda else (run_count, instances)
+
+
+@wp.func
+def find_run(worker: int, row: int, column: int):
+    """Instance and run of a thread, by the row and column of its launch."""
+    return wp.where(worker < 0, row, column), wp.where(worker < 0, column, row)
+
+
 def strip_count(device: wp.Device) -> int:
     """Threads that share a face or an edge: on CUDA several, so that none follows a huge one alone."""
     return 16 if device.is_cuda else 1
@@ -122,40 +137,92 @@ def launch_slices(
     device: wp.Device,
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
-    dim = (dim,) if isinstance(dim, int) else dim
-    workers = thread_count()
-    rows = workers if device.is_cpu else math.prod(dim)
-    before = [0, 0 if device.is_cpu else -1, *inputs]
-    before += [wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch]
-    before += outputs
-    summed = {place: array for place, array in enumerate(sums, len(before)) if array is not None}
-    options = {"inputs": [*before, *sums], "device": device, "record_tape": False}
-    total = math.prod(dim)
-    most = _SLICES_PER_THREAD * workers
+    rows = thread_count() if device.is_cpu else math.prod(_shape(dim))
+    before = [*inputs, *(wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch), *outputs]
+    summed = {place: array for place, array in enumerate(sums, 2 + len(before)) if array is not None}
+    _launch_slices(kernel, dim, cost, [*before, *sums], summed, None, device)
+
+
+def launch_adjoint_slices(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    *,
+    cost: float,
+    inputs: Sequence[Any],
+    outputs: Sequence[wp.array | None],
+    shared: Sequence[wp.array | None],
+    device: wp.Device,
+) -> None:
+    """Launch Warp's adjoint of a kernel as :func:`launch_slices` does the kernel; it adds to gradients of inputs.
+
+    Args:
+        shared: Inputs to whose gradients all rows add.
+    """
+    arguments = [*inputs, *outputs]
+    gradients = [value.grad if isinstance(value, wp.array) else wp.Tape().get_adjoint(value) for value in arguments]
+    summed = {
+        place: value.grad
+        for place, value in enumerate(inputs, 2)
+        if isinstance(value, wp.array) and value.requires_grad and any(value is array for array in shared)
+    }
+    _launch_slices(kernel, dim, cost, arguments, summed, gradients, device)
+
+
+def _shape(dim: int | Sequence[int]) -> Sequence[int]:
+    return (dim,) if isinstance(dim, int) else dim
+
+
+def _launch_slices(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    cost: float,
+    arguments: Sequence[Any],
+    summed: dict[int, wp.array],
+    gradients: Sequence[wp.array | None] | None,
+    device: wp.Device,
+) -> None:
+    """Launch a kernel, or its adjoint where gradients of its arguments are given.
+
+    Args:
+        summed: What all rows add to, by the place of the argument that it is, or is the gradient of.
+    """
+    dim, workers, is_adjoint = _shape(dim), thread_count(), gradients is not None
+    options: dict[str, Any] = {"inputs": [0, 0 if device.is_cpu else -1, *arguments], "device": device}
+    if gradients is not None:
+        options |= {"adj_inputs": [None, None, *gradients], "adjoint": True}
+    maximum = _SLICES_PER_THREAD * workers
     if summed:  # as many for any number of threads
-        most = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
+        maximum = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
-    slice_count = min(dim[0], most, int(total * cost / _LEAST_WORK)) if is_divisible else 1
+    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / _LEAST_WORK)) if is_divisible else 1
     if slice_count <= 1 or (not summed and workers == 1):
-        wp.launch(kernel, dim=dim, **options)
+        wp.launch(kernel, dim=dim, **options, record_tape=False)
         return
     own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
-    command = wp.launch(kernel, dim=dim, **options, record_cmd=True)
+    command = wp.launch(kernel, dim=dim, **options, record_tape=False, record_cmd=True)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
     slices: list[wp.Launch] = []
     for number, (first, end) in enumerate(itertools.pairwise(starts)):
         piece = resized_launch(command, [end - first, *dim[1:]])
         piece.set_param_at_index(0, first)
         for place, parts in own.items():
-            piece.set_param_at_index(place, parts[number])
+            if is_adjoint:
+                piece.set_param_at_index(place, _with_gradient(arguments[place - 2], parts[number]))
+            piece.set_param_at_index(place, parts[number], adjoint=is_adjoint)
         slices.append(piece)
     _share(slices, workers)
     for place, parts in own.items():
         summed[place].numpy()[...] += parts.numpy().sum(axis=0)
 
 
+def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
+    """The same array with another gradient: to that a kernel adds where it reads a row of the array as an array."""
+    assert array.is_contiguous
+    return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
+
+
 def _share(slices: Sequence[wp.Launch], workers: int) -> None:
-    """Run slices on the calling thread and those of the pool.
+    """Run slices on the calling thread and the threads of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
     kernel to kernel; one that is done takes over from the end of another's part. Threads that got no core before all

@@ -1,36 +1,49 @@
-"""Progress bars: one for one wait, after a second, in terminals and notebooks; none in files."""
+"""Progress: bars in terminals and notebooks, from a second on; elsewhere a line every ten seconds.
+
+One wait has one bar or line. Work within it, such as the compilation of kernels, is named there, too.
+"""
 
 from __future__ import annotations
 
 import builtins
 import contextlib
+import itertools
+import os
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
-_DELAY = 1.0  # before a bar shows [s]
+from warpshadow.device.parallel import thread_count
+from warpshadow.device.warp_internals import around_compilation
+
+_DELAY = 1.0
+"""Time before a bar shows, and between its states where nothing is done [s]."""
+
+_EVERY = 10.0
+"""Time between lines [s]."""
+
+LONG = 30.0
+"""Time of work that is announced, with the way around it [s]."""
 
 
-class _Shown(threading.local):
-    """The bar that a thread shows."""
-
-    bar: Any = None
-
-
-class _Wish:
-    """Whether bars may show, in all of the process."""
+class _Setting:
+    """Whether bars and lines may show, in all of the process."""
 
     shows = True
 
 
-_shown = _Shown()
+def show_bars(shows: bool) -> None:
+    """Show progress bars and lines from now on, or hide all, whatever ``progress`` functions get."""
+    _Setting.shows = shows
 
 
-def show_bars(wanted: bool) -> None:
-    """Let bars show from now on, or none, whatever functions are told."""
-    _Wish.shows = wanted
+def tell_every(seconds: float) -> None:
+    """Say so often how far a wait is where no bar can show, in place of every ten seconds."""
+    global _EVERY
+    _EVERY = seconds
 
 
 def in_ipython() -> bool:
@@ -39,53 +52,257 @@ def in_ipython() -> bool:
 
 
 def _can_be_seen() -> bool:
-    """Whether what is shown can change: in a file, every state of a bar would stay."""
+    """Whether output can be overwritten: in a file, every state of a bar would stay."""
     return in_ipython() or (sys.stderr is not None and sys.stderr.isatty())
 
 
-class _Within:
-    """What a block within another bar updates: once it takes longer than a second, the bar says what it waits for."""
+def say(text: str) -> None:
+    """Write a line to stderr, above a bar that shows."""
+    if sys.stderr is None:  # as of a service
+        return
+    from tqdm import tqdm
 
-    def __init__(self, bar: Any, what: str):
-        self._bar, self._what, self._start = bar, what, time.monotonic()
+    with contextlib.suppress(OSError, ValueError):  # of a closed file
+        tqdm.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+
+def announce(work: str, seconds: float, way_out: str, *, shows: bool = True) -> None:
+    """Say before work of more than half a minute how long it takes, and how to leave it out.
+
+    Args:
+        work: What is done, such as "tracing the shadow of a body on itself".
+        seconds: How long it takes on one thread [s]; it runs on all.
+        way_out: A setting, and that it needs no such work.
+        shows: Whether to say it.
+    """
+    seconds /= thread_count()
+    if shows and _Setting.shows and seconds > LONG:
+        say(f"{work} takes about {show_time(seconds)}, {way_out}")
+
+
+def show_time(seconds: float) -> str:
+    """A time as people say it."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+class Wait:
+    """Work that somebody waits for, and how much of it is done.
+
+    Args:
+        what: Label of the work, such as "shading".
+        total: Number of units; None where it is not known.
+        unit: Unit of the count, such as "receiver"; empty where nothing is counted.
+        done: Units that were done before.
+    """
+
+    def __init__(self, what: str = "", total: int | None = None, unit: str = "", done: int = 0):
+        self.what, self.total, self.unit, self.done = what, total, unit, done
+        self.remark = ""
+        self.bar: Any = None  # tqdm's, where it shows one
+        self.outer_bar: Any = None  # or that in which its words show
+        self._before, self._start = done, time.monotonic()
+
+    @property
+    def age(self) -> float:
+        """How long it takes so far [s]."""
+        return time.monotonic() - self._start
 
     def update(self, count: int = 1) -> None:
-        """Called as a bar's."""
-        if self._what and time.monotonic() - self._start >= _DELAY:
-            self._bar.set_postfix_str(self._what)
-            self._what = ""  # said
+        """Count units that are done."""
+        self.done += count
+        if self.bar is not None:
+            self.bar.update(count)
+        elif self.outer_bar is not None and self.age >= _DELAY:
+            self.outer_bar.set_postfix_str(self.what)
+            self.outer_bar = None  # said
+
+    def expect(self, left: int) -> None:
+        """Let so many more units follow, where these are fewer or more than was thought."""
+        if self.total == self.done + left:
+            return
+        self.total = self.done + left
+        if self.bar is not None:
+            self.bar.total = self.total
+            if hasattr(self.bar, "container"):  # a notebook's, whose widget has a total of its own
+                self.bar.container.children[1].max = self.total
+            self.bar.refresh()
+
+    def describe(self, what: str, remark: str = "") -> None:
+        """Label the bar, from its next update, with the work under way and a remark on it."""
+        self.what, self.remark = what, remark
+        if self.bar is not None:
+            self.bar.set_description_str(what, refresh=False)
+            self.bar.set_postfix_str(remark, refresh=False)
+
+    def line(self) -> str:
+        """How far it is, for people."""
+        parts = [show_time(self.age)]
+        if self.unit and self.total is not None:
+            parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")
+            if self.done > self._before:
+                left = self.age * max(self.total - self.done, 0) / (self.done - self._before)
+                parts.append(f"{show_time(left)} left")
+        if self.remark:
+            parts.append(self.remark)
+        return f"{self.what}: {', '.join(parts)}"
+
+
+class _OfThread(threading.local):
+    """Labels of the work that a thread waits for, the innermost last."""
+
+    def __init__(self) -> None:
+        self.waits: list[Wait] = []
+        self.is_hidden = False
+
+
+_mine = _OfThread()
+
+
+class _Teller:
+    """A thread that prints the progress of all threads that wait, while there are any."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._of_threads: list[list[Wait]] = []
+        self._thread: threading.Thread | None = None
+        self._said = self._ended = -_EVERY
+
+    def begin(self, waits: list[Wait]) -> None:
+        """Tell of the waits of a thread."""
+        with self._lock:
+            now = time.monotonic()
+            if not self._of_threads and now - self._ended >= _EVERY:
+                self._said = now
+            self._of_threads.append(waits)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="warpshadow-progress", daemon=True)
+                self._thread.start()
+
+    @contextlib.contextmanager
+    def ending(self, waits: list[Wait]) -> Iterator[None]:
+        """Say nothing while the last of the waits of a thread ends."""
+        with self._lock:
+            yield
+            if not waits:
+                self._of_threads = [others for others in self._of_threads if others is not waits]
+                self._ended = time.monotonic()
+
+    def _run(self) -> None:
+        while True:
+            time.sleep(min(_DELAY, _EVERY) / 2)
+            with self._lock:
+                if not self._of_threads:
+                    self._thread = None
+                    return
+                shown_waits = [[wait for wait in waits if wait.age >= _DELAY] for waits in self._of_threads]
+                if _can_be_seen():
+                    for waits in shown_waits:
+                        _refresh(waits)
+                elif any(shown_waits) and time.monotonic() - self._said >= _EVERY:
+                    self._said = time.monotonic()
+                    for waits in filter(None, shown_waits):
+                        say("; ".join(wait.line() for wait in waits))
+
+
+def _refresh(waits: list[Wait]) -> None:
+    """Draw the bar of a thread as it is now; bars of notebooks are drawn by their own threads alone."""
+    bar = next((wait.bar for wait in waits if wait.bar is not None), None)
+    if bar is not None and not in_ipython():
+        if waits[-1].outer_bar is bar:
+            bar.set_postfix_str(waits[-1].what, refresh=False)
+        bar.refresh()
+
+
+_teller = _Teller()
+if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
+    os.register_at_fork(after_in_child=_teller.__init__)  # type: ignore[misc]
 
 
 @contextlib.contextmanager
-def progress_bar(total: int | None, what: str, unit: str, *, wanted: bool = True, stays: bool = False) -> Iterator[Any]:
+def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
+    """Say in files every ten seconds that a block runs; bars within it show as without.
+
+    Args:
+        what: Label of the work, such as "rendering".
+        shows: Whether to say anything, of compiled kernels too.
+    """
+    if _mine.waits or _mine.is_hidden:
+        yield
+        return
+    _mine.is_hidden = not shows
+    try:
+        with _within(Wait(what), shows=shows):
+            yield
+    finally:
+        _mine.is_hidden = False
+
+
+@contextlib.contextmanager
+def progress_bar(
+    total: int | None, what: str, unit: str, *, done: int = 0, shows: bool = True, stays: bool = False
+) -> Iterator[Wait]:
     """Show a bar while a block runs, if that takes longer than a second; within another bar, its words alone.
 
-    None shows where stderr is neither a terminal nor a notebook's.
+    Where stderr is neither a terminal nor a notebook's, a line says every ten seconds how far it is.
 
     Args:
         total: Number of units; None where it is not known.
-        what: What is done, such as "shading".
-        unit: What is counted, such as "receiver".
-        wanted: Whether to show it.
+        what: Label of the work, such as "shading".
+        unit: Unit of the count, such as "receiver"; empty where nothing is counted.
+        done: Units that were done before.
+        shows: Whether to show it.
         stays: Whether it shows at once, and the full bar stays on the terminal.
 
     Returns:
-        A bar of tqdm's, on which the block calls ``update(count)``.
+        On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """
-    from tqdm.auto import tqdm
+    wait = Wait(what, total, unit, done)
+    shows = shows and _Setting.shows
+    if shows and _can_be_seen():
+        wait.outer_bar = next((outer.bar for outer in _mine.waits if outer.bar is not None), None)
+        if wait.outer_bar is None:
+            with warnings.catch_warnings():  # of a notebook without ipywidgets, whose bars are text then
+                warnings.filterwarnings("ignore", "IProgress not found")
+                from tqdm.auto import tqdm
 
-    wanted = wanted and _Wish.shows and _can_be_seen()
-    outer = _shown.bar
-    if wanted and outer is not None:
-        try:
-            yield _Within(outer, what)
-        finally:
-            outer.set_postfix_str("", refresh=False)
+            only_time = {} if unit else {"bar_format": "{desc} [{elapsed}]"}
+            delay = 0 if stays else _DELAY
+            wait.bar = tqdm(total=total, desc=what, unit=unit, initial=done, delay=delay, leave=stays, **only_time)
+    with _within(wait, shows=shows):
+        yield wait
+
+
+@contextlib.contextmanager
+def _within(wait: Wait, *, shows: bool) -> Iterator[None]:
+    """Tell of a wait while a block runs."""
+    if not (shows and _Setting.shows):
+        yield
         return
-    delay = 0 if stays else _DELAY
-    with tqdm(total=total, desc=what, unit=unit, delay=delay, leave=stays, disable=not wanted) as bar:
-        try:
-            _shown.bar = bar if wanted else outer
-            yield bar
-        finally:
-            _shown.bar = outer
+    outer_bar = wait.outer_bar
+    _mine.waits.append(wait)
+    if len(_mine.waits) == 1:
+        _teller.begin(_mine.waits)
+    try:
+        yield
+    finally:
+        with _teller.ending(_mine.waits):
+            _mine.waits.pop()
+            if wait.bar is not None:
+                wait.bar.close()
+        if outer_bar is not None:
+            outer_bar.set_postfix_str("", refresh=False)
+
+
+_module_numbers = itertools.count(1)
+
+
+def _compiling(folder: str) -> contextlib.AbstractContextManager:
+    """Say that kernels are compiled, and of which module of this process."""
+    what = f"compiling kernels, module {next(_module_numbers)}"
+    return progress_bar(None, what, "", shows=not _mine.is_hidden)
+
+
+around_compilation(_compiling)

@@ -1,4 +1,4 @@
-"""Starting Warp without what it says as it starts."""
+"""Start Warp without its start-up messages."""
 
 import os
 import sys
@@ -12,10 +12,10 @@ def start_quietly() -> None:
     """Start Warp without its messages, and keep its remark that a machine has no GPU, which its native code prints, off
     the terminal.
 
-    Warnings stay. What else it prints on stderr meanwhile is printed after.
+    Warnings stay. Other output on stderr is held back and printed afterwards.
     """
     wp.config.log_level = getattr(wp, "LOG_WARNING", 30)
-    wp.config.quiet = True  # what releases before log_level read
+    wp.config.quiet = True  # releases before log_level read this
     if sys.stderr is None:  # as of a service
         wp.init()
         return
@@ -28,8 +28,8 @@ def start_quietly() -> None:
         wp.init()
     finally:
         os.dup2(terminal, 2)
-        for each in (terminal, writer):
-            os.close(each)
+        for item in (terminal, writer):
+            os.close(item)
         with open(reader, "rb") as caught:
             for line in caught:
                 if _NO_DRIVER not in line:

@@ -15,7 +15,7 @@ from warpshadow.device.warp_internals import current_tape, own_tape
 
 @contextlib.contextmanager
 def recorded() -> Iterator[wp.Tape]:
-    """Record what this thread launches on a tape of its own, whatever tape is open around it or in other threads."""
+    """Record this thread's launches on a tape of their own, whatever tape is open around them or in other threads."""
     tape = wp.Tape()
     with own_tape(tape):
         yield tape
@@ -33,12 +33,12 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
 
     Args:
         adjoint: Launches that add to the gradients of the inputs, called when the tape plays back.
-        arrays: What it reads and writes the gradients of; the tape zeroes them; None is passed over.
+        arrays: Arrays whose gradients it reads and writes; the tape zeroes them; None is skipped.
     """
     tape = current_tape()
-    wanted = [array for array in arrays if array is not None and array.requires_grad]
-    if tape is not None and wanted:
-        tape.record_func(adjoint, wanted)
+    requested = [array for array in arrays if array is not None and array.requires_grad]
+    if tape is not None and requested:
+        tape.record_func(adjoint, requested)
 
 
 def record(function: Callable[[], None]) -> None:

@@ -1,9 +1,9 @@
 """Threads: any number of them may call the library, which does the work of one call after another.
 
 Loading modules and making kernels is not thread-safe in Warp (1.19: two threads that load at once lose kernels). One
-lock guards both, and what renderers keep between calls. These hold it: renderers, fits of spheres, `tune`, deformation
-graphs, captured graphs, and everything in torch. The functions of single stages do not. Little is lost by it: a call
-runs on all cores (:mod:`warpshadow.device.parallel`), and Python between launches runs one thread at a time.
+lock guards both, and the renderers' caches. These hold it: renderers, fits of spheres, `tune`, deformation graphs,
+captured graphs, and everything in torch. The functions of single stages do not. Little is lost by it: a call runs on
+all cores (:mod:`warpshadow.device.parallel`), and Python between launches runs one thread at a time.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""What we use of Warp that Warp does not call public, all of it: a release of Warp may change it without notice.
+"""All uses of Warp's private interface: a release of Warp may change them without notice.
 
 ``tests/device/test_warp_internals.py`` tells which of these a release breaks. pyproject.toml accepts the releases that
 have passed it.
@@ -8,7 +8,7 @@ import contextlib
 import copy
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
@@ -38,13 +38,13 @@ if "tape" not in vars(_Runtime):
 
 
 def current_tape() -> wp.Tape | None:
-    """The tape that records what this thread launches."""
+    """The tape that records this thread's launches."""
     return wp._src.context.runtime.tape
 
 
 @contextlib.contextmanager
 def own_tape(tape: wp.Tape | None) -> Iterator[None]:
-    """Record what this thread launches on a tape that other threads do not see; None for not at all."""
+    """Record this thread's launches on a tape that other threads do not see; None for no recording."""
     own = _Runtime.tape.own
     own.append(tape)
     try:
@@ -57,6 +57,7 @@ def resized_launch(command: wp.Launch, dim: Sequence[int]) -> wp.Launch:
     """Copy a recorded launch, with other dimensions and arguments of its own."""
     copied = copy.copy(command)
     copied.params, copied.fwd_args = list(command.params), list(command.fwd_args)
+    copied.adj_args = None if command.adj_args is None else list(command.adj_args)
     copied.set_dim(list(dim))
     return copied
 
@@ -81,26 +82,39 @@ def kernel_modules() -> dict[str, wp.Module]:
     return wp._src.context.user_modules
 
 
-_compile = wp.Module._compile
+def around_compilation(context: Callable[[str], contextlib.AbstractContextManager]) -> None:
+    """From now on, compile modules of kernels within a context, which is made of the folder that they are put in.
+
+    A module that was compiled before, maybe where nothing can be written, is read without.
+    """
+    compile_before = wp.Module._compile
+
+    def compile_within(
+        module: wp.Module, device: Any = None, output_dir: Any = None, *rest: Any, **options: Any
+    ) -> bool:
+        is_new = output_dir is not None and not os.path.exists(output_dir)
+        with context(os.fspath(output_dir)) if is_new else contextlib.nullcontext():
+            return compile_before(module, device, output_dir, *rest, **options)
+
+    wp.Module._compile = compile_within
 
 
 def compile_in_turn() -> None:
-    """From now on, let one process compile what several need: others wait, and find it in Warp's cache.
+    """From now on, let one process compile a module that several need: others wait, and load it from Warp's cache.
 
     Should it be killed, its lock ends with it, and the next compiles.
     """
-    wp.Module._compile = _compile_in_turn
+    around_compilation(_locked)
 
 
-def _compile_in_turn(module: wp.Module, device: Any, folder: str, *rest: Any, **options: Any) -> bool:
+@contextlib.contextmanager
+def _locked(folder: str) -> Iterator[None]:
     from filelock import FileLock
 
-    if os.path.exists(folder):  # compiled before, maybe where nothing can be written
-        return _compile(module, device, folder, *rest, **options)
     lock = FileLock(f"{folder}.lock")
     with lock:
         try:
-            return _compile(module, device, folder, *rest, **options)
+            yield
         finally:
             with contextlib.suppress(OSError):  # of Windows, where filelock removes it
                 os.unlink(lock.lock_file)

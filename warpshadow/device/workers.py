@@ -1,7 +1,7 @@
 """Worker processes: tasks that do not depend on each other, shared out among processes of this machine.
 
-Each process has a share of the threads of :mod:`warpshadow.device.parallel`, does one task after another, and keeps
-what it loaded and compiled. A process that dies, killed or out of memory, takes no other with it.
+Each process has a share of the threads of :mod:`warpshadow.device.parallel`, does one task after another, and keeps its
+caches and compiled kernels. A process that dies, killed or out of memory, takes no other with it.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class WorkerDied(RuntimeError):
     """A process ended in the middle of a task, and did so again when others tried."""
 
 
-class Ended(NamedTuple, Generic[Task, Result]):
+class TaskResult(NamedTuple, Generic[Task, Result]):
     """A task that is over."""
 
     task: Task
     result: Result | None
-    """What the function returned; None where it failed."""
+    """The function's result; None where it failed."""
     error: Exception | None
-    """What it raised, or :class:`WorkerDied`."""
+    """The exception it raised, or :class:`WorkerDied`."""
 
 
 class _Worker(Generic[Task, Result]):
@@ -75,16 +75,17 @@ def run_tasks(
     workers: int,
     threads: int | None = None,
     attempts: int = 2,
-) -> Generator[Ended[Task, Result], None, None]:
+) -> Generator[TaskResult[Task, Result], None, None]:
     """Do tasks in worker processes, which end with this one, however it ends.
 
     Args:
-        function: What does a task; sent once to each process, so it can be pickled. A task fails where it or its
+        function: Called for each task; pickled and sent once to each process. A task fails where it or its
             result cannot be.
         tasks: Taken one by one as processes are free.
         workers: Number of processes.
         threads: Threads that kernels and NumPy have in each process; by default an even share of all.
-        attempts: How often a task is begun whose process dies: it may have been killed for what another process took.
+        attempts: How often a task is begun whose process dies: it may have been killed because another process ran out
+            of memory.
 
     Yields:
         The tasks that are over, as they end.
@@ -103,7 +104,7 @@ def run_tasks(
                 try:
                     packed = pack(task)
                 except PackError as failure:
-                    yield Ended(task, None, failure)
+                    yield TaskResult(task, None, failure)
                     continue
                 worker = idle.pop() if idle else _Worker(function, threads)
                 worker.begin(task, packed, attempt)
@@ -133,7 +134,7 @@ def run_tasks(
                         again.append((task, attempt + 1))
                         continue
                     result, error = None, WorkerDied(f"its process ended {_in_words(status)}, {attempts} times")
-                yield Ended(task, result, error)
+                yield TaskResult(task, result, error)
     finally:
         for worker in (*busy.values(), *idle):
             worker.end()
@@ -186,7 +187,7 @@ def unpack(answered: bytes) -> tuple[Any, Exception | None]:
 
 
 def _sendable(error: BaseException) -> Exception:
-    """An error, or what it says, where it cannot be pickled or would end the process that gets it."""
+    """An error, or its text, where it cannot be pickled or would end the process that gets it."""
     try:
         str(pickle.loads(pickle.dumps(error)))
     except Exception:
@@ -195,7 +196,7 @@ def _sendable(error: BaseException) -> Exception:
 
 
 def _said(error: BaseException) -> str:
-    """What an error is and says, on a line."""
+    """Type and message of an error, on a line."""
     return " ".join("".join(traceback.format_exception_only(error)).split())
 
 

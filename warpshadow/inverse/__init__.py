@@ -1,7 +1,7 @@
-"""Inverse rendering: explain images by what a scene leaves free.
+"""Inverse rendering: fit the free parameters of a scene to images.
 
-A :class:`Problem` says what is seen (targets), what is free and what counts as alike (the loss); :func:`fit` descends
-to a :class:`Result`, whose scene can be rendered, relit and written. Needs torch.
+A :class:`Problem` has targets, free parameters and a loss; :func:`fit` descends to a :class:`Result`, whose scene can
+be rendered, relit and written. Needs torch.
 """
 
 from warpshadow.inverse.checkpoint import CheckpointError

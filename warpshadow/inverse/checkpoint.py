@@ -1,7 +1,7 @@
 """Checkpoints: the state of a long computation in a file that is whole or not there.
 
-A file holds a mark, the SHA-256 of what follows, and torch's own format. It replaces the one before by a rename, and
-that one is kept beside it, so whenever a process is killed a whole file remains.
+A file holds a mark, the SHA-256 of the payload, and the payload in torch's own format. It replaces the one before by a
+rename, and that one is kept beside it, so whenever a process is killed a whole file remains.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from warpshadow.assets import files
 from warpshadow.check import AnyPath
 
 OTHERWISE = "choose another file, which on the command line is another folder by -o"
-"""What to do where a checkpoint cannot be used."""
+"""Remedy for messages about an unusable checkpoint."""
 
 _MARK = b"warpshadow checkpoint 1\n"
 
@@ -99,7 +99,7 @@ def load(path: AnyPath) -> dict[str, Any] | None:
 
 
 def _payload(path: Path) -> bytes | None:
-    """What a file holds behind its mark and digest; None where it is not there or not whole."""
+    """Read the payload of a checkpoint; None where the file is missing or damaged."""
     if not path.exists():
         return None
     content = path.read_bytes()

@@ -30,7 +30,7 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
 from warpshadow.inverse.watch import Watch, watching
-from warpshadow.inverse.world import Found, Setting
+from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.scene import Scene
 from warpshadow.viewer import FitViewer
 
@@ -54,15 +54,15 @@ GOOD_ENDINGS = ("converged", "finished")
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a fit ended with.
+    """Result of a fit.
 
     Args:
-        problem: What was to be solved.
+        problem: The problem that was fitted.
         setting: Its scene at the start and its units.
-        values: Of what is free, by its name: those of the least loss in the last stage.
+        values: Free parameters by name, at the least loss of the last stage.
         losses: Loss of each iteration before its step, a list for each candidate of each stage.
-        reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or what
-            became non-finite.
+        reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or the name
+            of a non-finite quantity.
         seconds: Median time of an iteration of the last stage [s].
     """
 
@@ -80,7 +80,7 @@ class Result:
         return f"Result({free}: {self.reason} after {count} iterations, loss {loss:.3g})"
 
     @functools.cached_property
-    def found(self) -> Found:
+    def found(self) -> FittedScene:
         """Scene, cameras and exposures."""
         return self.problem.found(self.values, self.setting)
 
@@ -103,10 +103,10 @@ class Result:
 
     @property
     def figures(self) -> dict[str, list[float]]:
-        """What was found where that is a few numbers, by the names that scene files have for it."""
+        """The fitted parameters that are a few numbers, by their keys in scene files."""
         figures: dict[str, list[float]] = {}
         for free in self.problem.free:
-            for key, numbers in free.figures(self.found).items():
+            for key, numbers in free.summary(self.found).items():
                 figures[key] = np.ravel(numbers).astype(float).tolist()
         return figures
 
@@ -137,7 +137,7 @@ class _Run(NamedTuple):
 
     loss: float
     best: dict[str, Values]
-    failure: str | None  # what became non-finite
+    failure: str | None  # the non-finite quantity
     curvature: Curvature | None  # of a QuasiNewton
 
 
@@ -168,7 +168,7 @@ class _Descent:
         self.descents: list[int] = []
         self.reason: str | None = None
         self._begin_run(self.candidates[0])
-        # The optimizer is known by what it makes: a partial or a lambda has no name that says all of it.
+        # The optimizer is identified by an instance of it: a partial or a lambda has no name that tells all of it.
         made = f"{type(self.optimizer).__qualname__} {self.optimizer.state_dict()!r}"
         self.fingerprint = f"{problem.fingerprint()} {stages!r} {tolerance!r} {seed} {made}"
 
@@ -207,7 +207,7 @@ class _Descent:
     # ---------------------------------------------------------------------------------------- state
 
     def state(self) -> dict[str, Any]:
-        """What a descent is continued from."""
+        """State from which a descent is resumed."""
         return {
             "fingerprint": self.fingerprint,
             "stage": self.stage,
@@ -286,6 +286,14 @@ class _Descent:
         self.begin_stage()
         return True
 
+    def iterations_left(self) -> int:
+        """The most that may follow."""
+        if self.reason is not None:
+            return 0
+        stage, *later = self.stages[self.stage :]
+        in_turn = (len(self.candidates) - len(self.ended)) * stage.iterations - len(self.losses[-1])
+        return in_turn + sum((1 if self.is_found else item.candidates) * item.iterations for item in later)
+
     def _has_converged(self) -> bool:
         """Whether the run gains no more than a part of its loss, by the optimizer's word where it has one."""
         own = self.stages[self.stage].tolerance
@@ -338,7 +346,7 @@ class _Descent:
                 loss, images = self.model.loss(self.values)
             except ValueError as error:
                 if not self.losses[0] and not evaluated:
-                    raise  # what was wrong from the beginning
+                    raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
@@ -400,11 +408,11 @@ def fit(
     view: bool | FitViewer = False,
     progress: bool = True,
 ) -> Result:
-    """Fit what a problem leaves free.
+    """Fit the free parameters of a problem.
 
     Args:
         problem: The problem.
-        stages: What to do in which order; "pose" and "deformation" are ways that work, :func:`pose_stages` and
+        stages: Stages in order; "pose" and "deformation" are ready-made ones, :func:`pose_stages` and
             :func:`deformation_stages`. The paper's reference setting is ``[Stage(1000, learning_rate=1e-2)]`` with
             ``optimizer=torch.optim.SGD``.
         optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``, by default
@@ -424,8 +432,8 @@ def fit(
         progress: Show progress, that of sphere fits included.
 
     Returns:
-        The result. Where something became NaN or Inf it has the best values before that, and a :class:`FitWarning`
-        says what.
+        The result. If a value becomes NaN or Inf, the result has the best values before that, and a :class:`FitWarning`
+        names the quantity.
 
     Raises:
         ValueError: for a problem that cannot be rendered.
@@ -481,9 +489,9 @@ def _descend(
 
     saved = previewed = time.perf_counter()
     durations: list[float] = []
-    total = sum(stage.candidates * stage.iterations for stage in descent.stages)
-    with progress_bar(total, "preparing: kernels, shadows, form factors", "it", wanted=progress, stays=True) as bar:
-        bar.update(sum(map(len, descent.losses)))
+    done = sum(map(len, descent.losses))
+    total, what = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
+    with progress_bar(total, what, "it", done=done, shows=progress, stays=True) as bar:
         start = time.perf_counter()
         for _ in descent.run():
             now = time.perf_counter()
@@ -495,12 +503,13 @@ def _descend(
                 with torch.no_grad():
                     write_preview(preview, descent.model.targets, descent.model.images(descent.values))
                 previewed = time.perf_counter()
-            bar.set_description_str("fitting", refresh=False)
-            bar.set_postfix_str(f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}", refresh=False)
+            bar.describe("fitting", f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}")
             bar.update()
+            bar.expect(descent.iterations_left())
             if watch is not None and not watch.goes_on(descent, save):
                 break
             start = time.perf_counter()
+        bar.expect(descent.iterations_left())
     if state is None or state["reason"] is None:  # else it would look as if it had ended now
         save()
     return durations

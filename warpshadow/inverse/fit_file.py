@@ -49,11 +49,11 @@ _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Cal
         {"max_iter": check.whole, "history_size": check.whole},
     ),
 }
-"""What makes an optimizer, and what checks its options."""
+"""Optimizers by name, and the checks of their options."""
 
 
 class FitFileError(ValueError):
-    """A fit file that cannot be used: the message says where and what is accepted."""
+    """A fit file that cannot be used: the message names the place and the accepted values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class Fit:
     """A fit, ready to run.
 
     Args:
-        problem: What is to be solved.
-        stages: What to do in which order.
+        problem: The problem to fit.
+        stages: Stages in order.
         optimizer: Makes an optimizer of a list of tensors and ``lr``.
         tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
             loss falls by less than this part.
-        seed: Of what is scattered where a stage has candidates.
+        seed: Seed of the random starts of stages with candidates.
     """
 
     problem: Problem
@@ -89,7 +89,7 @@ def load_fit(path: AnyPath) -> Fit:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
 
     Raises:
-        FitFileError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
+        FitFileError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file that is not there.
     """
     path = Path(path)
@@ -103,8 +103,8 @@ def _fit(table: Table, folder: Path) -> Fit:
         if name not in table:
             raise ValueError(f'{name} is missing; a fit has scene = "FILE", at least one [[target]], and [free]')
     tolerance = check.number("tolerance", table.get("tolerance", 1e-4))
-    seed = check.whole("seed", table.get("seed", 0), least=0)
-    scene = load_scene(toml_tables.file(table, "scene", folder))
+    seed = check.whole("seed", table.get("seed", 0), minimum=0)
+    scene = load_scene(toml_tables.file(table, "scene", folder)).with_method()
     targets = []
     for where, target in toml_tables.numbered(table, "target"):
         with check.located(where):
@@ -136,7 +136,7 @@ def _target(table: Table, folder: Path) -> Target:
     return Target(image, camera=camera, **mask)
 
 
-# ---------------------------------------------------------------------------------------------- what is free
+# ---------------------------------------------------------------------------------------------- free parameters
 
 
 def _free(table: Table, scene: Scene) -> list[Free]:
@@ -145,11 +145,11 @@ def _free(table: Table, scene: Scene) -> list[Free]:
         check.known_keys("key", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
     free: list[Free] = []
     for key, kind in _FREE_OF_SCENE.items():
-        given = table.get(key, False)
-        if given is False:
+        arguments = table.get(key, False)
+        if arguments is False:
             continue
         with check.located(f"[free] {key}"):
-            settings = {} if given is True else given
+            settings = {} if arguments is True else arguments
             toml_tables.check_table(settings)
             if kind is Light and "directions" in settings:
                 settings = {"order": None} | settings  # in place of the default

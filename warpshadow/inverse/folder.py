@@ -1,4 +1,4 @@
-"""The folder of a fit: what is in it, and whether a fit may write into it."""
+"""The folder of a fit: its files, and whether a fit may write into it."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def check_folder(path: Path) -> None:
     check_writable(path)
     if not path.is_dir() or has_checkpoint(path):
         return
-    others = sorted(each.name for each in path.iterdir() if not each.name.startswith(".") and each.name != PREVIEW)
+    others = sorted(item.name for item in path.iterdir() if not item.name.startswith(".") and item.name != PREVIEW)
     if others:
         raise FileExistsError(f"{path}: got a folder with {others[0]} in it, expected a new one or that of this fit")
 

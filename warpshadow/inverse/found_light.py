@@ -1,7 +1,7 @@
 """The light that a fit found, and which directions of it the images determined.
 
-Light from below a ground reaches nothing that an image shows, so whatever a fit says of it is a guess. How much a
-direction matters is its influence, the sum of what its light adds to all pixels,
+Light from below a ground reaches no pixel, so a fit cannot determine it. The influence of a direction is the sum of the
+changes that its light makes in all pixels,
 
     e(ω) = Σ_p w_p ∂I_p / ∂L(ω),
 
@@ -32,8 +32,9 @@ from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
 from warpshadow.pipeline.lighting import map_of
 
 FAINTEST = 0.05
-"""Influence below which a direction is not determined, as a part of the mean over all directions: what noise in the
-images does to light from there is twenty times as much as on the average."""
+"""Influence below which a direction is not determined, as a fraction of the mean over all directions: noise in the
+images disturbs it twenty times as much as on average.
+"""
 
 _CELLS = 512  # that directions are told apart by
 _SIDE = 96  # shorter side of the images that influences are summed over [pixels]
@@ -65,11 +66,11 @@ class FoundLight:
         return float(pixel_solid_angles(len(self.influence)) @ (~self.determined).sum(axis=1) / (4 * np.pi))
 
     def picture(self) -> Picture:
-        """The light at the automatic exposure of what is determined; gray stripes over the rest."""
+        """The light at the automatic exposure of its determined part; gray stripes over the rest."""
         bright = np.maximum(self.radiance, 0)
         shown = bright[self.determined] if self.determined.any() else bright
         linear = np.clip(bright * 2 ** auto_exposure(shown), 0, 1)
-        large, known = (each.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for each in (linear, self.determined))
+        large, known = (item.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for item in (linear, self.determined))
         rows, columns = np.indices(known.shape)
         is_stripe = ~known & ((rows + columns) // _STRIPE % 2 == 0)
         return Picture(np.where(is_stripe[..., None], 0.2, large), exposure=0.0)
@@ -84,13 +85,13 @@ class FoundLight:
 def found_light(
     light: EnvironmentMap | np.ndarray, problem: Problem, setting: Setting, values: Mapping[str, Values]
 ) -> FoundLight:
-    """What a fit found of the light.
+    """The light of a fit, and which part of it the images determine.
 
     Args:
         light: The light that was found.
         problem: In which light is free.
         setting: Of the problem.
-        values: Of what is free, by its name.
+        values: Free parameters by name.
     """
     radiance = map_of(light)
     towards = equirectangular_directions(len(radiance))
@@ -102,7 +103,7 @@ def found_light(
 def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
     """How much light from each of 512 cells matters to the images, 1 on the average, shape [cell]."""
     cells = Light(None, directions=_CELLS)
-    free = [cells if isinstance(each, Light) else each for each in problem.free]
+    free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)
     height, width, _ = problem.targets[0].image.shape
     model = Model(by_cells, setting, Stage(scale=min(1.0, _SIDE / min(height, width)), supersampling=1))

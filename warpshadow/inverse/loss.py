@@ -18,10 +18,10 @@ class Loss:
 
     Args:
         kind: "l2", squares (the paper's); "l1", magnitudes; "huber", squares up to ``delta`` and magnitudes beyond,
-            which noise and what the scene cannot explain disturb less.
+            less disturbed by noise and model errors.
         delta: Where "huber" changes over [root mean squares of the target].
-        coverage: Weight of the coverage, for targets that have it.
-        reduction: "mean" over pixels, or "sum": what a plain gradient descent on many pixels' own parameters wants.
+        coverage: Weight of the coverage, for targets that have it. reduction: "mean" over pixels, or "sum", for plain
+            gradient descent on parameters of single pixels.
     """
 
     kind: str = "l2"

@@ -44,7 +44,7 @@ from warpshadow.scene import toml_tables
 TABLE = "table.csv"
 """The file, in the folder of all results, that says how each fit ended."""
 
-_FIT_FILE = "fit.toml"  # what a folder is searched for
+_FIT_FILE = "fit.toml"  # pattern of fit files in a folder
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
 _PATIENCE = 60.0
@@ -59,12 +59,12 @@ class Ending:
         name: Of the fit, and of its folder.
         reason: "converged", "finished" (all iterations done), "diverged" (something became NaN or Inf; the folder has
             the best values before that) or "failed" (it left no result).
-        error: What became NaN or Inf, or why it failed.
+        error: The non-finite quantity, or the reason of the failure.
         iterations: Of all stages.
         loss_before, loss_after: With regularizers.
         seconds: From when its last worker began with it.
-        parameters: What was found, as scene files call it, where that is a few numbers: "bunny.translation", …
-        warnings: What was warned of.
+        parameters: Fitted numbers by their keys in scene files, if they are few: "bunny.translation", …
+        warnings: Warnings that the fit gave.
     """
 
     name: str
@@ -97,19 +97,19 @@ def fit_many(
     checkpoint_seconds: float = 10.0,
     progress: bool = True,
 ) -> list[Ending]:
-    """Do many fits, several at a time; called again, it does what has not ended, from its checkpoints.
+    """Run many fits, several at a time; called again, it resumes unfinished ones from their checkpoints.
 
     A script that calls it does so under ``if __name__ == "__main__":``, as workers import it.
 
     Args:
-        fits: Problems, fits, or fit files, by name; those without names are called 000000, 000001, …, so each has to
-            come at the same place when it is called again. They are asked for as workers become free.
-        folder: Made if it is not there. Each fit gets a folder of its name in it, with what
-            :meth:`~warpshadow.inverse.report.Report.write` writes; table.csv says how each ended.
+        fits: Problems, fits, or fit files, by name; unnamed ones are called 000000, 000001, …, so keep their order when
+            you call it again. They are asked for as workers become free.
+        folder: Made if it is not there. Each fit gets a subfolder of its name, with the files of
+            :meth:`~warpshadow.inverse.report.Report.write`; table.csv says how each ended.
         stages, optimizer, tolerance, seed: Of problems, as :func:`warpshadow.inverse.fit` takes them. Fits and fit
             files have their own.
         workers: How many fits at a time; on this machine by default one for each of ``ws.thread_count()`` threads,
-            which they share, or on a GPU one; with ``ray`` as many as the cluster has cores or, on GPUs, those.
+            which they share, or on a GPU one; with ``ray`` one for each core, or GPU, of the cluster.
         ray: Address of a Ray cluster, "HOST:PORT" or "auto", whose machines see the same files under the same paths.
         device: Where to compute.
         checkpoint_seconds: Time between checkpoints [s].
@@ -134,7 +134,7 @@ def fit_many(
         raise FileExistsError(f"{folder}: got the folder of one fit, expected a new one or that of many")
     if isinstance(fits, Mapping):
         _check_names(fits)
-    named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", each) for k, each in enumerate(fits))
+    named = fits.items() if isinstance(fits, Mapping) else ((f"{k:06}", item) for k, item in enumerate(fits))
     folder.mkdir(exist_ok=True)
     names: list[str] = []
     endings: dict[str, Ending] = {}
@@ -142,25 +142,25 @@ def fit_many(
 
     with (
         checkpoints.alone(folder / TABLE),
-        progress_bar(total, "fitting", "fit", wanted=progress, stays=True) as bar,
+        progress_bar(total, "fitting", "fit", shows=progress, stays=True) as bar,
     ):
 
         def note(ending: Ending) -> None:
             endings[ending.name] = ending
-            others = sum(not each.is_good for each in endings.values())
-            bar.set_postfix_str(f"{others} failed or diverged" if others else "", refresh=False)
+            others = sum(not item.is_good for item in endings.values())
+            bar.describe("fitting", f"{others} failed or diverged" if others else "")
             bar.update()
 
-        def jobs() -> Iterator[_Job]:
-            for name, given in named:
+        def jobs() -> Iterator[_FitJob]:
+            for name, source in named:
                 names.append(name)
-                each = given
-                if isinstance(each, Problem):
-                    each = Fit(each, stages_for(stages, each), optimizer, tolerance, seed)
-                elif not isinstance(each, Fit):
-                    each = Path(each).absolute()
+                item = source
+                if isinstance(item, Problem):
+                    item = Fit(item, stages_for(stages, item), optimizer, tolerance, seed)
+                elif not isinstance(item, Fit):
+                    item = Path(item).absolute()
                 try:
-                    job = _Job(name, folder, each, _digest(each), device, checkpoint_seconds)
+                    job = _FitJob(name, folder, item, _digest(item), device, checkpoint_seconds)
                 except Exception as error:  # such as that of an optimizer that cannot be pickled
                     note(_failed(name, error))
                     continue
@@ -189,13 +189,13 @@ def fit_many(
 
 
 @dataclass(frozen=True)
-class _Job:
+class _FitJob:
     """One of many fits, as a worker is told of it."""
 
     name: str
     results: Path  # the folder of all
     fit: Fit | Path
-    digest: str  # of what decides it
+    digest: str  # of all its inputs
     device: str
     checkpoint_seconds: float
 
@@ -222,7 +222,7 @@ class _Job:
 
 
 def _digest(fit: Fit | Path) -> str:
-    """A digest of a fit file's text and of when what it names changed, empty where there is none; or of a fit."""
+    """A digest of a fit, or of a fit file's text and its files' modification times, empty if one is missing."""
     if isinstance(fit, Path):
         return hashlib.sha256("\n".join(_marks(fit)).encode()).hexdigest() if fit.is_file() else ""
     decides = f"{fit.problem.fingerprint()} {fit.stages!r} {fit.tolerance!r} {fit.seed}".encode()
@@ -248,16 +248,16 @@ def _marks(file: Path) -> Iterator[str]:
 
 
 def _texts(value: object) -> Iterator[str]:
-    """All texts in what a TOML file holds."""
+    """All strings in a parsed TOML file."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, (dict, list)):
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from _texts(each)
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _texts(item)
 
 
-def _do(job: _Job) -> Ending:
-    """Do a fit, whatever becomes of it."""
+def _do(job: _FitJob) -> Ending:
+    """Run a fit and record its ending, even if it fails."""
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
@@ -265,15 +265,15 @@ def _do(job: _Job) -> Ending:
             ending = _ended(job)
         except Exception as error:
             ending = _failed(job.name, error)
-    said = dict.fromkeys(str(each.message) for each in caught if not issubclass(each.category, FitWarning))
-    ending = replace(ending, seconds=round(time.perf_counter() - start, 3), warnings=[*said])
+    messages = dict.fromkeys(str(item.message) for item in caught if not issubclass(item.category, FitWarning))
+    ending = replace(ending, seconds=round(time.perf_counter() - start, 3), warnings=[*messages])
     if ending.reason != "failed":
         job.record(ending)
     return ending
 
 
 def _failed(name: str, error: Exception) -> Ending:
-    """An ending that says what went wrong, and where, unless it is a mistake in what was given."""
+    """An ending with the error, and with its place unless it is a mistake in the input."""
     message = str(error) if error.args else type(error).__name__
     if not isinstance(error, (ValueError, OSError, ImportError)):
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -281,7 +281,7 @@ def _failed(name: str, error: Exception) -> Ending:
     return Ending(name, "failed", message)
 
 
-def _ended(job: _Job) -> Ending:
+def _ended(job: _FitJob) -> Ending:
     """Do a fit, in its folder."""
     from filelock import Timeout
 
@@ -321,10 +321,10 @@ def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
     rows = []
     for ending in endings:
         row = dataclasses.asdict(ending)
-        said, parameters = row.pop("warnings"), row.pop("parameters")
+        messages, parameters = row.pop("warnings"), row.pop("parameters")
         for name, numbers in parameters.items():
             row |= {f"{name}[{k}]" if len(numbers) > 1 else name: number for k, number in enumerate(numbers)}
-        rows.append(row | {"warnings": "; ".join(said)})
+        rows.append(row | {"warnings": "; ".join(messages)})
     columns = [column for column in dict.fromkeys(itertools.chain.from_iterable(rows)) if column != "warnings"]
     with files.whole(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*columns, "warnings"])
@@ -342,39 +342,39 @@ def is_of_many(where: AnyPath) -> bool:
 
 
 def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
-    """Find fit files and name them, whatever others there are.
+    """Find fit files and name them; ignore other files.
 
     A name is the file's path without its suffix: from the first folder of the pattern that has a wildcard; from the
-    searched folder; from the list's folder; from the folder that all of several files are in. Where the pattern says
-    what the last part is, and for files called fit.toml, that part is left out.
+    searched folder; from the list's folder; from the folder that all of several files are in. A last part that the
+    pattern fixes, or that is fit.toml, is left out.
 
     Args:
         where: A pattern, such as "photos/*/fit.toml" or "fits/**/*.toml"; a folder, which is searched for files called
             fit.toml; a list, a .txt file with a path on each line, relative to it; or several files.
 
     Returns:
-        Files by name, in the order of names; those of a list in its own.
+        Files by name, sorted by name; a list keeps its own order.
 
     Raises:
         FileNotFoundError: where there are none.
         ValueError: where the results of two would be in one folder.
     """
     if not isinstance(where, (str, os.PathLike)):
-        found = [check.file("file", each).absolute() for each in where]
-        return _named(found, Path(os.path.commonpath([file.parent for file in found])), _FIT_FILE)
+        fitted = [check.file("file", item).absolute() for item in where]
+        return _named(fitted, Path(os.path.commonpath([file.parent for file in fitted])), _FIT_FILE)
     path, text = Path(where), os.fspath(where)
     if path.is_dir():
-        start, found, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
+        start, fitted, last = path, sorted(path.rglob(_FIT_FILE)), _FIT_FILE
     elif path.suffix == ".txt":
         lines = (line.strip() for line in check.file("file", path).read_text(encoding="utf-8").splitlines())
-        start, found, last = path.parent, [path.parent / line for line in lines if line], _FIT_FILE
+        start, fitted, last = path.parent, [path.parent / line for line in lines if line], _FIT_FILE
     else:
         start = Path(*itertools.takewhile(lambda part: not glob.has_magic(part), path.parts))
-        found = sorted(each for each in map(Path, glob.glob(text, recursive=True)) if each.is_file())
+        fitted = sorted(item for item in map(Path, glob.glob(text, recursive=True)) if item.is_file())
         last = path.name
-    if not found:
+    if not fitted:
         raise FileNotFoundError(f"{where}: no fit file, expected some")
-    return _named(found, start, last)
+    return _named(fitted, start, last)
 
 
 def _named(files: Iterable[Path], start: Path, last: str) -> dict[str, Path]:

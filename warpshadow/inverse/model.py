@@ -1,4 +1,4 @@
-"""Models: the images of a problem, and their loss, as functions of the values of what is free."""
+"""Models: the images of a problem, and their loss, as functions of the free parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Model:
     Args:
         problem: The problem.
         setting: Of the problem.
-        stage: At what size and how softly.
+        stage: Sets size and softness.
     """
 
     def __init__(self, problem: Problem, setting: Setting, stage: Stage):
@@ -54,19 +54,19 @@ class Model:
         """Images of the views, [view, height, width, 4]. Differentiable: values."""
         world = World(self.renderer, self.cameras)
         for free in self.problem.free:
-            free.place(values[free.name], self.setting, world)
+            free.apply(values[free.name], self.setting, world)
         return world.images()
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
         total, images = self._unlikeness(values)
         for free in self.problem.free:
-            energy = free.energy(values[free.name], self.setting)
-            total = total if energy is None else total + self.regularization * energy
+            regularizer = free.regularizer(values[free.name], self.setting)
+            total = total if regularizer is None else total + self.regularization * regularizer
         return total, images
 
     def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The loss of the images, and they."""
+        """Return (image loss, images)."""
         images = self.images(values)
         return self.problem.loss(images, self.targets, self.weights, self.setting.unit), images
 
@@ -75,8 +75,8 @@ class LightModel(Model):
     """The same where light alone is free and differences are squared: a quadratic form, computed without images.
 
     Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
-    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the weights of the pixels over their sum. Sums are float64: what is
-    left of them at the end is a small difference.
+    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the weights of the pixels over their sum. Sums are float64: near the
+    end they are small differences of large numbers.
     """
 
     def __init__(self, problem: Problem, setting: Setting, stage: Stage):
@@ -88,14 +88,14 @@ class LightModel(Model):
         roots = (self.weights * share).sqrt()[..., None] / setting.unit
         with torch.no_grad():
             columns = torch.cat([(image[..., :3] * roots).reshape(1, -1, 3) for image in self._images_of_units()])
-            wanted = (self.targets[..., :3] * roots).reshape(-1, 3)
+            target = (self.targets[..., :3] * roots).reshape(-1, 3)
             dark = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
             alike = torch.cat([self.targets[..., :3], dark[..., 3:]], dim=-1)  # but for coverage
             coverage = problem.loss(alike, self.targets, self.weights, setting.unit).double()
-        columns, wanted = columns.permute(2, 0, 1), wanted.T[..., None]  # [color, coefficient, pixel]
+        columns, target = columns.permute(2, 0, 1), target.T[..., None]  # [color, coefficient, pixel]
         self._form = torch.stack([_product(column, column.T) for column in columns])
-        self._slope = torch.stack([_product(column, want) for column, want in zip(columns, wanted, strict=True)])
-        self._constant = coverage + wanted.double().square().sum()
+        self._slope = torch.stack([_product(column, want) for column, want in zip(columns, target, strict=True)])
+        self._constant = coverage + target.double().square().sum()
 
     @staticmethod
     def applies(problem: Problem) -> bool:
@@ -122,5 +122,5 @@ def _product(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
 
 
 def make_model(problem: Problem, setting: Setting, stage: Stage) -> Model:
-    """The model that leaves out what the problem does not need."""
+    """The cheapest model that the problem allows."""
     return (LightModel if LightModel.applies(problem) else Model)(problem, setting, stage)

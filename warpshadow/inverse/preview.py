@@ -24,8 +24,8 @@ def side_by_side(targets: torch.Tensor, images: torch.Tensor) -> np.ndarray:
     Returns:
         Shape [view · height, 3 · width, 3].
     """
-    wanted, got = targets[..., :3].cpu().numpy(), images[..., :3].cpu().numpy()
-    white = 2.0 ** -auto_exposure(wanted)
-    difference = srgb_to_linear(np.clip(0.5 + 0.5 * (got - wanted) / white, 0, 1))  # in steps that look even
-    parts = zip(wanted / white, got / white, difference, strict=True)
+    target, got = targets[..., :3].cpu().numpy(), images[..., :3].cpu().numpy()
+    white = 2.0 ** -auto_exposure(target)
+    difference = srgb_to_linear(np.clip(0.5 + 0.5 * (got - target) / white, 0, 1))  # in steps that look even
+    parts = zip(target / white, got / white, difference, strict=True)
     return np.concatenate([np.concatenate(view, axis=1) for view in parts], axis=0)

@@ -1,4 +1,4 @@
-"""Problems: a scene, what is seen of it, what of it is free, and what counts as alike."""
+"""Problems: a scene, targets, free parameters, and a loss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
-from warpshadow.inverse.world import Found, Setting
+from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
 from warpshadow.scene.scene import METHODS, SCENE, SPHERE_METHODS, Scene, Visibility
 from warpshadow.tuning.tune import resolved
@@ -29,13 +29,13 @@ _SQUARES, _RAYS = Loss(), Visibility("ray-traced")
 
 @dataclass(frozen=True, eq=False, init=False)
 class Problem:
-    """What a fit solves.
+    """A fit's problem.
 
     Args:
-        scene: Where the fit starts: all that is not free stays as it is here, and what is free begins as it is here.
+        scene: Start of the fit: free parameters begin with its values, all else stays as it is.
         targets: The images to explain, of one size; one, or several views.
-        free: What the fit may change.
-        loss: What counts as alike.
+        free: The free parameters.
+        loss: The loss.
         still: How visibility is computed where no geometry and no camera moves: rays by default, since then they are
             traced once and an iteration costs the same; None for the scene's own method.
     """
@@ -67,8 +67,8 @@ class Problem:
             object.__setattr__(self, name, items)
         for number, target in enumerate(self.targets):
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it")
-        for number, each in enumerate(self.free):
-            check.instance(f"free[{number}]", each, Free, "what is free, such as Pose(0) or Light()")
+        for number, item in enumerate(self.free):
+            check.instance(f"free[{number}]", item, Free, "what is free, such as Pose(0) or Light()")
         object.__setattr__(self, "free", tuple(self._numbered()))
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:
@@ -81,6 +81,7 @@ class Problem:
             if {Albedo(body).name, Texture(body).name} <= set(names):
                 raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
         if self.still is not None:
+            object.__setattr__(self, "still", self.still.with_method())
             check.choice("still.method", self.still.method, METHODS)
         object.__setattr__(self, "scene", resolved(self.scene))
         if self.moves and self.scene.visibility.method == "ray-traced":
@@ -88,9 +89,9 @@ class Problem:
                 'scene: got visibility.method = "ray-traced" with free geometry, of which rays have no derivative; '
                 'expected "directional", "log-sh" or "none"'
             )
-        for number, each in enumerate(self.free):
+        for number, item in enumerate(self.free):
             with check.located(f"free[{number}]"):
-                each.check_scene(self.scene)
+                item.check_scene(self.scene)
         self.cameras()  # raises for an image of other proportions
 
     def __repr__(self) -> str:
@@ -99,9 +100,9 @@ class Problem:
         return f"Problem({self.scene!r}, {len(self.targets)} targets of {width} × {height}, free: {free})"
 
     def _numbered(self) -> Iterator[Free]:
-        for number, each in enumerate(self.free):
+        for number, item in enumerate(self.free):
             with check.located(f"free[{number}]"):
-                yield each.numbered(self.scene)
+                yield item.numbered(self.scene)
 
     @property
     def moves(self) -> bool:
@@ -115,7 +116,7 @@ class Problem:
 
     @property
     def basis(self) -> Basis | None:
-        """What free light is expressed in."""
+        """Basis of free light."""
         return next((free.basis for free in self.free if isinstance(free, Light)), None)
 
     def cameras(self) -> list[Camera]:
@@ -144,20 +145,20 @@ class Problem:
         return set(blocking_planes(scene)) - reshaped
 
     def start(self, setting: Setting) -> dict[str, Values]:
-        """Values of what is free, by its name, where the scene has them."""
+        """The scene's values of the free parameters, by name."""
         return {free.name: free.start(setting) for free in self.free}
 
-    def found(self, values: dict[str, Values], setting: Setting) -> Found:
+    def found(self, values: dict[str, Values], setting: Setting) -> FittedScene:
         """The scene with values in it, and its own visibility."""
-        found = Found(
+        fitted = FittedScene(
             replace(setting.scene, visibility=self.scene.visibility),
             list(setting.cameras),
             [1.0] * len(setting.cameras),
         )
         with torch.no_grad():
             for free in self.free:
-                free.settle(values[free.name], setting, found)
-        return found
+                free.export(values[free.name], setting, fitted)
+        return fitted
 
     def fingerprint(self) -> str:
         """A digest of all that the result depends on, in hexadecimal."""
@@ -182,9 +183,9 @@ def _digest(value: object, digest: hashlib._Hash) -> None:
     """Add numbers, strings, arrays, and sequences and dataclasses of them."""
     if dataclasses.is_dataclass(value):
         digest.update(type(value).__name__.encode())
-        for each in dataclasses.fields(value):
-            digest.update(each.name.encode())
-            _digest(getattr(value, each.name), digest)
+        for entry in dataclasses.fields(value):
+            digest.update(entry.name.encode())
+            _digest(getattr(value, entry.name), digest)
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif isinstance(value, (tuple, list)):

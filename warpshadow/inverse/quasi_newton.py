@@ -1,4 +1,4 @@
-"""Quasi-Newton steps that grow and shrink by what they achieve."""
+"""Quasi-Newton steps with a trust region that grows and shrinks by the achieved decrease."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
 """Steps, and how the gradient changed over them, [value] each."""
 
 HISTORY = 12
-"""How many steps are remembered: of six values, their curvature wholly."""
+"""How many steps are load_or_compute: of six values, their curvature wholly."""
 
 _GROWTH = 2.0  # of the bound, where a step that reached it was kept
-_SHORTEST, _LONGEST = 0.1, 0.5  # what the bound becomes where a step was taken back, as parts of the step
+_SHORTEST, _LONGEST = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step
 _REACH = 5.0  # the bound at most, in learning rates
 _CURVED = 1e-3  # least cosine of a step and the change of the gradient that tell the curvature
 
@@ -46,7 +46,7 @@ class QuasiNewton(torch.optim.Optimizer):
 
     @property
     def curvature(self) -> Curvature:
-        """What is known of the curvature."""
+        """Curvature estimates."""
         memory = self._memory
         return memory.get("steps", []), memory.get("changes", [])
 
@@ -54,7 +54,7 @@ class QuasiNewton(torch.optim.Optimizer):
         """Take over the curvature that another one found, of a similar loss."""
         place = self._tensors[0]
         names = ("steps", "changes")
-        self._memory.update({n: [each.to(place) for each in part] for n, part in zip(names, curvature, strict=True)})
+        self._memory.update({n: [item.to(place) for item in part] for n, part in zip(names, curvature, strict=True)})
 
     def has_converged(self, tolerance: float) -> bool:
         """Whether the last step that was kept gained, and the next may gain, at most this part of the loss."""

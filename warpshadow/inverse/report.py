@@ -1,4 +1,4 @@
-"""Reports: what a fit found, as numbers, files and pictures."""
+"""Reports: the result of a fit as numbers, files and pictures."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ SUMMARY = "summary.toml"
 
 
 def write_result(result: Result, folder: AnyPath) -> list[Path]:
-    """Write what a fit found; see :meth:`Report.write`."""
+    """Write the result of a fit; see :meth:`Report.write`."""
     return Report(result).write(folder)
 
 
 class Report:
-    """What a fit found, beside what it began with, at the targets' own size and the scene's own softness.
+    """The result of a fit beside its start, at the targets' own size and the scene's own softness.
 
     Args:
         result: The result.
@@ -73,7 +73,7 @@ class Report:
             write_image(folder / "light.exr", map_of(scene.light).astype(np.float32))
             written.append(folder / "light.exr")
         values: dict[str, Any] = {
-            f"{name}.{key}": each.cpu().numpy() for name, own in result.values.items() for key, each in own.items()
+            f"{name}.{key}": item.cpu().numpy() for name, own in result.values.items() for key, item in own.items()
         }
         with files.whole(folder / "parameters.npz") as unfinished:
             np.savez(unfinished, **values)
@@ -83,7 +83,7 @@ class Report:
         return [*written, folder / SUMMARY]
 
     def _summary(self) -> toml_tables.Table:
-        found, seconds = self.result.found, self.result.seconds
+        fitted, seconds = self.result.found, self.result.seconds
         fit = {
             "reason": self.result.reason,
             "iterations": sum(map(len, self.result.losses)),
@@ -94,7 +94,7 @@ class Report:
             fit["milliseconds_per_iteration"] = round(1e3 * seconds, 3)
         views = [
             {"exposure": factor} | camera_table(camera)
-            for camera, factor in zip(found.cameras, found.exposures, strict=True)
+            for camera, factor in zip(fitted.cameras, fitted.exposures, strict=True)
         ]
         light = self.result.light
         known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}

@@ -28,8 +28,8 @@ class Stage:
         softness: κ of directional visibility; by default the scene's. Softer shadows reach farther.
         directions: Number of cells of directional visibility; by default the scene's.
         supersampling: Samples a pixel across and down; by default the scene's.
-        candidates: How many descents take part. They go on from the best of the stage before; where those are fewer,
-            others start scattered around the best. The least loss tells them apart.
+        candidates: How many descents take part. They go on from the best of the stage before; missing ones start
+            scattered around the best. The least loss tells them apart.
         standout: A candidate has found it, and no others are tried from then on, if its loss is below this part of
             that of each of six values scattered around it. 0: all are tried.
         tolerance: In place of the fit's.
@@ -71,19 +71,19 @@ class Stage:
         return self.learning_rate * (LAST_RATE + (1 - LAST_RATE) * fall)
 
     def visibility(self, visibility: Visibility) -> Visibility:
-        """A scene's visibility with what the stage says of it."""
-        given: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
-        return replace(visibility, **{name: value for name, value in given.items() if value is not None})
+        """A scene's visibility with the overrides of a stage."""
+        arguments: dict[str, Any] = {"softness": self.softness, "directions": self.directions}
+        return replace(visibility, **{name: value for name, value in arguments.items() if value is not None})
 
 
 def check_part(name: str, value: object, of: str) -> None:
-    """Raise ValueError for what is no number from 0 to below 1."""
+    """Raise ValueError unless the number is in [0, 1)."""
     if not (check.is_number(value) and 0 <= value < 1):
         raise ValueError(f"{name}: got {value!r}, expected a part {of}, 0 or more and below 1")
 
 
 def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
-    """The stages of a problem: those that are given, or ready-made ones by their name."""
+    """The stages of a problem: the given ones, or ready-made ones by name."""
     if isinstance(stages, str):
         check.choice("stages", stages, READY_STAGES)
         return READY_STAGES[stages](problem)
@@ -93,7 +93,7 @@ def stages_for(stages: object, problem: Problem) -> tuple[Stage, ...]:
 
 
 def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
-    """Raise ValueError for what the last stage of a long fit would stumble over."""
+    """Raise ValueError early, for mistakes on which the last stage of a long fit would fail."""
     if not stages:
         raise ValueError("stages: got none, expected one or more")
     visibility = problem.visibility
@@ -145,7 +145,7 @@ READY_STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {
     "pose": pose_stages,
     "deformation": deformation_stages,
 }
-"""Stages that work, by what they find."""
+"""Ready-made stages, by name."""
 
 
 def _soft(problem: Problem, softness: float) -> dict[str, Any]:

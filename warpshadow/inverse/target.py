@@ -23,13 +23,13 @@ _ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 class Target:
     """An image that a fit explains.
 
-    The path of a file, relative to the current folder, stands for what is in it, as in fit files.
+    A path, relative to the current folder, stands for its file, as in fit files.
 
     Args:
         image: Linear RGB, shape [height, width, 3]; or premultiplied RGB with coverage, [height, width, 4], as
             renderers make it, and the coverage is explained, too; or a file that :func:`read_target` reads.
-        mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out what the scene has
-            no body for: the background of a photograph, say. Or a file that :func:`read_mask` reads.
+        mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out pixels that the
+            scene does not model: the background of a photograph, say. Or a file that :func:`read_mask` reads.
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
     """
 
@@ -54,8 +54,10 @@ class Target:
             )
         if self.mask is not None:
             is_bool = np.asarray(self.mask).dtype == bool
-            given = np.asarray(self.mask, np.float32) if is_bool else self.mask
-            mask = check.numbers("mask", given, expected="weights of pixels [height, width], or the path of a picture")
+            arguments = np.asarray(self.mask, np.float32) if is_bool else self.mask
+            mask = check.numbers(
+                "mask", arguments, expected="weights of pixels [height, width], or the path of a picture"
+            )
             check.shape("mask", mask.shape, image.shape[:2])
             check.finite("mask", mask)
             if mask.min() < 0 or mask.max() > 1 or not mask.any():
@@ -64,7 +66,7 @@ class Target:
                     "8 bits: mask / 255"
                 )
             object.__setattr__(self, "mask", mask)
-            image[mask == 0] = 0  # whatever is there
+            image[mask == 0] = 0  # whatever the value
         check.finite("image", image)
         object.__setattr__(self, "image", image)
         size = image.shape[1], image.shape[0]
@@ -105,13 +107,13 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tu
     """Images [view, height, width, channel] and weights [view, height, width] at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]
-    down, across = (_area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
+    down, width_means = (_area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
 
     def resized(pixels: np.ndarray) -> torch.Tensor:
-        return torch.einsum("ih,vhwc,jw->vijc", down, torch.from_numpy(pixels).to(device), across)
+        return torch.einsum("ih,vhwc,jw->vijc", down, torch.from_numpy(pixels).to(device), width_means)
 
     weight = resized(weights)
-    image = resized(images * weights) / torch.where(weight > 0, weight, 1)  # what is masked out bleeds into nothing
+    image = resized(images * weights) / torch.where(weight > 0, weight, 1)  # masked-out pixels bleed into nothing
     return image.contiguous(), weight[..., 0].contiguous()
 
 

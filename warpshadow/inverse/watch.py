@@ -1,4 +1,4 @@
-"""A fit in the browser: what its page shows while it runs, and that it does what the page asks for.
+"""A fit in the browser: its page shows progress, and its buttons control the fit.
 
 All of it runs in the fit's own thread, between two iterations: pictures are made of images that the fit has anyway, as
 often as a small part of its time allows, and only while a browser looks.
@@ -35,7 +35,7 @@ _ACROSS = 768
 
 
 class Watched(Protocol):
-    """What is shown of a fit under way."""
+    """State of a running fit, for its page."""
 
     stages: tuple[Stage, ...]
     stage: int
@@ -47,7 +47,7 @@ class Watched(Protocol):
 
 
 class Watch:
-    """Shows a fit on a page, and does what the page asks for.
+    """Show a fit on a page, and obey the page's buttons.
 
     Args:
         viewer: Has the page.
@@ -98,7 +98,7 @@ class Watch:
 
     @contextlib.contextmanager
     def _kept_from_the_fit(self) -> Iterator[None]:
-        """Say on the page what goes wrong there, and once in a warning, and leave the fit alone."""
+        """Report an error of the page on the page, and once in a warning, and leave the fit alone."""
         try:
             yield
         except Exception as error:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpshadow.assets.camera import Camera
-from warpshadow.pipeline.assembly import Geometry
+from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
@@ -20,7 +20,7 @@ from warpshadow.torch import TorchRenderer
 
 
 class Setting:
-    """What all stages of a fit have in common: the scene at the start and the units of its parameters.
+    """Shared by all stages of a fit: the scene at the start and the units of its parameters.
 
     Args:
         scene: The scene, its blockers fitted where its method has spheres.
@@ -45,7 +45,7 @@ class Setting:
         return np.linalg.norm([camera.eye - middle for camera in self.cameras], axis=1, keepdims=True)
 
     def graph(self, body: int, count: int) -> DeformationGraph:
-        """The deformation graph of a body, whose nodes are its spheres, be it that nothing casts shadows."""
+        """The deformation graph of a body, whose nodes are its spheres, even if the method casts no shadows."""
         if (body, count) not in self._graphs:
             shadowed = replace(self.scene, visibility=Visibility())
             centers = scene_blockers(shadowed, device=str(self.device))[body].centers
@@ -54,7 +54,7 @@ class Setting:
         return self._graphs[body, count]
 
     def smoothing(self, body: int, count: int, weight: float) -> torch.Tensor:
-        """What smooths values over the nodes of a body's graph, (I + λ L)⁻¹, [node, node]."""
+        """Matrix that smooths values over the nodes of a body's graph, (I + λ L)⁻¹, [node, node]."""
         if (body, count, weight) not in self._smoothings:
             graph = self.graph(body, count)
             pairs = graph.neighbors.numpy()
@@ -90,7 +90,7 @@ class Setting:
 
 
 class World:
-    """A scene on its way to an image; each free parameter puts its tensors in place of what the scene has.
+    """A scene on its way to an image; each free parameter replaces the scene's values with its tensors.
 
     Args:
         renderer: Of the scene, at a stage's size and softness, with a camera for each view.
@@ -138,8 +138,8 @@ class World:
 
 
 @dataclass
-class Found:
-    """What a fit found: the scene, and what is not the scene's.
+class FittedScene:
+    """The fitted scene, and the fitted values that are not in the scene, such as exposures.
 
     Args:
         scene: The scene; its camera is that of the first view.

@@ -3,7 +3,7 @@
 import numpy as np
 
 _FLATNESS = 1e-4
-"""Thickness of what counts as flat, as a part of its size."""
+"""Relative thickness below which a mesh counts as flat."""
 
 
 def plane_normal(corners: np.ndarray) -> np.ndarray | None:

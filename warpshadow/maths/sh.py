@@ -7,7 +7,7 @@ n² coefficients:
     l   0        1 1 1          2 2 2 2 2          3 …
     m   0       −1 0 1         −2 −1 0 1 2        −3 …
 
-Functions are NumPy in float64; sh_kernels.py has what kernels use.
+Functions are NumPy in float64; sh_kernels.py has the kernels' versions.
 """
 
 import functools
@@ -119,7 +119,7 @@ def pixel_solid_angles(height: int) -> np.ndarray:
 
 
 def project_map(pixels: np.ndarray, order: int) -> np.ndarray:
-    """Project an equirectangular map, constant over what each pixel covers, onto the basis.
+    """Project an equirectangular map, constant over each pixel, onto the basis.
 
     About the map's own axis, +y, the basis is a product, so its integral over a pixel is, too: over polar angles by
     Gauss–Legendre quadrature, exact to rounding for maps of any height, and over azimuth in closed form,
@@ -232,7 +232,7 @@ def rotation_generators(order: int) -> np.ndarray:
 
 
 class TripleProducts(NamedTuple):
-    """The non-zero Γ_ijk = ∫ y_i y_j y_k, sorted by k; those of k are at first[k] … first[k+1]."""
+    """The non-zero Γ_ijk = ∫ y_i y_j y_k, sorted by k; entries of k are at first[k] … first[k+1]."""
 
     first: np.ndarray
     i: np.ndarray
@@ -257,7 +257,7 @@ def triple_products(order: int, bands_of_j: tuple[int, ...] | None = None, symme
     Args:
         order: Number of bands n.
         bands_of_j: Keep only these bands of the second factor (a clamped cosine has few).
-        symmetric: For squares: keep i ≤ j only and double what is off the diagonal.
+        symmetric: For squares: keep i ≤ j only and double the off-diagonal entries.
     """
     tensor = triple_product_tensor(order)
     if bands_of_j is not None:

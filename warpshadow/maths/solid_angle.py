@@ -10,8 +10,8 @@ def solid_angles(corners: np.ndarray) -> np.ndarray:
         corners: float64 of shape [triangle, 3, 3].
 
     Returns:
-        Of each triangle, −2π to 2π, positive where its back is seen; shape [triangle]. Those of a closed mesh that
-        faces outwards add up to 4π inside and to 0 outside.
+        Of each triangle, −2π to 2π, positive where its back is seen; shape [triangle]. The solid angles of a closed
+        mesh that faces outwards add up to 4π inside and to 0 outside.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     length_a, length_b, length_c = np.moveaxis(np.linalg.norm(corners, axis=2), 1, 0)

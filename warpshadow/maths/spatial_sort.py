@@ -1,4 +1,4 @@
-"""Compact order: what is near in space is near in memory, so that kernels can look at several things at once."""
+"""Compact order: points near in space are near in memory, so that kernels can process several at once."""
 
 import numpy as np
 
@@ -19,9 +19,9 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
     if unit is None:
         return np.arange(count)
     _, axes = np.linalg.eigh(np.cov(points.T))
-    along = np.argsort(points @ axes[:, -1], kind="stable")
+    axis_order = np.argsort(points @ axes[:, -1], kind="stable")
     middle = -(-count // unit) // 2 * unit
-    halves = along[:middle], along[middle:]
+    halves = axis_order[:middle], axis_order[middle:]
     return np.concatenate([half[compact_order(points[half], runs=runs)] for half in halves])
 
 

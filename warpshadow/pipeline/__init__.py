@@ -1,1 +1,1 @@
-"""What runs and what is kept: from a scene to its images."""
+"""The pipeline from a scene to its images: nodes that run, and cached results."""

@@ -27,47 +27,47 @@ def find_squares(
     fragments: Fragments,
     spheres: tuple[wp.array, wp.array],
     is_adaptive: np.ndarray,
-    across: int,
+    supersampling: int,
 ) -> Quadtree:
     """Find the squares of images in which the samples of some bodies interpolate.
 
     Args:
-        points: Has what blocks their light.
+        points: Receivers with their blockers.
         positions, normals: Of the vertices, vec3 of shape [batch, vertex].
-        fragments: What samples see.
+        fragments: The fragments of the samples.
         spheres: Centers and radii of all spheres.
         is_adaptive: The bodies, which are flat, bool of shape [body].
-        across: Samples of a pixel across and down.
+        supersampling: Samples of a pixel across and down.
     """
-    assembly, method = points.assembly, points.method
+    merged_scene, method = points.merged_scene, points.method
     assert isinstance(method, SphereMethod)
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    keys = _keys(is_adaptive.tobytes(), assembly.first_face.tobytes())
-    row, column = probe_grid(sides.shape[1:], across)
+    keys = _keys(is_adaptive.tobytes(), merged_scene.first_face.tobytes())
+    row, column = probe_grid(sides.shape[1:], supersampling)
     places = _by_tiles(len(row), len(column))
     probes = (row[:, None] * sides.shape[2] + column).ravel()[places]
     probe_keys = np.append(keys, -1)[sides.numpy().reshape(len(sides), -1)[:, probes]]
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
-    flats = points.blocking.flats
+    planes = points.blocking.planes
     with unrecorded():
         bare = detached(spheres[0]), detached(spheres[1])
-        frames = method.flats.frames(flats, detached(positions)) if flats else None
-        grouping = Grouping(points, method.flats)
+        frames = method.planes.frames(planes, detached(positions)) if planes else None
+        grouping = Grouping(points, method.planes)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:
                 continue
             samples = np.where(columns < 0, -1, probes[columns])
             seen = see_samples(fragments, samples)
-            facing = points_seen(detached(positions), detached(normals), assembly.faces, seen)
+            facing = points_seen(detached(positions), detached(normals), merged_scene.faces, seen)
             group = grouping.around(*facing, body, bare, frames)
             parts = [method.sharp_share(part) for part in group.parts()]
             known = [part for part in parts if part is not None]
             if known:
                 view, place = np.nonzero(columns >= 0)
                 shares[view, places[columns[view, place]]] = np.concatenate(known, axis=1)[view, place]
-    return find_quadtree(sides, keys, shares.reshape(len(shares), len(row), len(column)), across)
+    return find_quadtree(sides, keys, shares.reshape(len(shares), len(row), len(column)), supersampling)
 
 
 @functools.lru_cache(maxsize=16)

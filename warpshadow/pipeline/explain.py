@@ -1,9 +1,9 @@
-"""Explanations: what the next call computes, what it leaves out, and why."""
+"""Explanations: which stages the next call computes, which it skips, and why."""
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from warpshadow.pipeline.node import Call, Fixed, Input, Node, Source, Timing
+from warpshadow.pipeline.node import AnyInput, Call, Fixed, Input, Node, Timing
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageReport:
     """A stage of a call; it is true if it runs.
 
     Args:
-        name: What it is called.
+        name: Name of the stage.
         forward: Whether it is computed.
         backward: Whether its adjoint is, when gradients are played back.
         items: On how many items, in words.
@@ -38,11 +38,11 @@ class Stage:
 
 
 class Explanation:
-    """What the next call computes, stage by stage; as text a table.
+    """The stages of the next call; as text a table.
 
     Args:
         image: The node that the call asks for.
-        call: What is known before.
+        call: The cached values that it starts from.
         timings: How long stages took last, by name.
         is_host: Whether launches wait until they are done, as they do on a CPU.
         hidden: Nodes that are left out.
@@ -50,7 +50,7 @@ class Explanation:
 
     Attributes:
         stages: By name, in the order in which they run.
-        notes: What else there is to say, a line each.
+        notes: Further notes, a line each.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Explanation:
         if not is_host:
             self.notes.append("Times are the host's: a launch returns before the GPU is done.")
 
-    def __getitem__(self, name: str) -> Stage:
+    def __getitem__(self, name: str) -> StageReport:
         return self.stages[name]
 
     def __repr__(self) -> str:
@@ -98,19 +98,19 @@ class Explanation:
 def decide(image: Node, call: Call) -> dict[Node, Decision]:
     """Decide which nodes run when a call asks for an image, in the order in which they do; nothing is computed."""
     decisions: dict[Node, Decision] = {}
-    asked: set[Node] = set()
+    requested: set[Node] = set()
 
-    def visit(given: Input, reason: Decision) -> None:
+    def visit(arguments: AnyInput, reason: Decision) -> None:
         """Decide on a node, which is asked for if the reason is that something runs."""
-        node = given.node if isinstance(given, Fixed) else given
-        if isinstance(node, Source) or node in asked or (node in decisions and not reason):
+        node = arguments.node if isinstance(arguments, Fixed) else arguments
+        if isinstance(node, Input) or node in requested or (node in decisions and not reason):
             return
         if reason:
-            asked.add(node)
+            requested.add(node)
         own = _decision(node, call, reason)
-        is_idle = not own and node.known(call) is None  # what is idle asks for what it passes on
-        for each in node.before:
-            visit(each, reason if is_idle else own)
+        is_idle = not own and node.known(call) is None  # an idle node passes the question on to its inputs
+        for item in node.before:
+            visit(item, reason if is_idle else own)
         decisions[node] = own
 
     visit(image, Decision(True, "an image is asked for"))
@@ -120,7 +120,7 @@ def decide(image: Node, call: Call) -> dict[Node, Decision]:
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
     if node.known(call) is not None:
-        return Decision(False, f"kept: {_names(node.sources)} are the same")
+        return Decision(False, f"cached: {_names(node.sources)} are the same")
     if idle := _words(node.idle):
         return Decision(False, idle)
     if not reason:
@@ -130,21 +130,21 @@ def _decision(node: Node, call: Call, reason: Decision) -> Decision:
         return Decision(True, f"a gradient to {_names(varying)} is asked for")
     if news := [source.news for source in node.sources if source.news]:
         return Decision(True, _listed(dict.fromkeys(news)))
-    return Decision(True, "nothing is kept yet") if node.keeps else reason
+    return Decision(True, "nothing is kept yet") if node.caches else reason
 
 
-def _stage(node: Node, forward: Decision) -> Stage:
+def _stage(node: Node, forward: Decision) -> StageReport:
     """A stage whose adjoint runs if it runs itself and something before it requires a gradient."""
     if not forward:
         backward = Decision(False, "nothing is computed")
-    elif node.pulled and node.has_adjoint:
-        backward = Decision(True, f"a gradient to {_names(node.pulled)} is asked for")
+    elif node.differentiated_inputs and node.has_adjoint:
+        backward = Decision(True, f"a gradient to {_names(node.differentiated_inputs)} is asked for")
     else:
         backward = Decision(False, "nothing before it requires a gradient")
-    return Stage(node.name, forward, backward, _words(node.items) if forward else "")
+    return StageReport(node.name, forward, backward, _words(node.items) if forward else "")
 
 
-def _names(sources: Iterable[Source]) -> str:
+def _names(sources: Iterable[Input]) -> str:
     return _listed(dict.fromkeys(source.name for source in sources))
 
 

@@ -1,4 +1,4 @@
-"""Lighting: where light is evaluated, and what each method of visibility makes of it there."""
+"""Lighting: where light is evaluated, and the interface of visibility methods."""
 
 import functools
 from collections.abc import Callable, Hashable
@@ -13,11 +13,11 @@ from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.maths import sh
-from warpshadow.pipeline.assembly import Assembly, Geometry
-from warpshadow.pipeline.node import Call, Node, Source
-from warpshadow.pipeline.own_shadows import BY_SPHERES, Blocking, OwnShadows
+from warpshadow.pipeline.merged_scene import Geometry, MergedScene
+from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.static import Static
+from warpshadow.pipeline.self_visibility import BY_SPHERES, Blocking, SelfVisibility
+from warpshadow.pipeline.static import StaticBodies
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
 from warpshadow.stages.shading import shade
@@ -26,26 +26,26 @@ KnownLight = EnvironmentMap | np.ndarray
 Light = KnownLight | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
-Kept = TypeVar("Kept")
+Cached = TypeVar("Cached")
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 """Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
 
 
 class LitPoints:
-    """Points that are lit: what light takes of a view.
+    """Points that are lit: the receivers of a view.
 
     Args:
         method: How their light is blocked.
-        materials: What the scene's bodies reflect.
+        materials: Reflectance of the scene's bodies.
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
         receivers: The points.
-        call: Has what of them may not be kept.
+        call: Holds values of the points that may not be cached.
         static: The static bodies among moving ones; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocking: How the bodies block light.
-        stands: Whether bodies and points are where the scene and its camera have them, for good.
+        is_static: Whether bodies and points are where the scene and its camera have them, for good.
         blocker_of_point: Of points that send light, the number of the blocker nearest to the patch of each, among the
             spheres of bodies that are not flat, −1 for none: NumPy of shape [receiver].
     """
@@ -54,31 +54,31 @@ class LitPoints:
         self,
         method: "Method",
         materials: Materials,
-        vertices: Source,
-        spheres: Source,
+        vertices: Input,
+        spheres: Input,
         receivers: Node,
         call: Call,
-        static: Static | None = None,
+        static: StaticBodies | None = None,
         normals: Node | None = None,
         blocking: Blocking = BY_SPHERES,
-        stands: bool = False,
+        is_static: bool = False,
         blocker_of_point: np.ndarray | None = None,
     ):
-        self.blocking, self.stands, self.blocker_of_point = blocking, stands, blocker_of_point
-        self.method, self.materials, self.assembly = method, materials, method.assembly
+        self.blocking, self.is_static, self.blocker_of_point = blocking, is_static, blocker_of_point
+        self.method, self.materials, self.merged_scene = method, materials, method.merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
-        self.normals = Node("", vertex_normals, vertices, method.assembly.faces) if normals is None else normals
+        self.normals = Node("", vertex_normals, vertices, method.merged_scene.faces) if normals is None else normals
         self._scene_shading: Node | None = None
-        self._known: tuple[Source, Node] | None = None
+        self._known: tuple[Input, Node] | None = None
         self._transfers: Node | None = None
-        self._kept: dict[str, tuple[Hashable, Any]] = {}
+        self._cached: dict[str, tuple[Hashable, Any]] = {}
 
-    def kept(self, name: str, given: Hashable, make: Callable[[], Kept]) -> Kept:
-        """What a method makes for the points: that which the name has, as long as it is asked for the same."""
-        if name not in self._kept or self._kept[name][0] != given:
-            self._kept[name] = given, make()
-        return self._kept[name][1]
+    def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+        """A method's value for the points, cached under a name while its inputs stay the same."""
+        if name not in self._cached or self._cached[name][0] != key:
+            self._cached[name] = key, make()
+        return self._cached[name][1]
 
     @property
     def receivers(self) -> Receivers:
@@ -91,16 +91,16 @@ class LitPoints:
         return "", receivers.points.size, len(receivers.on_static)
 
     def shading(self, light: Light | None, materials: Materials | None = None) -> Node:
-        """What the receivers send back as white surfaces, vec3 of shape [batch, receiver]; None is the scene's light.
+        """Light reflected by the receivers as white surfaces, vec3 of shape [batch, receiver]; None: the scene's.
 
-        What the scene's light and the last other known light make is kept. Materials, by default the scene's, matter
-        where light bounces.
+        Results for the scene's light and the last other known light are cached. Materials, by default the scene's,
+        matter where light bounces.
         """
         check_light(light)
-        if materials is None or not self.assembly.scene.bounces:
+        if materials is None or not self.merged_scene.scene.bounces:
             materials = self.materials
         if isinstance(light, wp.array):
-            return self.method.free_shading(self, Source("light", light, news="light is given"), materials)
+            return self.method.free_shading(self, Input("light", light, news="light is given"), materials)
         if light is None or light is self.method.light.value():
             if materials is not self.materials:
                 return self.method.shading(self, self.method.light, materials)
@@ -108,7 +108,7 @@ class LitPoints:
                 self._scene_shading = self.method.shading(self, self.method.light, materials)
             return self._scene_shading
         last, node = self._known or (None, None)
-        source = Source.renewed("light", light, last)
+        source = Input.renewed("light", light, last)
         if node is None or source is not last:
             node = self.method.shading(self, source, self.materials)
             self._known = source, node
@@ -126,74 +126,81 @@ class Method:
     """How light is blocked: a method of visibility.
 
     Args:
-        assembly: The bodies.
-        native_basis: What the method computes light in.
-        basis: What free light is expressed in; None for the method's own.
+        merged_scene: The bodies.
+        native_basis: Basis in which the method computes light.
+        basis: Basis of free light; None for the method's own.
         progress: Show progress where something takes longer than a second.
     """
 
     lights_samples = False
-    """Whether every sample is a receiver, whatever its body says."""
+    """Whether every sample is a receiver, overriding the bodies."""
 
-    traces_own_shadows = False
+    shares_directions = False
+    """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
+
+    traces_self_visibility = False
     """Whether bodies' shadows on themselves may come from rays, where the others' come from spheres."""
 
-    def __init__(self, assembly: Assembly, native_basis: Basis, basis: Basis | None, *, progress: bool = False):
-        self.assembly, self.native_basis, self.progress = assembly, native_basis, progress
+    def __init__(self, merged_scene: MergedScene, native_basis: Basis, basis: Basis | None, *, progress: bool = False):
+        self.merged_scene, self.native_basis, self.progress = merged_scene, native_basis, progress
         self.basis = native_basis if basis is None else basis
-        self.visibility = assembly.scene.visibility
-        self.light = Source("light", assembly.scene.light)
+        self.visibility = merged_scene.scene.visibility
+        self.light = Input("light", merged_scene.scene.light)
         self._numberings: dict[tuple[tuple[int, ...], ...], list[Numbering]] = {}
 
-    def flats_in(self, geometry: Geometry | None) -> tuple[int, ...]:
+    def planes_in(self, geometry: Geometry | None) -> tuple[int, ...]:
         """Bodies that block as planes in a geometry, by default the scene's."""
         return ()
 
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
         """Bodies on which samples are receivers, bool of shape [body]."""
-        return np.array([self.lights_samples or body.receivers != "vertex" for body in self.assembly.scene.bodies])
+        return np.array([self.lights_samples or body.receivers != "vertex" for body in self.merged_scene.scene.bodies])
 
     @functools.cached_property
     def is_adaptive(self) -> np.ndarray:
         """Flat bodies on which samples interpolate between receivers, bool of shape [body]."""
-        adaptive = np.array([body.receivers == "adaptive" for body in self.assembly.scene.bodies])
-        return adaptive & self.assembly.is_flat & (not self.lights_samples)
+        adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
+        return adaptive & self.merged_scene.is_flat & (not self.lights_samples)
 
     @functools.cached_property
     def can_receive(self) -> np.ndarray:
-        """Vertices that may be receivers, and those whose backs may be, bool of shape [2, vertex]."""
-        body_of_vertex, receives = self.assembly.body_of_vertex, ~self.samples_receive
-        return np.stack([receives[body_of_vertex], (receives & self.assembly.is_two_sided)[body_of_vertex]])
+        """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
+        body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive
+        return np.stack([receives[body_of_vertex], (receives & self.merged_scene.is_two_sided)[body_of_vertex]])
 
     @functools.cached_property
-    def own_shadows(self) -> OwnShadows:
+    def self_visibility(self) -> SelfVisibility:
         """The bodies' shadows on themselves, from rays."""
-        return OwnShadows(self.assembly, self.samples_receive, progress=self.progress)
+        return SelfVisibility(self.merged_scene, self.samples_receive, progress=self.progress)
 
-    def apart(self, blocking: Blocking) -> np.ndarray | None:
+    def separate_bodies(self, blocking: Blocking) -> np.ndarray | None:
         """Bodies whose receivers are groups of their own, −1 for others, shape [body]; None where all share a group."""
-        bodies = np.arange(len(self.assembly.scene.bodies))
-        if self.assembly.scene.bounces:
+        bodies = np.arange(len(self.merged_scene.scene.bodies))
+        if self.merged_scene.scene.bounces:
             return bodies
-        named = (*blocking.traced, *blocking.flats)
+        named = (*blocking.traced, *blocking.planes)
         return np.where(np.isin(bodies, named), bodies, -1) if named else None
 
     def numbering(self, blocking: Blocking, has_backs: bool) -> Numbering:
         """Of all vertices, or of all with their backs; a first call makes both, so that a capture finds them."""
-        key = blocking.traced, blocking.flats
+        key = blocking.traced, blocking.planes
         if key not in self._numberings:
-            faces, can_receive, apart = self.assembly.faces, self.can_receive, self.apart(blocking)
-            bodies = None if apart is None else apart[self.assembly.body_of_vertex]
+            faces, can_receive, separate_bodies = (
+                self.merged_scene.faces,
+                self.can_receive,
+                self.separate_bodies(blocking),
+            )
+            bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]
             sides = can_receive[:1], can_receive
-            self._numberings[key] = [number_receivers(faces, each, bodies=bodies) for each in sides]
+            self._numberings[key] = [number_receivers(faces, item, bodies=bodies) for item in sides]
         return self._numberings[key][has_backs]
 
-    def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+    def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
         raise NotImplementedError
 
-    def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+    def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light, which is converted where the transfer vectors are not."""
         matrix = self.native_from_basis if points.transfers.requires_grad else None
         items = functools.partial(receiver_words, points)
@@ -201,11 +208,11 @@ class Method:
 
     @functools.cached_property
     def native_from_basis(self) -> np.ndarray | None:
-        """What takes free light to what the method computes in; None where it is that, or bands of it."""
-        given, native = self.basis, self.native_basis
-        if isinstance(native, HarmonicBasis) and isinstance(given, HarmonicBasis) and given.order <= native.order:
+        """Matrix from free light to the method's native basis; None if they are the same, or bands of it."""
+        basis, native = self.basis, self.native_basis
+        if isinstance(native, HarmonicBasis) and isinstance(basis, HarmonicBasis) and basis.order <= native.order:
             return None
-        return conversion(given, native)
+        return conversion(basis, native)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group."""
@@ -217,7 +224,7 @@ class Method:
 
 
 def check_light(light: object) -> None:
-    """Raise ValueError for what is no light, or None."""
+    """Raise ValueError for a value that is neither light nor None."""
     expected = f"{LIGHT}, or free coefficients in renderer.basis as a tensor"
     check.instance("light", light, (EnvironmentMap, np.ndarray, wp.array, type(None)), expected)
     if isinstance(light, np.ndarray):
@@ -237,10 +244,10 @@ def receiver_words(points: LitPoints, *, moving: bool = True, static: bool = Tru
 
 def _shade(transfers: list[wp.array], light: wp.array, *, matrix: np.ndarray | None) -> wp.array:
     """Light the receivers of all groups, by light that a matrix converts. Differentiable: transfers, light."""
-    most = check.LARGEST
+    maximum = check.LARGEST
     if matrix is not None:
-        light, most = converted(light, matrix), LARGEST_COEFFICIENT
-    return joined([shade(transfer, light, most=most) for transfer in transfers])
+        light, maximum = converted(light, matrix), LARGEST_COEFFICIENT
+    return joined([shade(transfer, light, maximum=maximum) for transfer in transfers])
 
 
 def converted(light: wp.array, matrix: np.ndarray | None) -> wp.array:

@@ -1,9 +1,9 @@
-"""Nodes: what is computed, from what, whether it is kept, and why.
+"""Nodes: a computed value, its inputs, whether it is cached, and why.
 
 A source is something given: vertices, a light. A node computes a value from sources and from other nodes when it is
 asked for it. Neither ever changes: where something else is given, there is another source, and there are other nodes
-that take it. So what a node computed is right for as long as the node is there. It is kept, and a node that keeps its
-value asks nothing that comes before it. Only what has a gradient is not kept: a tape is good for one playback.
+that take it. So a node's value stays right for as long as the node exists. It is cached, and a node that keeps its
+value asks nothing that comes before it. Only values with a gradient are not cached: a tape is good for one playback.
 """
 
 import time
@@ -17,11 +17,11 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import record
 
 
-class Source:
+class Input:
     """Something given.
 
     Args:
-        name: What it is called.
+        name: Name of the stage.
         value: The value; or a function that makes it when it is first asked for.
         news: Why it takes the place of another, in words, such as "light is given".
 
@@ -32,9 +32,9 @@ class Source:
     def __init__(self, name: str, value: Any, *, news: str = ""):
         self.name, self.news, self.given, self._value = name, news, value, value
         self.requires_grad = False
-        for each in value if isinstance(value, (tuple, list)) else [value]:
-            self.requires_grad |= getattr(each, "requires_grad", False)
-        self.sources, self.pulled = {self: None}, {self: None} if self.requires_grad else {}
+        for item in value if isinstance(value, (tuple, list)) else [value]:
+            self.requires_grad |= getattr(item, "requires_grad", False)
+        self.sources, self.differentiated_inputs = {self: None}, {self: None} if self.requires_grad else {}
 
     def value(self, call: "Call | None" = None) -> Any:
         """The value."""
@@ -43,26 +43,26 @@ class Source:
         return self._value
 
     @classmethod
-    def renewed(cls, name: str, given: Any, last: "Source | None") -> "Source":
-        """A source of a copy of what is given now; the last source where that is the same.
+    def renewed(cls, name: str, value: Any, last: "Input | None") -> "Input":
+        """A source with a copy of the given value; the last source if the value is the same.
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
         """
-        source = cls(name, given)
+        source = cls(name, value)
         if source.requires_grad:
             return source
         if last is not None and not last.requires_grad:
-            if _is_same(given, last):
+            if _is_same(value, last):
                 return last
             source.news = f"{name} changed since the last call"
-        source._value = _copied(given)
+        source._value = _copied(value)
         return source
 
 
 def _arrays(value: Any) -> list[wp.array]:
     """The arrays of a value, which may be one or a sequence of them."""
-    return [each for each in (value if isinstance(value, (tuple, list)) else [value]) if isinstance(each, wp.array)]
+    return [item for item in (value if isinstance(value, (tuple, list)) else [value]) if isinstance(item, wp.array)]
 
 
 def _copied(value: Any) -> Any:
@@ -73,13 +73,13 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-def _is_same(given: Any, last: Source) -> bool:
-    """Whether what is given is what a source has, as far as can be told without waiting."""
-    arrays, value = _arrays(given), last.value()
-    if isinstance(given, np.ndarray):
-        return isinstance(value, np.ndarray) and np.array_equal(given, value)
+def _is_same(new_value: Any, last: Input) -> bool:
+    """Whether a given value equals a source's, as far as can be told without waiting."""
+    arrays, value = _arrays(new_value), last.value()
+    if isinstance(new_value, np.ndarray):
+        return isinstance(value, np.ndarray) and np.array_equal(new_value, value)
     if not arrays:
-        return given is value
+        return new_value is value
     return all(map(_is_same_array, arrays, _arrays(last.given) or arrays, _arrays(value)))
 
 
@@ -88,7 +88,7 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count; 20 µs for 35,000 vertices
         return np.array_equal(array.numpy(), copy.numpy())
     origin = getattr(array, "origin", None)
-    marks = [(each.ptr, each.shape, each.strides, getattr(each, "version", None)) for each in (array, before)]
+    marks = [(item.ptr, item.shape, item.strides, getattr(item, "version", None)) for item in (array, before)]
     return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
 
 
@@ -96,22 +96,22 @@ class Node:
     """Something computed.
 
     Args:
-        name: What the stage is called; empty for what is no stage of its own: it is neither timed nor explained.
-        function: Computes the value from those of the inputs; None where nobody asks for it.
+        name: Name of the stage; empty for a node that is neither timed nor explained.
+        function: Computes the value from the inputs' values; None if nothing asks for it.
         inputs: Nodes and sources; anything else is passed on as it is.
         items: On how many items it is computed, in words.
         idle: Why there is nothing to do, in words; the function then passes something on.
         has_adjoint: Whether gradients take it more than to hand them on.
-        keeps: Whether the value may outlive a call.
-        beside: Other nodes that run for this one, or are explained beside it.
+        caches: Whether the value may outlive a call.
+        extra_inputs: Other nodes that run for this one, or are explained beside it.
 
     Items and idle may be functions that make the words.
 
     Attributes:
         before: The nodes and sources that it depends on at once.
         sources: All sources that it depends on.
-        requires_grad: Whether a gradient to any of them is asked for; then nothing is kept.
-        pulled: Those of them that get a gradient from here.
+        requires_grad: Whether a gradient to any of them is asked for; then nothing is cached.
+        differentiated_inputs: The inputs that get a gradient from here.
     """
 
     def __init__(
@@ -122,33 +122,33 @@ class Node:
         items: str | Callable[[], str] = "",
         idle: str | Callable[[], str] = "",
         has_adjoint: bool = True,
-        keeps: bool = True,
-        beside: tuple["Node", ...] = (),
+        caches: bool = True,
+        extra_inputs: tuple["Node", ...] = (),
     ):
         self.name, self.function, self.inputs = name, function, inputs
         self.items, self.idle, self.has_adjoint = items, idle, has_adjoint
-        self.before: list[Input] = []
-        self.sources: dict[Source, None] = {}  # in order
-        self.pulled: dict[Source, None] = {}
+        self.before: list[AnyInput] = []
+        self.sources: dict[Input, None] = {}  # in order
+        self.differentiated_inputs: dict[Input, None] = {}
         self.requires_grad = False
-        for each in (*inputs, *beside):
-            if isinstance(each, (Node, Source)) or (isinstance(each, Fixed) and not each.is_constant):
-                self.before.append(each)
-                self.sources |= each.sources
-                self.pulled |= each.pulled
-                self.requires_grad |= each.requires_grad
-        self.keeps = keeps and not self.requires_grad
-        self.is_kept = False
-        self._kept: Any = None
+        for item in (*inputs, *extra_inputs):
+            if isinstance(item, (Node, Input)) or (isinstance(item, Fixed) and not item.is_constant):
+                self.before.append(item)
+                self.sources |= item.sources
+                self.differentiated_inputs |= item.differentiated_inputs
+                self.requires_grad |= item.requires_grad
+        self.caches = caches and not self.requires_grad
+        self.is_cached = False
+        self._cached: Any = None
 
     def value(self, call: "Call") -> Any:
-        """The value, which is computed unless it is kept or the call has it."""
-        if self.is_kept:
-            return self._kept
+        """The value, which is computed unless it is cached or the call has it."""
+        if self.is_cached:
+            return self._cached
         if self not in call:
             value = self.compute(call)
-            if self.keeps and call.keeps:
-                self._kept, self.is_kept = value, True
+            if self.caches and call.caches:
+                self._cached, self.is_cached = value, True
                 self.inputs = ()  # which may be large, and constants are not asked for again
                 return value
             call[self] = value
@@ -160,21 +160,21 @@ class Node:
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
-        return [each.value(call) if isinstance(each, (Node, Source, Fixed)) else each for each in self.inputs]
+        return [item.value(call) if isinstance(item, (Node, Input, Fixed)) else item for item in self.inputs]
 
     def run(self, call: "Call", *values: Any) -> Any:
         """Call the function, and time it."""
         assert self.function is not None
         if not self.name or isinstance(self.idle, str) and self.idle:
             return self.function(*values)
-        end = call.start(self.name, is_marked=self.has_adjoint and bool(self.pulled))
+        end = call.start(self.name, is_marked=self.has_adjoint and bool(self.differentiated_inputs))
         value = self.function(*values)
         end()
         return value
 
     def known(self, call: "Call") -> Any:
         """The value if it needs no computation, else None."""
-        return self._kept if self.is_kept else call.get(self)
+        return self._cached if self.is_cached else call.get(self)
 
 
 class Fixed:
@@ -182,16 +182,16 @@ class Fixed:
 
     Args:
         node: The node or source.
-        is_constant: Whether the value is the same whatever the sources of the node are.
+        is_constant: Whether the value is independent of the sources' values.
     """
 
-    def __init__(self, node: Node | Source, *, is_constant: bool = False):
+    def __init__(self, node: Node | Input, *, is_constant: bool = False):
         self.node, self.value, self.is_constant = node, node.value, is_constant
         self.requires_grad, self.sources = node.requires_grad, node.sources
-        self.pulled: dict[Source, None] = {}
+        self.differentiated_inputs: dict[Input, None] = {}
 
 
-Input = Node | Source | Fixed
+AnyInput = Node | Input | Fixed
 
 
 class Timing:
@@ -228,22 +228,22 @@ class Clock:
 
 
 class Call(dict[Node, Any]):
-    """What a call computes and does not keep: values by node.
+    """Values of a call that are not cached: by node.
 
     Args:
         clock: Where times are noted.
         known: Values that are known before.
-        keeps: Whether nodes may keep values. What is made while a CUDA graph is captured belongs to the graph.
+        caches: Whether nodes may keep values. Values made during the capture of a CUDA graph belong to the graph.
     """
 
-    def __init__(self, clock: Clock, known: Mapping[Node, Any] | None = None, *, keeps: bool = True):
+    def __init__(self, clock: Clock, known: Mapping[Node, Any] | None = None, *, caches: bool = True):
         super().__init__(known or {})
-        self.keeps = keeps
+        self.caches = caches
         self._clock = clock
         self._timings: dict[str, Timing] = {}
 
     def start(self, name: str, *, is_marked: bool) -> Callable[[], None]:
-        """Start a stage, or a part of one that has run in this call, and return what ends it.
+        """Start a stage, or resume one that has run in this call, and return the function that ends it.
 
         Its adjoint is timed by marks on the tape.
         """

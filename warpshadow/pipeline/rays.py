@@ -3,22 +3,26 @@
 import functools
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_words
-from warpshadow.pipeline.node import Fixed, Node, Source
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.ray_tracing import trace_shading, trace_transfer
+from warpshadow.stages.light_samples import cut_map, sample_map
+from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
+from warpshadow.stages.ray_tracing import trace_shading
 from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.shared_rays import find_shares, trace_shared
+from warpshadow.stages.traced_transfer import trace_transfer
 
 if TYPE_CHECKING:  # it is imported where light bounces
-    from warpshadow.pipeline.bounces.kept import KeptBounces
+    from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 
 Meshes = list[wp.Mesh | None]
-"""What blocks the light of each instance of receivers; None for nothing."""
+"""Mesh that blocks the light of each instance of receivers; None for no blocker."""
 
 
 class Rays(Method):
@@ -26,64 +30,68 @@ class Rays(Method):
 
     lights_samples = True
 
-    def __init__(self, assembly: Assembly, basis: Basis | None, *, progress: bool = False):
-        super().__init__(assembly, HarmonicBasis(assembly.scene.visibility.order), basis, progress=progress)
+    def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
+        super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
+        self.shares_directions = self.visibility.sampling == "shared"
 
-    def shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+    def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, towards which rays are drawn.
 
         By what the scene's bodies reflect, light bounces along paths, without a gradient; by reflectance that a call
-        gives, it bounces between patches, whose form factors rays find once.
+        gives, and where receivers share directions, since few paths have grain, it bounces between patches, whose form
+        factors rays find once.
         """
-        meshes = self._meshes(points)
+        meshes = self._blockers(points, points.receivers_node)
 
         def shaded() -> Node:
             return Node(
                 "shading",
-                self._shade,
+                self._shade_shared if self.shares_directions else self._shade,
                 meshes,
                 points.receivers_node,
                 light,
                 items=lambda: receiver_words(points),
-                beside=(Node("transfer", None, idle="rays shade known light at once"),),
+                extra_inputs=(Node("transfer", None, idle="rays shade known light at once"),),
             )
 
-        if not self.assembly.scene.bounces:
+        if not self.merged_scene.scene.bounces:
             return shaded()
-        direct = points.kept("direct", light, shaded)
-        if materials is points.materials:
+        direct = points.cached("direct", light, shaded)
+        if materials is points.materials and not self.shares_directions:
             from warpshadow.pipeline.bounces.paths import path_traced
 
-            given = direct, meshes, points, light, materials
-            return path_traced(*given, samples=self._sample_count, progress=self.progress)
+            arguments = direct, meshes, points, light, materials
+            return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
         sources = self._bounces.sources(points, materials)
 
         def shaded_sources() -> Node:
-            return Node("", self._shade, self._meshes_for(points, sources), sources, light)
+            shade = self._shade_shared if self.shares_directions else self._shade
+            return Node("", shade, self._blockers(points, sources), sources, light)
 
-        at_sources = points.kept("direct at sources", (light, sources), shaded_sources)
+        at_sources = points.cached("direct at sources", (light, sources), shaded_sources)
         return self._bounces.in_known_light(direct, at_sources, points, materials)
 
-    def free_shading(self, points: LitPoints, light: Source, materials: Materials) -> Node:
+    def free_shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in free light."""
         direct = super().free_shading(points, light, materials)
-        if not self.assembly.scene.bounces:
+        if not self.merged_scene.scene.bounces:
             return direct
         sources = self._bounces.sources(points, materials)
 
         def transfers() -> Node:
             return Node("", self._transfer, self._meshes_for(points, sources), sources)
 
-        at_sources = points.kept("transfer of sources", sources, transfers)
+        at_sources = points.cached("transfer of sources", sources, transfers)
         return self._bounces.in_free_light(direct, at_sources, light, points, materials)
 
     @functools.cached_property
-    def _bounces(self) -> "KeptBounces":
-        from warpshadow.pipeline.bounces.kept import KeptBounces
+    def _bounces(self) -> "StaticBounces":
         from warpshadow.pipeline.bounces.patches import ScenePatches
+        from warpshadow.pipeline.bounces.static_bounces import RAYS, STILL_RAYS, StaticBounces
 
-        given = ScenePatches(self.assembly), self.assembly.scene.bounces
-        return KeptBounces(*given, progress=self.progress)
+        arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces
+        rays = STILL_RAYS if self.shares_directions else RAYS
+        return StaticBounces(*arguments, rays=rays, progress=self.progress)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -98,6 +106,21 @@ class Rays(Method):
             node.function = _refuse
         return node
 
+    def _blockers(self, points: LitPoints, receivers: Node) -> Node:
+        """Node of what rays in known light meet: trees of all vertices, or meshes for each instance of receivers."""
+        if not self.shares_directions:
+            return self._meshes(points) if receivers is points.receivers_node else self._meshes_for(points, receivers)
+        items = functools.partial(receiver_words, points)
+        return points.cached(
+            "trees", points.vertices, lambda: Node("visibility", self._trees, points.vertices, items=items)
+        )
+
+    def _trees(self, positions: wp.array) -> list[FaceTree]:
+        """Hierarchies of what casts shadows, for packets of rays."""
+        merged_scene = self.merged_scene
+        faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.casting)]
+        return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]
+
     def _meshes(self, points: LitPoints) -> Node:
         """Node of the meshes that rays meet."""
         alike = "rays treat all receivers alike"
@@ -107,37 +130,47 @@ class Rays(Method):
             points.vertices,
             Fixed(points.receivers_node),
             items=lambda: f"{receiver_words(points)} by rays",
-            idle="" if self.assembly.casting else "no body has blockers",
-            keeps=False,
-            beside=(Node("static shadows", None, idle=alike),),
+            idle="" if self.merged_scene.casting else "no body has blockers",
+            caches=False,
+            extra_inputs=(Node("static shadows", None, idle=alike),),
         )
 
     def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:
         """Node of the meshes that rays of other receivers among the same bodies meet."""
-        return Node("", self._casting_meshes, points.vertices, Fixed(receivers), keeps=False)
+        return Node("", self._casting_meshes, points.vertices, Fixed(receivers), caches=False)
 
     @property
     def _sample_count(self) -> int:
         """Rays of direct light for each receiver."""
-        return max(1, self.visibility.samples // self.assembly.scene.supersampling**2)
+        return max(1, self.visibility.ray_count // self.merged_scene.scene.supersampling**2)
 
     def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
         points = receivers.points
         count = min(len(points) if points.size else 0, len(positions))
-        meshes = [self.assembly.casting_mesh(positions[instance]) for instance in range(count)]
+        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
         return [*meshes, *meshes[-1:] * (len(points) - count)]
 
     def _shade(self, meshes: Meshes, receivers: Receivers, light: KnownLight) -> wp.array:
-        points, normals = receivers.points, receivers.normals
-        if points.requires_grad:
-            raise ValueError(
-                "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
-            )
+        points, normals = _without_gradient(receivers.points), receivers.normals
         samples = sample_map(map_of(light), self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         for instance, mesh in enumerate(meshes):
             lit = trace_shading(mesh, points[instance], normals[instance], samples, progress=self.progress)
             wp.copy(traced[instance], lit)
+        return traced
+
+    def _shade_shared(self, trees: list[FaceTree], receivers: Receivers, light: KnownLight) -> wp.array:
+        """Shading by rays in directions that all receivers share."""
+        points, normals, progress = _without_gradient(receivers.points), receivers.normals, self.progress
+        count = -(-self.visibility.ray_count // PACKET) * PACKET
+        traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+        for instance in range(len(points) if points.size else 0):
+            tree = trees[min(instance, len(trees) - 1)]
+            lit_points = tree, points[instance], normals[instance]
+            # a ratio image has the same directions with the bodies and without
+            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points)
+            samples = cut_map(map_of(light), count, pilots)
+            wp.copy(traced[instance], trace_shared(*lit_points, samples, progress=progress))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers) -> list[wp.array]:
@@ -149,11 +182,19 @@ class Rays(Method):
                 points[instance],
                 normals[instance],
                 self.basis.functions,
-                self.visibility.samples,
+                self.visibility.ray_count,
                 progress=self.progress,
             )
             wp.copy(transfer[instance], traced)
         return [transfer]
+
+
+def _without_gradient(points: wp.array) -> wp.array:
+    if points.requires_grad:
+        raise ValueError(
+            "geometry: got arrays that require a gradient, which rays do not have; expected none, or another method"
+        )
+    return points
 
 
 def _refuse(*_: object) -> None:

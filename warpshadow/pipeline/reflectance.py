@@ -1,4 +1,4 @@
-"""Reflectance: what the samples of a view reflect, by albedo of bodies and vertices and by textures."""
+"""Reflectance: the colors of the samples of a view, from albedo of bodies and vertices and from textures."""
 
 import copy
 import functools
@@ -13,8 +13,8 @@ from warpshadow import check
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.node import Call, Fixed, Node, Source
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
@@ -22,14 +22,14 @@ from warpshadow.stages.textures.sample import sample_albedo
 from warpshadow.stages.textures.seen import seen_texels
 
 Given = Sequence[wp.array | None] | None
-"""For each body an array or None for what the scene has; None for all of that."""
+"""For each body an array, or None for the scene's own; None for all bodies' own."""
 
 
 class Materials:
-    """What each body reflects.
+    """Reflectance of each body.
 
     Args:
-        assembly: The bodies.
+        merged_scene: The bodies.
         albedo: Of each body, vec3 of shape [batch, 1] or [batch, vertex].
         textures: Of each body, vec3 of shape [batch, height, width], None without one.
 
@@ -40,47 +40,49 @@ class Materials:
         pyramids: Node of the mip levels of the textures, all of them.
     """
 
-    def __init__(self, assembly: Assembly, albedo: Source, textures: Source):
-        self.assembly = assembly
+    def __init__(self, merged_scene: MergedScene, albedo: Input, textures: Input):
+        self.merged_scene = merged_scene
         self._take_albedo(albedo)
         self._take_textures(textures)
         self._of_scene = list(albedo.value()), list(textures.value())
 
-    def _take_albedo(self, albedo: Source) -> None:
-        counts = np.diff(self.assembly.first_vertex).tolist()
+    def _take_albedo(self, albedo: Input) -> None:
+        counts = np.diff(self.merged_scene.first_vertex).tolist()
         self.albedo, self.vertex_albedo = albedo, Node("", lambda colors: concatenate(colors, counts), albedo)
 
-    def _take_textures(self, textures: Source) -> None:
+    def _take_textures(self, textures: Input) -> None:
         self.textures, images = textures, textures.value()
         self.images = [image for image in images if image is not None]
         self.sizes = tuple([None if image is None else image.shape[1:] for image in images])
         self.pyramids = self.pyramids_to(lambda: None)
 
     @classmethod
-    def of_scene(cls, assembly: Assembly) -> "Materials":
-        """Those of the scene's bodies."""
+    def of_scene(cls, merged_scene: MergedScene) -> "Materials":
+        """The scene's own materials."""
 
         def array(values: np.ndarray) -> wp.array:
-            return wp.array(values[None], dtype=wp.vec3, device=assembly.device)
+            return wp.array(values[None], dtype=wp.vec3, device=merged_scene.device)
 
-        bodies = assembly.scene.bodies
-        albedo = Source("albedo", [array(np.atleast_2d(body.albedo)) for body in bodies])
-        textures = Source("textures", [None if body.texture is None else array(body.texture) for body in bodies])
-        return cls(assembly, albedo, textures)
+        bodies = merged_scene.scene.bodies
+        albedo = Input("albedo", [array(np.atleast_2d(body.albedo)) for body in bodies])
+        textures = Input("textures", [None if body.texture is None else array(body.texture) for body in bodies])
+        return cls(merged_scene, albedo, textures)
 
     def is_black(self, number: int) -> bool:
         """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
         colors, images = self._of_scene
-        given = self.albedo.value()[number] is not colors[number] or self.textures.value()[number] is not images[number]
-        body = self.assembly.scene.bodies[number]
-        return not given and not np.any(body.albedo if body.texture is None else body.texture)
+        arguments = (
+            self.albedo.value()[number] is not colors[number] or self.textures.value()[number] is not images[number]
+        )
+        body = self.merged_scene.scene.bodies[number]
+        return not arguments and not np.any(body.albedo if body.texture is None else body.texture)
 
     def replaced(self, albedo: Given, textures: Given) -> "Materials":
-        """A copy that has what is given in place of some, checked; nodes of the others are the same.
+        """A copy with some materials replaced, checked; nodes of the others are shared.
 
         Itself where nothing is given.
         """
-        bodies = self.assembly.scene.bodies
+        bodies = self.merged_scene.scene.bodies
         colors, images = list(self.albedo.value()), list(self.textures.value())
         for number, color in enumerate(albedo or ()):
             if color is not None:
@@ -102,20 +104,20 @@ class Materials:
                 self._warn_of_growth(f"textures[{number}]", image)
                 images[number] = image
         has_colors, has_images = (
-            all(map(operator.is_, *each)) for each in ((colors, self.albedo.value()), (images, self.textures.value()))
+            all(map(operator.is_, *item)) for item in ((colors, self.albedo.value()), (images, self.textures.value()))
         )
         if has_colors and has_images:
             return self
         materials = copy.copy(self)
         if not has_colors:
-            materials._take_albedo(Source("albedo", colors, news="albedo is given"))
+            materials._take_albedo(Input("albedo", colors, news="albedo is given"))
         if not has_images:
-            materials._take_textures(Source("textures", images, news="textures are given"))
+            materials._take_textures(Input("textures", images, news="textures are given"))
         return materials
 
     def _warn_of_growth(self, name: str, values: wp.array) -> None:
         """Say, where the host need not wait for it, that more light is reflected than falls in; Python says it once."""
-        if self.assembly.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
+        if self.merged_scene.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
             check.warn(
                 f"{name}: got values above 1, with which light grows with each bounce, expected reflectances in "
                 "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
@@ -123,10 +125,10 @@ class Materials:
 
     @property
     def texture_of_face(self) -> wp.array:
-        """Number of each face's texture among those that there are, -1 for none, int32 of shape [face]."""
+        """Index of each face's texture, -1 for none, int32 of shape [face]."""
         has_texture = np.array([size is not None for size in self.sizes])
         texture_of_body = np.where(has_texture, np.cumsum(has_texture) - 1, -1)
-        return constant(texture_of_body[self.assembly.body_of_face], wp.int32, self.assembly.device)
+        return constant(texture_of_body[self.merged_scene.body_of_face], wp.int32, self.merged_scene.device)
 
     def pyramids_to(self, coarsest: Callable[[], int | None]) -> Node:
         """Node of the mip levels of the textures down to the coarsest that is wanted, None for all."""
@@ -145,7 +147,7 @@ class Materials:
 
 
 class Reflection(NamedTuple):
-    """Nodes of what samples reflect."""
+    """Nodes of the samples' reflectance."""
 
     samples: Node  # vec3 of shape [batch, height, width]
     vertex_albedo: Node
@@ -153,14 +155,14 @@ class Reflection(NamedTuple):
     footprints: Node
 
 
-class SeenSurfaces:
-    """What samples see of surfaces, and what these reflect.
+class VisibleSurfaces:
+    """The visible surfaces of samples, and their reflectance.
 
     Args:
         materials: The scene's.
-        fragments: Node of what each sample sees.
+        fragments: Node of the fragments.
         clip_positions: Node of the vertices in clip space.
-        call: Has what of them may not be kept.
+        call: Holds values of the points that may not be cached.
         items: Says how many samples there are.
     """
 
@@ -173,7 +175,7 @@ class SeenSurfaces:
         self._footprints: tuple[tuple, Node, Node] = (), Node("", None), Node("", None)
 
     def reflect(self, materials: Materials) -> Reflection:
-        """Wire what samples reflect; that of the scene's materials is kept."""
+        """Wire the samples' reflectance; the scene's own is cached."""
         own = self._materials
         if materials is not own:
             return self._reflect(materials)
@@ -182,25 +184,25 @@ class SeenSurfaces:
         return self._reflection
 
     def _reflect(self, materials: Materials) -> Reflection:
-        faces, items, vertex_albedo = materials.assembly.faces, self._items, materials.vertex_albedo
+        faces, items, vertex_albedo = materials.merged_scene.faces, self._items, materials.vertex_albedo
         seen = self._fragments, faces, vertex_albedo
         if not materials.images:
             none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
-            samples = Node("reflectance", interpolate, *seen, items=items, beside=tuple(none))
+            samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))
             return Reflection(samples, vertex_albedo, *none)
         pyramids = materials.pyramids
         if materials.textures is not self._materials.textures:
             pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
         if self._footprints[0] != materials.sizes:
-            assembly = materials.assembly
+            merged_scene = materials.merged_scene
             footprints = Node(
                 "footprints",
                 find_footprints,
                 self._fragments,
                 faces,
                 self._clip_positions,
-                assembly.uvs,
-                assembly.uv_faces,
+                merged_scene.uvs,
+                merged_scene.uv_faces,
                 materials.texture_of_face,
                 Fixed(pyramids, is_constant=True),  # of which it takes the sizes alone
                 items=items,
@@ -213,13 +215,13 @@ class SeenSurfaces:
     def coarsest_level(self, sizes: tuple) -> int | None:
         """Coarsest level that kept footprints in textures of some sizes take; on a GPU it waits for that, once."""
         known, footprints, coarsest = self._footprints
-        is_capturing = self._materials.assembly.device.is_capturing
-        if known != sizes or not footprints.is_kept or (is_capturing and not coarsest.is_kept):
+        is_capturing = self._materials.merged_scene.device.is_capturing
+        if known != sizes or not footprints.is_cached or (is_capturing and not coarsest.is_cached):
             return None
         return coarsest.value(self._call)
 
     def seen_texels(self, number: int) -> np.ndarray:
-        """What each texel of the texture of a body weighs in the samples, float32 of shape [height, width]."""
+        """Weight of each texel of a body's texture in the samples, float32 of shape [height, width]."""
         has_texture = [size is not None for size in self._materials.sizes]
         if not has_texture[number]:
             raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")

@@ -1,4 +1,4 @@
-"""Static bodies: those that do not move while others do. What is found out about them once is kept.
+"""Static bodies: bodies that do not move while others do. Results about them are computed once and cached.
 
 Where the spheres of moving bodies let the share T_q of the light of a cell through, a receiver on a static body gets
 
@@ -15,80 +15,81 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.assembly import Assembly, Geometry, exchanged
-from warpshadow.pipeline.node import Node, Source
-from warpshadow.stages.kept_cells import KeptRows
+from warpshadow.pipeline.merged_scene import Geometry, MergedScene, exchanged
+from warpshadow.pipeline.node import Input, Node
+from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sides import split_sides
 
 
-class Static:
-    """The static bodies of a geometry, and what was found out about them.
+class StaticBodies:
+    """The static bodies of a geometry, and cached results about them.
 
     Args:
-        assembly: All bodies.
-        geometry: Has them; what moves in it does not matter.
+        merged_scene: All bodies.
+        geometry: Geometry with the static bodies; its moving bodies are ignored.
 
     Attributes:
         moving: The other bodies, from 0.
         has_vertex: Whether each vertex is static, bool of shape [vertex].
-        normals: Node of the normals of all vertices, vec3 of shape [1, vertex]; those of moving ones mean nothing.
+        normals: Node of the normals of all vertices, vec3 of shape [1, vertex]; normals of moving vertices are
+            undefined.
 
     Raises:
         ValueError: where the static bodies of the instances differ.
     """
 
-    def __init__(self, assembly: Assembly, geometry: Geometry):
+    def __init__(self, merged_scene: MergedScene, geometry: Geometry):
         assert geometry.moving is not None
         self.moving = geometry.moving
-        self.bodies = [number for number in range(len(assembly.scene.bodies)) if number not in geometry.moving]
-        self.has_vertex = np.isin(assembly.body_of_vertex, self.bodies)
-        self._assembly = assembly
+        self.bodies = [number for number in range(len(merged_scene.scene.bodies)) if number not in geometry.moving]
+        self.has_vertex = np.isin(merged_scene.body_of_vertex, self.bodies)
+        self._merged_scene = merged_scene
         self._geometry = geometry.map(_first_instance)
         if not self.are_those_of(geometry):
             raise ValueError(
                 f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
                 "name all that do"
             )
-        self._vertex_runs = assembly.runs(assembly.first_vertex, self.moving)
-        self.normals = Node("", vertex_normals, self._geometry.positions, assembly.faces)
+        self._vertex_runs = merged_scene.runs(merged_scene.first_vertex, self.moving)
+        self.normals = Node("", vertex_normals, self._geometry.positions, merged_scene.faces)
         self._clip_positions: Node | None = None
         self._gathered: tuple = (None,)  # vertices, and points and normals of them
-        self._rows: dict[Hashable, Rows] = {}
+        self._rows: dict[Hashable, VertexRows] = {}
 
     def are_those_of(self, geometry: Geometry) -> bool:
         """Whether the static bodies of another geometry are these; on a GPU that is taken on trust."""
         if geometry.moving != self.moving:
             return False
-        if not is_readable(self._assembly.device):
+        if not is_readable(self._merged_scene.device):
             return True
-        starts = self._assembly.first_vertex, self._assembly.first_sphere, self._assembly.first_sphere
+        starts = self._merged_scene.first_vertex, self._merged_scene.first_sphere, self._merged_scene.first_sphere
         return all(
             (array.numpy()[:, first:end] == own.numpy()[:, first:end]).all()
             for array, own, start in zip(
                 geometry.arrays().values(), self._geometry.arrays().values(), starts, strict=True
             )
-            for first, end in self._assembly.runs(start, self.bodies)
+            for first, end in self._merged_scene.runs(start, self.bodies)
         )
 
     # ------------------------------------------------------------------------------------------ vertices
 
-    def clip_positions(self, cameras: Source) -> Node:
-        """Clip positions of all vertices, vec4 of shape [camera, vertex]; those of moving ones mean nothing."""
+    def clip_positions(self, cameras: Input) -> Node:
+        """Clip positions of all vertices, vec4 of shape [camera, vertex]; moving vertices' are undefined."""
         if self._clip_positions is None or self._clip_positions.before != [cameras]:
             self._clip_positions = Node("", to_clip, self._geometry.positions, cameras)
         return self._clip_positions
 
-    def with_moving_clip_positions(self, positions: wp.array, clip_matrices: wp.array, kept: wp.array) -> wp.array:
-        """Put clip positions of moving vertices into those of static ones. Differentiable: positions."""
-        return exchanged(kept, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
+    def with_moving_clip_positions(self, positions: wp.array, clip_matrices: wp.array, cached: wp.array) -> wp.array:
+        """Overwrite the clip positions of moving vertices. Differentiable: positions."""
+        return exchanged(cached, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
 
-    def with_moving_normals(self, positions: wp.array, kept: wp.array) -> wp.array:
-        """Put normals of moving vertices into those of static ones. Differentiable: positions."""
-        faces_of = self._assembly.faces_of
-        return exchanged(kept, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
+    def with_moving_normals(self, positions: wp.array, cached: wp.array) -> wp.array:
+        """Overwrite the normals of moving vertices. Differentiable: positions."""
+        faces_of = self._merged_scene.faces_of
+        return exchanged(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
 
     def receivers(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
         """Gather points and normals of some vertices: vec3 of shape [1, receiver].
@@ -110,16 +111,18 @@ class Static:
             for array, sign in ((self._geometry.positions, np.float32(1)), (normals, outward))
         )
 
-    # ------------------------------------------------------------------------------------------ what blocks light
+    # ------------------------------------------------------------------------------------------ blockers
 
     @property
     def rotations(self) -> wp.array | None:
-        """How all bodies are turned, mat33 of shape [1, body]; those of moving ones mean nothing. None if unknown."""
+        """Rotations of all bodies, mat33 of shape [1, body]; rotations of moving bodies are undefined.
+        None if unknown.
+        """
         return self._geometry.rotations
 
     def spheres_of(self, bodies: list[int]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of some of them."""
-        return self._assembly.spheres_of(bodies, (self._geometry.centers, self._geometry.radii))
+        return self._merged_scene.spheres_of(bodies, (self._geometry.centers, self._geometry.radii))
 
     @functools.cached_property
     def spheres(self) -> tuple[wp.array, wp.array]:
@@ -129,19 +132,19 @@ class Static:
     @functools.cached_property
     def mesh(self) -> wp.Mesh | None:
         """The mesh of the static bodies that rays meet."""
-        return self._assembly.casting_mesh(self._geometry.positions[0], self.bodies)
+        return self._merged_scene.casting_mesh(self._geometry.positions[0], self.bodies)
 
-    def rows(self, key: Hashable, find: Callable[["Static", np.ndarray, wp.array], wp.array]) -> "Rows":
+    def rows(self, key: Hashable, find: Callable[["StaticBodies", np.ndarray, wp.array], wp.array]) -> "VertexRows":
         """Rows of numbers, such as log sums, of static vertices.
 
         Args:
-            key: What the numbers are.
+            key: Names the numbers' meaning.
             find: Finds the rows of some vertices, given these bodies, the vertices and :attr:`normals`.
         """
         if key not in self._rows:
-            is_two_sided = self._assembly.is_two_sided[self._assembly.body_of_vertex]
-            most = self.has_vertex.sum() + (self.has_vertex & is_two_sided).sum()
-            self._rows[key] = Rows(2 * len(self.has_vertex), int(most), functools.partial(find, self))
+            is_two_sided = self._merged_scene.is_two_sided[self._merged_scene.body_of_vertex]
+            maximum = self.has_vertex.sum() + (self.has_vertex & is_two_sided).sum()
+            self._rows[key] = VertexRows(2 * len(self.has_vertex), int(maximum), functools.partial(find, self))
         return self._rows[key]
 
 
@@ -153,17 +156,17 @@ def _first_instance(array: wp.array) -> wp.array:
     return first
 
 
-class Rows:
+class VertexRows:
     """Rows of numbers that vertices get when they are first asked for; room for them doubles.
 
     Args:
         count: Number of vertices and backs.
-        most: Number of those that may be asked for.
+        most: Upper bound of the count.
         find: Finds the rows of some vertices, float32 of shape [vertex, channel, item], given normals.
     """
 
-    def __init__(self, count: int, most: int, find: Callable[[np.ndarray, wp.array], wp.array]):
-        self._most, self._find = most, find
+    def __init__(self, count: int, maximum: int, find: Callable[[np.ndarray, wp.array], wp.array]):
+        self._most, self._find = maximum, find
         self._row_of_vertex = np.full(count, -1, np.int32)
         self._count = 0
         self._rows: wp.array | None = None
@@ -176,8 +179,8 @@ class Rows:
             return self._most - self._count
         return int((self._row_of_vertex[vertices] < 0).sum())
 
-    def of_receivers(self, receivers: Receivers, normals: wp.array) -> KeptRows | None:
-        """Rows of the static receivers, those of vertices that come for the first time found; None without any."""
+    def of_receivers(self, receivers: Receivers, normals: wp.array) -> CachedRows | None:
+        """Rows of the static receivers, computed for vertices that come for the first time; None without any."""
         vertices = receivers.on_static
         if not len(vertices):
             return None
@@ -189,7 +192,7 @@ class Rows:
         if self._index is None or not np.array_equal(vertices, self._vertices):
             self._vertices = vertices
             self._index = wp.array(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
-        return KeptRows(self._rows, self._index)
+        return CachedRows(self._rows, self._index)
 
     def _append(self, rows: wp.array) -> None:
         count = self._count + rows.shape[0]

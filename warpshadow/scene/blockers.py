@@ -4,32 +4,35 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.mesh import Mesh
+from warpshadow.device.progress import LONG, announce
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
+from warpshadow.spheres.fit import fit_seconds, is_fitted
 
 
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
-    """Find the spheres of each body, in its own space, fitting those that are wanted.
+    """Find the spheres of each body, in its own space, fitting the wanted ones.
 
     A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it
     from behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets
     none.
     """
-    if scene.visibility.method not in SPHERE_METHODS:
+    if scene.visibility.with_method().method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)
     grounds = _ground_spheres(scene)
+    _announce(scene, fitted_counts(scene), device, progress)
     return [_body_spheres(body, ground, device, progress) for body, ground in zip(scene.bodies, grounds, strict=True)]
 
 
 def blocking_planes(scene: Scene) -> tuple[int, ...]:
     """Find the bodies that block light as the planes in which they lie, in place of their spheres.
 
-    By method "directional" these are flat bodies that cast shadows, but for those with spheres of the user's own,
+    By method "directional" these are flat bodies that cast shadows, except bodies with spheres of the user's own,
     unless light bounces.
     """
-    if scene.visibility.method != "directional":
+    if scene.visibility.with_method().method != "directional":
         return ()
     has_given = [isinstance(body.blockers, Spheres) and not scene.bounces for body in scene.bodies]
     return tuple(
@@ -40,7 +43,7 @@ def blocking_planes(scene: Scene) -> tuple[int, ...]:
 
 
 def fitted_counts(scene: Scene) -> dict[int, int | str]:
-    """Find the bodies to whose meshes spheres are fitted: neither grounds, nor those with spheres of their own.
+    """Find the bodies to whose meshes spheres are fitted: neither grounds, nor bodies with spheres of their own.
 
     Returns:
         Numbers of the bodies, from 0, and how many spheres each asks for, or "auto".
@@ -49,6 +52,20 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
     return {
         number: count for number, count in enumerate(map(_wanted, scene.bodies)) if count and grounds[number] is None
     }
+
+
+def _announce(scene: Scene, counts: dict[int, int | str], device: wp.DeviceLike, progress: bool) -> None:
+    """Say how long fits that are to be made take, if that is long."""
+    requested = {(scene.bodies[body].mesh, count) for body, count in counts.items()}
+    if sum(fit_seconds(count) for _, count in requested) <= LONG:
+        return
+    missing = [count for mesh, count in requested if not is_fitted(mesh, count, device=device)]
+    announce(
+        f"fitting spheres to {len(missing)} mesh{'es' * (len(missing) != 1)}",
+        sum(map(fit_seconds, missing)),
+        'once; method = "ray-traced" needs none, for still images, and blockers = 64 fewer',
+        shows=progress,
+    )
 
 
 def _wanted(body: Body) -> int | str:

@@ -13,7 +13,8 @@ A file is TOML:
     fov_y = 40.0                 # degrees; by default that of the scene's camera
 
 Each number goes from keyframe to keyframe along a piecewise cubic that has a continuous slope and never leaves the
-range of the two keyframes beside it (PCHIP; Fritsch and Butland 1984): what is the same in two keyframes stays.
+range of the two keyframes beside it (PCHIP; Fritsch and Butland 1984): a number that is the same in two keyframes
+stays.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class CameraPath:
         """Read a file.
 
         Raises:
-            ValueError: for what the file says wrongly.
+            ValueError: for a mistake in the file.
             FileNotFoundError: for a file that is not there.
         """
         path = check.path("path", path)
@@ -161,7 +162,7 @@ class CameraPath:
         return cameras
 
     def _between(self, rows: np.ndarray) -> np.ndarray:
-        """Values at the times of the frames, of those at keyframes, shape [frame, value]."""
+        """Interpolate keyframe values at the times of the frames, shape [frame, value]."""
         from scipy.interpolate import PchipInterpolator
 
         times = np.array([keyframe.time for keyframe in self.keyframes]) - self.keyframes[0].time

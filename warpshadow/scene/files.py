@@ -58,7 +58,7 @@ _KEYS = {
 
 
 class SceneError(ValueError):
-    """A scene file that cannot be used: the message says where and what is accepted."""
+    """A scene file that cannot be used: the message names the place and the accepted values."""
 
 
 def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: object) -> Scene:
@@ -68,15 +68,18 @@ def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: obj
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
         bounces: How often light bounces, in place of the file's.
         settings: Settings of visibility in place of the file's, such as ``method="log-sh"``. A file may hold settings
-            for several methods; those that the method does not read are left out.
+            for several methods; settings that the method does not read are left out.
 
     Raises:
-        SceneError: for what the file says wrongly: it names the table, the key, what it got and what it accepts.
+        SceneError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file that is not there.
     """
     path = check.path("path", path)
     if path.suffix.lower() in MESH_SUFFIXES:
-        raise SceneError(f'{path}: got a mesh, expected a scene file, which names it: [[body]] mesh = "{path.name}"')
+        raise SceneError(
+            f'{path}: got a mesh, expected a scene file, which names it: [[body]] mesh = "{path.name}"; '
+            "default_scene(path) makes a scene of it alone, as the commands render and view do"
+        )
     with check.located(str(path), SceneError):
         return _scene(toml_tables.read(path, "scene file"), path.parent, bounces, settings)
 
@@ -104,10 +107,10 @@ def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table)
         check_supersampling(supersampling)
         camera = _framing(placed, bodies) if "framing" in placed else parse_camera(placed)
     with check.located("[visibility]"):
-        given = scene.get("visibility", {})
-        toml_tables.check_table(given)
-        _check_keys("[visibility]", given)
-        visibility = Visibility.of(given | settings)  # a file may hold settings for what --method chooses
+        value = scene.get("visibility", {})
+        toml_tables.check_table(value)
+        _check_keys("[visibility]", value)
+        visibility = Visibility.of(value | settings)  # a file may hold settings for another --method
     with check.located("the scene"):
         return Scene(tuple(bodies), light, camera, visibility, supersampling, bounces)
 
@@ -135,7 +138,7 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, what: str
 
 
 def parse_camera(table: Table) -> Camera:
-    """A camera from its table: from where it looks at what, or by intrinsics and world-to-camera [R | t]."""
+    """A camera from its table: eye and target, or intrinsics and world-to-camera [R | t]."""
     toml_tables.check_table(table)
     check.known_keys("key", table, _CAMERA_KEYS)
     if not any(key in table for key in ("eye", "target", *_PINHOLE_KEYS)):
@@ -209,20 +212,20 @@ def _body(table: Table, folder: Path) -> Body:
         with check.located("spheres"):
             place["blockers"] = Spheres.read(path)
         del place["spheres"]
-    stands = place.pop("on_ground", False)
+    on_ground = place.pop("on_ground", False)
     angle = place.pop("creased", None)
     body = Body(**place)
     if angle is not None:
         with check.located("creased"):
             body = body.creased(angle)
-    if isinstance(stands, bool):
-        return body.on_ground(body.translation) if stands else body
-    check.instance("on_ground", stands, Mapping, "true or false, or a table such as {size = 2.0}")
+    if isinstance(on_ground, bool):
+        return body.on_ground(body.translation) if on_ground else body
+    check.instance("on_ground", on_ground, Mapping, "true or false, or a table such as {size = 2.0}")
     with check.located("on_ground"):
-        check.known_keys("key", stands, ("size",))
-        if "size" in stands and "scale" in table:
+        check.known_keys("key", on_ground, ("size",))
+        if "size" in on_ground and "scale" in table:
             raise ValueError("size: got it beside the body's scale, expected one of them")
-        return body.on_ground(body.translation, **stands)
+        return body.on_ground(body.translation, **on_ground)
 
 
 # ---------------------------------------------------------------------------------------------- writing
@@ -259,7 +262,7 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
     else:
         light = {"sh": [_numbers(row) for row in scene.light]}
     light["bounces"] = scene.bounces if scene.bounces == "all" else int(scene.bounces)
-    visibility = asdict(scene.visibility)
+    visibility = {name: value for name, value in asdict(scene.visibility).items() if value is not None}
     camera = camera_table(scene.camera) | {"supersampling": scene.supersampling}
     path = folder / "scene.toml"
     toml_tables.write(path, {"camera": camera, "light": light, "visibility": visibility, "body": bodies})
@@ -267,7 +270,7 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
 
 
 def camera_table(camera: Camera) -> Table:
-    """What a scene file says of a camera, without loss."""
+    """The table of a camera in a scene file, without loss."""
     return {
         "intrinsics": camera.intrinsics.tolist(),
         "rotation": camera.rotation.tolist(),
@@ -278,7 +281,7 @@ def camera_table(camera: Camera) -> Table:
 
 
 def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
-    """Write what a body's table names, and make the table."""
+    """Write the files that a body's table names, and make the table."""
     mesh, arrays, colors, texture = (stem.with_suffix(suffix) for suffix in (".obj", ".npz", ".npy", ".exr"))
     body.mesh.write(mesh)
     table: Table = {"mesh": mesh.name}
@@ -311,7 +314,7 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
 
 
 def _write_material(mesh: Path, texture: np.ndarray) -> list[Path]:
-    """Let an OBJ file name its texture, as a PNG, which is what other programs draw."""
+    """Let an OBJ file name its texture, as a PNG, which other programs draw."""
     picture, material = mesh.with_suffix(".png"), mesh.with_suffix(".mtl")
     write_image(picture, texture)
     with files.whole(material) as unfinished:

@@ -73,7 +73,7 @@ def misplacements(scene: Scene) -> list[str]:
 def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
     """Say of the first camera that is inside of a body of which one.
 
-    A room whose walls face inwards, or are thick, is not around what is in it.
+    A room whose walls face inwards, or are thick, does not enclose the bodies in it.
     """
     for camera in cameras:
         for number, body in enumerate(scene.bodies):

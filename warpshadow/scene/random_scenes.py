@@ -1,9 +1,9 @@
 """Random scenes: a data set whose scenes come from a seed and a number, each by itself.
 
 Some bodies stand or lie on a ground of neutral gray, in colors of their own, under a sky with a sun or under a few soft
-lights, or under maps that are given; a camera looks at them from above. :class:`Ranges` are those of what is
-drawn. Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and
-ranges give the same scene.
+lights, or under given maps; a camera looks at them from above. :class:`Ranges` has the ranges of all random numbers.
+Scenes are drawn when they are asked for, in any order, in any process: the same seed, number, bodies, maps and ranges
+give the same scene.
 """
 
 import functools
@@ -28,7 +28,7 @@ GROUND_SIZE = 10.0  # scene units; a body is about one
 SKY_HEIGHT = 64  # rows
 
 Range = tuple[float, float]
-"""The least and the largest of what is drawn evenly between them; the same twice for what is always the same."""
+"""Lower and upper bound of an even distribution; equal for a constant."""
 
 
 @functools.cache
@@ -62,17 +62,17 @@ def _creased(name: str, shape) -> Mesh:
 
 @dataclass(frozen=True)
 class Ranges:
-    """What the numbers of random scenes are drawn from.
+    """Ranges of the random numbers of a scene.
 
     Args:
         count: Number of bodies on the ground.
         size: Longest edge of a body's bounds before it is turned [scene units].
         upright: Part of the bodies that are turned about the vertical alone; the others lie in any way.
-        gap: How far apart bodies stand, 1 where those two whose bounds are widest could just touch.
+        gap: Distance between bodies, 1 where the two with the widest bounds could just touch.
         albedo: Reflectance of a body without a texture or a color for each vertex, in each of red, green and blue.
         ground_albedo: Reflectance of the ground, which is gray.
         rotation: How far a given map is turned about the vertical [degrees].
-        scale: What the light is multiplied by; drawn evenly in its logarithm.
+        scale: Factor of the light; drawn evenly in its logarithm.
         fov_y: Vertical field of view [degrees].
         elevation: Of the camera above the ground [degrees].
         distance: Of the camera, 1 where a ball around all bodies just fills the image.
@@ -91,9 +91,9 @@ class Ranges:
     distance: Range = (0.9, 1.2)
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            if each.name != "upright":
-                object.__setattr__(self, each.name, _checked_range(each.name, getattr(self, each.name)))
+        for item in fields(self):
+            if item.name != "upright":
+                object.__setattr__(self, item.name, _checked_range(item.name, getattr(self, item.name)))
         if not (check.is_number(self.upright) and 0 <= self.upright <= 1):
             raise ValueError(f"upright: got {check.described(self.upright)}, expected a part of all, from 0 to 1")
 
@@ -110,15 +110,15 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "elevation": (1.0, 89.0),
     "distance": (0.5, 100.0),
 }
-"""Between what the ends of each range may be; the ground is ``GROUND_SIZE`` wide, or wider where bodies need it."""
+"""Range of the diameter over all draws; the ground is ``GROUND_SIZE`` wide, or wider where bodies need it."""
 
 
 def _checked_range(name: str, value: object) -> tuple[float, float]:
-    least, most = _LIMITS[name]
+    minimum, maximum = _LIMITS[name]
     is_whole = name == "count"
-    expected = f"two {'whole ' * is_whole}numbers from {least:g} to {most:g}, the lesser first"
+    expected = f"two {'whole ' * is_whole}numbers from {minimum:g} to {maximum:g}, the lesser first"
     ends = check.numbers(name, value, expected=expected, dtype=np.float64)
-    is_range = ends.shape == (2,) and least <= ends[0] <= ends[1] <= most
+    is_range = ends.shape == (2,) and minimum <= ends[0] <= ends[1] <= maximum
     if not is_range or (is_whole and (ends % 1).any()):
         raise ValueError(f"{name}: got {check.described(value)}, expected {expected}")
     low, high = ends.tolist()
@@ -126,18 +126,18 @@ def _checked_range(name: str, value: object) -> tuple[float, float]:
 
 
 class DrawnLight(NamedTuple):
-    """What became of one of the maps that are given."""
+    """A drawn map and its changes."""
 
     number: int
     """Which one, from 0."""
     rotation: float
     """How far it is turned about +y [degrees]."""
     scale: float
-    """What its radiance is multiplied by."""
+    """Factor of its radiance."""
 
 
 class Drawn(NamedTuple):
-    """A scene, and what it was made of."""
+    """A scene, and the random choices in it."""
 
     scene: Scene
     """The bodies, of which the last one is the ground, light and camera."""
@@ -153,15 +153,15 @@ class RandomScenes:
 
     Args:
         seed: Number of the data set, 0 or more.
-        count: Number of scenes; scene ``index`` is the same whatever the count.
+        count: Number of scenes; scene ``index`` does not depend on the count.
         size: Width and height of the images [pixels].
-        bodies: What bodies are drawn from; they get new poses and sizes, and new colors if they have one each.
+        bodies: Bodies to draw from; they get new poses and sizes, and new colors if they have one each.
             Bodies of one's own: ``[Body(load_mesh("bunny.obj"), blockers=32)]``. Like maps, a sequence that may read
             them when they are asked for.
         visibility: How visibility is computed.
         supersampling: As of a :class:`warpshadow.Scene`.
         maps: Light to draw from, turned and scaled; by default skies and lamps that are drawn, too.
-        ranges: What numbers are drawn from.
+        ranges: Ranges of the random numbers.
         bounces: As of a :class:`warpshadow.Scene`.
     """
 
@@ -176,10 +176,10 @@ class RandomScenes:
     bounces: Bounces = 0
 
     def __post_init__(self) -> None:
-        check.whole("seed", self.seed, least=0)
-        check.whole("count", self.count, least=0)
-        for name, given in (("bodies", self.bodies), ("maps", self.maps)):
-            if given is not None and not len(given):
+        check.whole("seed", self.seed, minimum=0)
+        check.whole("count", self.count, minimum=0)
+        for name, value in (("bodies", self.bodies), ("maps", self.maps)):
+            if value is not None and not len(value):
                 raise ValueError(f"{name}: got none, expected one or more to draw from")
 
     def __len__(self) -> int:
@@ -198,7 +198,7 @@ class RandomScenes:
         return self.draw(index).scene
 
     def draw(self, index: int) -> Drawn:
-        """Draw a scene, as indexing does, and say what it was made of."""
+        """Draw a scene, as indexing does, and return the random choices with it."""
         if not -self.count <= index < self.count:
             raise IndexError(f"index: got {index}, expected a scene from 0 to {self.count - 1}")
         rng = np.random.default_rng([self.seed, index % self.count])
@@ -223,7 +223,7 @@ def _ground_size(bodies: Sequence[Body]) -> float:
 
 @functools.lru_cache(8)
 def _ground_mesh(size: float) -> Mesh:
-    """The same for all scenes, but for wide ones, since renderers keep what they find of a mesh."""
+    """The same for all scenes, except wide ones, since renderers cache results by mesh."""
     return plane(size, 1)
 
 
@@ -239,8 +239,8 @@ def _random_bodies(
     rng: np.random.Generator, prototypes: Sequence[Body], ranges: Ranges
 ) -> tuple[list[Body], tuple[int, ...]]:
     """Some bodies on the ground, in a ring in which none touches another; and which they are."""
-    least, most = ranges.count
-    count = int(rng.integers(least, most + 1))
+    minimum, maximum = ranges.count
+    count = int(rng.integers(minimum, maximum + 1))
     bodies, chosen = zip(*(_random_body(rng, prototypes, ranges) for _ in range(count)), strict=True)
     widest = max(_footprint(body) for body in bodies)
     ring = 0.0 if count == 1 else _drawn(rng, ranges.gap) * widest / np.sin(np.pi / count)

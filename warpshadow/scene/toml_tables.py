@@ -1,4 +1,4 @@
-"""Tables of TOML files: read, made into what they describe, and written."""
+"""Tables of TOML files: read, turned into objects, and written."""
 
 import inspect
 import json
@@ -33,7 +33,7 @@ def read(path: Path, kind: str) -> Table:
 
 
 def _remedy(fault: str) -> str:
-    """What most often is meant where TOML finds a fault."""
+    """Likely causes of TOML's errors."""
     if " twice" in fault:
         return "; a table that comes several times has two brackets, [[body]]"
     return '; text is in quotes, "…"' if fault.startswith("Invalid value") else ""
@@ -45,7 +45,7 @@ def check_table(value: object) -> None:
 
 
 def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, Any]]:
-    """Tables of a list, each with what messages call it."""
+    """Tables of a list, each with its name for messages."""
     if not isinstance(table[key], list):
         raise ValueError(f"[{within}{key}]: expected [[{within}{key}]], since there may be several")
     for place, item in enumerate(table[key], start=1):
@@ -54,10 +54,10 @@ def numbered(table: Table, key: str, within: str = "") -> Iterator[tuple[str, An
 
 
 def make(kind: Callable[..., T], table: Table) -> T:
-    """Call what takes a table's keys as its arguments and checks their values; a missing one is check.NOTHING.
+    """Call a function with a table's keys as its arguments and check their values; a missing one is check.NOTHING.
 
-    Not done by msgspec or pydantic: those who write Python get the same messages, with what was got and the nearest
-    key, neither of which these libraries name.
+    Not done by msgspec or pydantic: Python users get the same messages, with the value they gave and the nearest key,
+    neither of which these libraries name.
     """
     check_table(table)
     arguments = inspect.signature(kind).parameters

@@ -2,15 +2,15 @@
 
     cover       stage 1, the paper's: medial balls picked greedily, then descent on the volume outside the mesh and
                 the surface left bare                               [Lyu et al. 2021, section 3.2; Wang et al. 2006]
-    receivers   receivers on and around the mesh, in its cavities and on grounds, and what they see past it, by rays
-    refine      stage 2: from balls picked greedily, gradient descent until the receivers see as much past the spheres
+    receivers   receivers on and around the mesh, in its cavities and on grounds, and their visibility, by rays
+    refine      stage 2: from balls picked greedily, gradient descent until the spheres' visibility matches the mesh's
     enough      how many spheres a body needs, by short fits of a few counts
     measure     irradiance under a sky with a sun, the spheres' against the mesh's
     fit         the stages in order, the search for an error, the cache
 
 Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh in part. An open mesh is a sheet, seen
 from both sides. Stage 2 uses the cones of warpshadow.stages.visibility.cones and the falloff of the directional method,
-so the fit accounts for what a renderer does at receivers on and inside spheres.
+so the fit matches the renderer at receivers on and inside spheres.
 """
 
 from warpshadow.spheres.fit import MANY, SphereFit, fit_spheres, is_fitted

@@ -62,7 +62,7 @@ def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
     """Pick balls greedily until they cover volume and surface, [sphere, 4].
 
-    Balls of the medial axis fill what has an inside, balls on the surface cover what is thin or open.
+    Balls of the medial axis fill solid parts, balls on the surface cover thin or open parts.
     """
     spacing = np.sqrt(mesh.area / count)
     on_surface, _ = mesh.sample(600 + 2 * count, rng)
@@ -143,9 +143,9 @@ def _bare_gaps(
     chosen = int(0)
     for sphere in range(spheres.shape[0]):
         ball = spheres[sphere]
-        beyond = wp.length(points[i] - wp.vec3(ball[0], ball[1], ball[2])) - ball[3]
-        if beyond < gap:
-            gap = beyond
+        excess = wp.length(points[i] - wp.vec3(ball[0], ball[1], ball[2])) - ball[3]
+        if excess < gap:
+            gap = excess
             chosen = sphere
     ball = spheres[chosen]
     toward = wp.vec4(0.0)
@@ -163,7 +163,7 @@ def cover_energy(
     """Energy of a cover, and its gradient.
 
     Args:
-        mesh: What is covered.
+        mesh: The mesh to cover.
         spheres: Centers and radii [diagonals], shape [sphere, 4].
         samples: Points evenly in the unit ball, shape [sample, 3].
         points: Points evenly on the surface, shape [point, 3].

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from warpshadow.spheres.cover import greedy_cover
@@ -25,30 +27,45 @@ _WANTED = 0.04
 _STALLED = 0.72
 """Ratio of the errors of a count and of four times as many above which more are not worth it: 15% a doubling."""
 
-_RAGGED = 0.2
+RAGGED = 0.2
 """Error relative to the light that is missing above which a shadow has holes, and more spheres are tried all the same.
 
 Measured with 32 spheres, cow 0.11, box 0.19, bunny 0.19, bowl 0.32, table 0.37, chair 0.39, slab 0.46; with 512, bunny
 0.07, bowl, table and slab 0.14, chair 0.18."""
 
 
-def enough_spheres(mesh: NormalizedMesh, receivers: FitReceivers, seed: int) -> int:
+def enough_spheres(
+    mesh: NormalizedMesh,
+    receivers: FitReceivers,
+    seed: int,
+    known: Sequence[Sequence[float]] = (),
+    keep: Callable[[list[Sequence[float]]], None] = lambda errors: None,
+) -> int:
     """How many spheres a body needs, a power of two from 8 to 1024.
 
     The error of short fits of 8, 32, 128 and 512 spheres falls with their number. Taken is where it is small enough, or
     where it falls no longer.
+
+    Args:
+        mesh, receivers, seed: The mesh to fit, its receivers, and the seed of random choices.
+        known: Errors of the first short fits, where an interrupted call found them.
+        keep: Gets the known fits, after each short fit.
     """
     judges = FitReceivers(mesh, _JUDGES, np.random.default_rng(seed + 1))
     before = np.inf, np.inf
-    for count in TRIED:
-        rng = np.random.default_rng(seed)
-        start = greedy_cover(mesh, count, rng)
-        *_, spheres = Refinement(mesh, receivers, rng).run(start, _STEPS + int(_STEPS_MORE * count))
-        error, shadow_error = _errors(Refinement(mesh, judges, rng), spheres)
+    errors = list(known)
+    for number, count in enumerate(TRIED):
+        if number == len(errors):
+            rng = np.random.default_rng(seed)
+            start = greedy_cover(mesh, count, rng)
+            *_, last = Refinement(mesh, receivers, rng).run(start, _STEPS + int(_STEPS_MORE * count))
+            errors.append(_errors(Refinement(mesh, judges, rng), last.spheres))
+            keep(errors)
+        error, shadow_error = errors[number]
         if error <= _WANTED:
             return _where(count, before[0], error)
         stalls = error > _STALLED * before[0]
-        if stalls and before[1] <= _RAGGED:
+        if stalls and before[1] <= RAGGED:
             return count // 2
         before = error, shadow_error
     return TRIED[-1] if stalls else MOST_SPHERES

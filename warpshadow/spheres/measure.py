@@ -39,7 +39,7 @@ class FitReport:
     ground_error: float
     """On a square of 2.5 times the bounding box's longest side at the height of the lowest point, y up."""
     surface_error: float
-    """On the mesh's own vertices, weighted by area; on both sides of an open mesh, whatever its winding."""
+    """On the mesh's own vertices, weighted by area; on both sides of an open mesh, for any winding."""
     nearby_error: float
     """In the air around it and in its cavities, most of it close to the mesh, on receivers that look anywhere."""
     shadow_error: float
@@ -64,7 +64,7 @@ def _sky(directions: np.ndarray, azimuth: float) -> np.ndarray:
 
 
 def _errors(mesh: NormalizedMesh, spheres: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float, float]:
-    """L2 error of the irradiance at receivers, over four azimuths of the sun, relative to it and to what is missing."""
+    """L2 error of irradiance at receivers, over four azimuths of the sun, relative to it and to its blocked part."""
     directions = fibonacci(DIRECTIONS)
     array = partial(wp.array, dtype=wp.vec3, device=mesh.device)
     receivers, rays = array(points[None].astype(np.float32)), array(directions.astype(np.float32))

@@ -80,7 +80,7 @@ def _count_escaping(
 def normalize(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Take vertices [vertex, 3] to the frame of the fit, onto a grid so fine that no shadow changes.
 
-    So what is found there, and the key that it is kept by, are the same wherever the mesh is and however large.
+    So results, and their cache key, do not depend on where the mesh is and how large.
 
     Returns:
         Vertices of float32, the middle of the bounds, and their diagonal.
@@ -93,7 +93,7 @@ def normalize(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 class NormalizedMesh:
     """A mesh in the frame of the fit, ready to be sampled and queried.
 
-    Normals do not round the edges of boxes. An open mesh is sampled on both sides, whatever its winding. If it is no
+    Normals do not round the edges of boxes. An open mesh is sampled on both sides, for any winding. If it is no
     solid with a few holes, it is a sheet: nothing is inside it. So is a closed mesh that winds inward, a room.
 
     Args:

@@ -34,17 +34,17 @@ def _exact_occlusion(
     for sphere in range(radii.shape[1]):
         radius = radii[batch, sphere]
         toward = centers[batch, sphere] - points[batch, vertex]
-        along = wp.dot(toward, directions[direction])
-        if along > 0.0 and radius > 0.0:
+        axial = wp.dot(toward, directions[direction])
+        if axial > 0.0 and radius > 0.0:
             distance = wp.length(toward)
             if distance >= (1.0 + BLEND) * radius:  # the cone is exact, and this test needs no root
-                closest = wp.length_sq(toward - along * directions[direction])
+                closest = wp.length_sq(toward - axial * directions[direction])
                 if closest < radius * radius:
                     blocked = wp.uint8(1)
                     break
             else:
                 cone = _cone(_Vectors(_Lane(toward[0]), _Lane(toward[1]), _Lane(toward[2])), 1.0 / radius)
-                if cone.weight[0] > 0.5 and along > cone.cosine[0] * distance:
+                if cone.weight[0] > 0.5 and axial > cone.cosine[0] * distance:
                     blocked = wp.uint8(1)
                     break
     occlusion[batch, vertex, direction] = blocked

@@ -8,6 +8,7 @@ altogether.
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -26,10 +27,10 @@ from warpshadow.device.launch import launch
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
-from warpshadow.spheres.receivers import BUNDLE, FitReceivers
+from warpshadow.spheres.receivers import FIT_BUNDLE, FitReceivers
 from warpshadow.stages.visibility.cones import make_cone
-from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
-from warpshadow.stages.visibility.walk import seen_type
+from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
+from warpshadow.stages.visibility.traversal import sphere_view_type
 
 TOUCH = 0.8
 """Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
@@ -43,7 +44,7 @@ _SPHERE_COST = 10.0
 _PAIR_COST = 0.1
 """Nanoseconds that a sphere costs for a receiver and a direction."""
 
-_Bundle = lane_type(BUNDLE)
+_Bundle = lane_type(FIT_BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
 _PLACE = 12
 """Numbers that say where a receiver is: its point, and the rows of its frame."""
@@ -54,7 +55,7 @@ _PLACE = 12
 @functools.cache
 def _make_see(lanes: int) -> wp.Function:
     """Make the kernel function of a sphere as a group of receivers sees it, in their frames."""
-    Lane, Vectors, Seen = lane_type(lanes), vectors_type(lanes), seen_type(lanes)
+    Lane, Vectors, SphereView = lane_type(lanes), vectors_type(lanes), sphere_view_type(lanes)
     cone_of = make_cone(lanes)
 
     @wp.func(inline=True)
@@ -67,7 +68,7 @@ def _make_see(lanes: int) -> wp.Function:
             wp.cw_mul(places[6, group], x) + wp.cw_mul(places[7, group], y) + wp.cw_mul(places[8, group], z),
             wp.cw_mul(places[9, group], x) + wp.cw_mul(places[10, group], y) + wp.cw_mul(places[11, group], z),
         )
-        seen = Seen()
+        seen = SphereView()
         seen.offset = offset
         seen.curvature = 1.0 / ball[3]
         seen.cone = cone_of(offset, seen.curvature)
@@ -109,9 +110,9 @@ def _make_project(lanes: int) -> wp.Kernel:
         bits = Lane(0.0)  # bit b: the sphere reaches bundle b; a float is exact for up to 24
         bit = float(1.0)
         for bundle in range(caps.shape[0]):
-            along = caps[bundle, 0] * cone.axis.x + caps[bundle, 1] * cone.axis.y + caps[bundle, 2] * cone.axis.z
-            beyond = along - caps[bundle, 3] * low + caps[bundle, 4] * outer
-            bits += bit * wp.min(wp.max(1.0e20 * beyond, Lane(0.0)), Lane(1.0))
+            axial = caps[bundle, 0] * cone.axis.x + caps[bundle, 1] * cone.axis.y + caps[bundle, 2] * cone.axis.z
+            excess = axial - caps[bundle, 3] * low + caps[bundle, 4] * outer
+            bits += bit * wp.min(wp.max(1.0e20 * excess, Lane(0.0)), Lane(1.0))
             bit *= 2.0
         for lane in range(lanes):
             i = group * lanes + lane
@@ -125,7 +126,7 @@ def _make_project(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_pull(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    see, falloff_pull = _make_see(lanes), make_falloff_pull(lanes)
+    see, sphere_adjoint = _make_see(lanes), make_sphere_adjoint(lanes)
     fn = make_lane_functions(lanes)
     sqrt, total = fn.sqrt, fn.total
 
@@ -168,7 +169,7 @@ def _make_pull(lanes: int) -> wp.Kernel:
             sum_t[lane] = factor * own[4]
             by_opacity[lane] = -own[5]
             slope[lane] = edge[1]
-        by_offset, by_radius, _ = falloff_pull(
+        by_offset, by_radius, _ = sphere_adjoint(
             seen, sine, low, cos_width, sin_width, slope, by_opacity, sum_, sum_t, Vectors(x, y, z)
         )
         by_balls[group, sphere] = wp.vec4(
@@ -232,16 +233,16 @@ def _transmit(
 # In C++ because its sums stay in vector registers: for 256 receivers × 64 spheres × 128 directions it takes
 # 1.1 ms on one core, Warp's own vectors 5.7 ms.
 _EDGE_SUMS = f"""
-const int bundles = directions.shape[1], count = bundles * {BUNDLE};
+const int bundles = directions.shape[1], count = bundles * {FIT_BUNDLE};
 const float *x = (const float*)directions.data, *y = x + count, *z = y + count;
 const float *up = (const float*)upstream.data + (size_t)i * count;
 const float ux = axis[0] * edge[1], uy = axis[1] * edge[1], uz = axis[2] * edge[1], u0 = edge[0] * edge[1];
-float sum[6][{BUNDLE}] = {{}};
+float sum[6][{FIT_BUNDLE}] = {{}};
 for (int bundle = 0; bundle < bundles; ++bundle) {{
     if (!((reached >> bundle) & 1))
         continue;
-    const int first = bundle * {BUNDLE};
-    for (int l = 0; l < {BUNDLE}; ++l) {{
+    const int first = bundle * {FIT_BUNDLE};
+    for (int l = 0; l < {FIT_BUNDLE}; ++l) {{
         const int q = first + l;
         float t = ux * x[q] + uy * y[q] + uz * z[q] - u0;
         t = t < 0.f ? 0.f : t;
@@ -315,8 +316,25 @@ class _View(NamedTuple):
     reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
 
 
+class Descended(NamedTuple):
+    """A refinement after some of its steps: all that it goes on from, to the same bits."""
+
+    spheres: np.ndarray  # [sphere, 4]
+    mean: np.ndarray  # Adam's, [sphere, 4]
+    square: np.ndarray  # Adam's, [sphere, 4]
+    step_count: np.ndarray  # int, a scalar
+    queue: np.ndarray  # receivers that are drawn for the next batches
+    random: np.ndarray  # state of the generator, JSON
+
+    @classmethod
+    def at(cls, spheres: np.ndarray, adam: Adam, queue: np.ndarray, rng: np.random.Generator) -> Descended:
+        """Copy it."""
+        random = np.array(json.dumps(rng.bit_generator.state))
+        return cls(spheres.copy(), adam.mean.copy(), adam.square.copy(), np.array(adam.age), queue, random)
+
+
 class Refinement:
-    """The loss of spheres against what receivers around a body see, and its descent."""
+    """The loss of spheres against the visibility of receivers around a body, and its descent."""
 
     BATCH = 256
     WIDTHS = (0.1, 0.04)
@@ -327,9 +345,9 @@ class Refinement:
     def __init__(self, mesh: NormalizedMesh, receivers: FitReceivers, rng: np.random.Generator):
         use_vector_registers(__name__)
         self.mesh, self.receivers, self.rng, self.device = mesh, receivers, rng, mesh.device
-        bundles = np.ascontiguousarray(receivers.directions.T, dtype=np.float32).reshape(3, -1, BUNDLE)
+        bundles = np.ascontiguousarray(receivers.directions.T, dtype=np.float32).reshape(3, -1, FIT_BUNDLE)
         self.directions = wp.array(bundles, dtype=_Bundle, device=self.device)
-        caps = np.column_stack(bundle_cones(receivers.directions, max(self.WIDTHS), BUNDLE))
+        caps = np.column_stack(bundle_cones(receivers.directions, max(self.WIDTHS), FIT_BUNDLE))
         self.caps = wp.array(caps, dtype=wp.float32, device=self.device)
 
     def _project(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> _View:
@@ -357,7 +375,7 @@ class Refinement:
             transmittance.shape,
             inputs=[view.axes, view.edges, view.reached, self.directions],
             outputs=[transmittance],
-            cost=_PAIR_COST * BUNDLE * sphere_count,
+            cost=_PAIR_COST * FIT_BUNDLE * sphere_count,
         )
         return transmittance.numpy().reshape(count, -1)
 
@@ -379,7 +397,7 @@ class Refinement:
         passing = transmittance[: len(chosen)]
         loss, by_errors = self._loss(passing, chosen)
         upstream[: len(chosen)] = (by_errors @ self.receivers.lights.T) * passing
-        by_logs = wp.array(upstream.reshape(len(upstream), -1, BUNDLE), dtype=_Bundle, device=self.device)
+        by_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
         sums = wp.empty(view.axes.shape, dtype=_Sums, device=self.device)
         inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
@@ -397,16 +415,19 @@ class Refinement:
     def _pull_back(self, spheres: np.ndarray) -> None:
         """Move spheres that left the body to where they touch it, in place."""
         distances, slopes = self.mesh.signed_distances(spheres[:, :3])
-        beyond = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
-        spheres[:, :3] -= beyond[:, None] * slopes
+        excess = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
+        spheres[:, :3] -= excess[:, None] * slopes
 
-    def run(self, spheres: np.ndarray, steps: int) -> Iterator[np.ndarray]:
-        """Refine spheres by Adam; yields them [sphere, 4] after every step."""
-        spheres = spheres.astype(np.float64)
-        adam = Adam(len(spheres))
+    def run(self, start: np.ndarray | Descended, steps: int) -> Iterator[Descended]:
+        """Refine spheres [sphere, 4] by Adam, or go on with that; yields where it is after every step."""
+        resumed = start if isinstance(start, Descended) else None
+        spheres = np.array(start if resumed is None else resumed.spheres, np.float64)
+        adam, queue = Adam(len(spheres)), np.zeros(0, int)
+        if resumed is not None:
+            adam.mean, adam.square, adam.age = resumed.mean.copy(), resumed.square.copy(), int(resumed.step_count)
+            queue, self.rng.bit_generator.state = resumed.queue, json.loads(str(resumed.random))
         first_rate = self.RATE * min(1.0, np.sqrt(64 / len(spheres)))
-        queue = np.zeros(0, int)
-        for step in range(steps):
+        for step in range(adam.age, steps):
             done = step / steps
             width = self.WIDTHS[0] * (self.WIDTHS[1] / self.WIDTHS[0]) ** min(1.0, 1.3 * done)
             if len(queue) < self.BATCH:
@@ -416,4 +437,4 @@ class Refinement:
             adam.step(spheres, gradient, first_rate * 0.5 * (1 + np.cos(np.pi * done)))
             if step % PULLED == 0 or step == steps - 1:
                 self._pull_back(spheres)
-            yield spheres
+            yield Descended.at(spheres, adam, queue, self.rng)

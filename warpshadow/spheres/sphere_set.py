@@ -18,9 +18,11 @@ from warpshadow.check import AnyPath
 class Spheres:
     """Spheres on the host, validated; the arrays are read-only copies.
 
+    As blockers of a :class:`warpshadow.Body` they are in units and axes of its mesh, and placed in the world with it.
+
     Args:
-        centers: Centers [scene units], float32, shape [sphere, 3].
-        radii: Radii [scene units], not negative, float32, shape [sphere]; a radius of 0 blocks nothing.
+        centers: Centers [units of the mesh], float32, shape [sphere, 3].
+        radii: Radii [units of the mesh], not negative, float32, shape [sphere]; a radius of 0 blocks nothing.
     """
 
     centers: np.ndarray = field(repr=False)
@@ -28,8 +30,8 @@ class Spheres:
 
     def __init__(self, centers: npt.ArrayLike, radii: npt.ArrayLike):
         shapes: tuple[tuple[int | str, ...], ...] = ("sphere", 3), ("sphere",)
-        for name, given, shape in zip(("centers", "radii"), (centers, radii), shapes, strict=True):
-            values = check.numbers(name, given, expected=f"an array [{', '.join(map(str, shape))}]")
+        for name, array, shape in zip(("centers", "radii"), (centers, radii), shapes, strict=True):
+            values = check.numbers(name, array, expected=f"an array [{', '.join(map(str, shape))}]")
             check.shape(name, values.shape, shape)
             check.finite(name, values)
             values.flags.writeable = False
@@ -44,7 +46,7 @@ class Spheres:
         """Read an .npz file of the arrays ``centers`` and ``radii``, as ``warpshadow spheres -o`` writes it.
 
         Raises:
-            ValueError: for what is not such a file.
+            ValueError: for a file of another format.
         """
         try:
             with np.load(path, allow_pickle=False) as arrays:

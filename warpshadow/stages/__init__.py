@@ -1,6 +1,6 @@
 """The paper's stages: functions of Warp's arrays, to be composed as :class:`warpshadow.Renderer` composes them.
 
-A module here is a stage, or what stages share; README.md lists them in their order.
+A module here is a stage, or code that stages share; README.md lists them in their order.
 """
 
 from warpshadow.stages.barycentrics import find_barycentrics
@@ -13,7 +13,7 @@ from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices, to_clip
 from warpshadow.stages.rasterize import Fragments, rasterize
-from warpshadow.stages.ray_tracing import trace_shading, trace_transfer, trace_visibility
+from warpshadow.stages.ray_tracing import trace_shading, trace_visibility
 from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.rotations import rotation_matrices
 from warpshadow.stages.shading import shade
@@ -26,6 +26,7 @@ from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import Textures, mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
 from warpshadow.stages.textures.seen import fill_unseen, seen_texels
+from warpshadow.stages.traced_transfer import trace_transfer
 from warpshadow.stages.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.exponential import exponentiate

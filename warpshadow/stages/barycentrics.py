@@ -24,7 +24,7 @@ def _weights(a: wp.vec4, b: wp.vec4, c: wp.vec4, ray: wp.vec2):
     """
     spanned = volumes(relative(a, ray), relative(b, ray), relative(c, ray))
     sign = wp.sign(spanned[0] + spanned[1] + spanned[2])
-    # A center may lie outside of the face by what the vertices moved when they snapped.
+    # A center may lie outside of the face by as much as the vertices moved when they snapped.
     inside = wp.max(sign * spanned, wp.vec3(0.0, 0.0, 0.0))
     total = inside[0] + inside[1] + inside[2]
     if total > TINY_VOLUME:
@@ -121,7 +121,7 @@ def _find_barycentrics_adjoint(
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[instance, sample]
         adj_weights = adj_barycentrics[instance, sample]
-        # What is the same at all corners does not depend on the weights, whose sum is 1.
+        # An attribute that is equal at all corners does not depend on the weights, whose sum is 1.
         if face >= 0 and (adj_weights[0] != adj_weights[1] or adj_weights[1] != adj_weights[2]):
             i = faces[face]
             ray = center(sample - row * width, row, width, height)

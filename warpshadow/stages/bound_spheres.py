@@ -41,11 +41,11 @@ def _move_centers(
     """A thread owns a sphere of an instance."""
     instance, sphere = wp.tid()
     moved = instance_in(instance, positions.shape[0])
-    still = instance_in(instance, rest_positions.shape[0])
+    rest_instance = instance_in(instance, rest_positions.shape[0])
     shift = wp.vec3()
     for item in range(first[sphere], first[sphere + 1]):
         vertex = vertices[item]
-        shift += weights[item] * (positions[moved, vertex] - rest_positions[still, vertex])
+        shift += weights[item] * (positions[moved, vertex] - rest_positions[rest_instance, vertex])
     centers[instance, sphere] = rest_centers[instance_in(instance, rest_centers.shape[0]), sphere] + shift
 
 
@@ -83,9 +83,9 @@ def _grow_radii(
     """A thread owns a sphere of an instance."""
     instance, sphere = wp.tid()
     radius = rest_radii[instance_in(instance, rest_radii.shape[0]), sphere]
-    least = softening * radius * radius
+    minimum = softening * radius * radius
     before = rest_spreads[instance_in(instance, rest_spreads.shape[0]), sphere]
-    radii[instance, sphere] = radius * wp.sqrt((spreads[instance, sphere] + least) / (before + least))
+    radii[instance, sphere] = radius * wp.sqrt((spreads[instance, sphere] + minimum) / (before + minimum))
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class SphereBinding:
 
         Args:
             points: Vertices [scene units], shape [vertex, 3].
-            vertices: Those that spheres may follow, shape [candidate].
+            vertices: The candidates that spheres may follow, shape [candidate].
             centers: Of the spheres [scene units], shape [sphere, 3].
             radii: Of the spheres [scene units], shape [sphere].
             device: Where the binding lives.
@@ -150,9 +150,9 @@ class SphereBinding:
 
         Differentiable: all.
         """
-        given = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}
-        check.finite_arrays(given)
-        shape, device = (common_batch(given), len(self.first) - 1), positions.device
+        arguments = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}
+        check.finite_arrays(arguments)
+        shape, device = (common_batch(arguments), len(self.first) - 1), positions.device
         bound = [self.first, self.vertices]
         centers = wp.empty(shape, dtype=wp.vec3, device=device)
         inputs = [*bound, self.weights, positions, rest_positions, rest_centers]

@@ -10,7 +10,7 @@ from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.threads import one_at_a_time
 
-_SHARED = 0.02  # points that two neighboring nodes carry together, as a part of what a node carries
+_SHARED = 0.02  # points that two neighboring nodes carry together, as a fraction of a node's points
 
 
 @wp.kernel

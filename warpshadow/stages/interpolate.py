@@ -1,4 +1,4 @@
-"""Interpolate: what an attribute of the vertices is worth at the samples.
+"""Interpolate an attribute of the vertices at the samples.
 
 At a point of a face with corners i, j, k and barycentrics w it is a = w₀ a_i + w₁ a_j + w₂ a_k. Its adjoint gives each
 corner the part w of the point's gradient ā, and each barycentric ā · a of its corner.
@@ -10,14 +10,14 @@ from typing import Any
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in, rows
-from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.parallel import run_length, split_row
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.rasterize import Fragments
 
 _COST = 5.0
-"""Nanoseconds that a sample takes, either way."""
+"""Nanoseconds that a sample takes."""
 
 
 @wp.func
@@ -56,7 +56,7 @@ def adj_weights(values: wp.array(dtype=Any), corners: wp.vec3i, adj: Any):
 def _make_interpolate(dtype: type) -> wp.Kernel:
     """Make the kernel for attributes of a dtype."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique")
     def interpolate(
         first_row: int,
         worker: int,
@@ -69,8 +69,9 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
         # out
         image: wp.array2d(dtype=dtype),
     ):
-        """A thread owns a run of samples; the image is zero before."""
-        instance, thread = split_row(first_row + wp.tid(), image.shape[1] // run)
+        """A thread owns a run of samples of an instance; the image is zero before."""
+        row, column = wp.tid()
+        instance, thread = find_run(worker, first_row + row, column)
         view = instance_in(instance, face_ids.shape[0])
         values = attributes[instance_in(instance, attributes.shape[0])]
         for sample in range(thread * run, (thread + 1) * run):
@@ -81,51 +82,13 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
     return interpolate
 
 
-@functools.cache
-def _make_interpolate_adjoint(dtype: type) -> wp.Kernel:
-    """Make its adjoint."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def interpolate_adjoint(
-        first_row: int,
-        worker: int,
-        # in
-        face_ids: wp.array2d(dtype=wp.int32),
-        barycentrics: wp.array2d(dtype=wp.vec3),
-        faces: wp.array(dtype=wp.vec3i),
-        attributes: wp.array2d(dtype=dtype),
-        run: int,
-        adj_image: wp.array2d(dtype=dtype),
-        # out
-        adj_barycentrics: wp.array2d(dtype=wp.vec3),
-        adj_attributes: wp.array2d(dtype=dtype),
-    ):
-        """A thread owns a run of samples of all instances."""
-        thread = first_row + wp.tid()
-        for instance in range(adj_image.shape[0]):
-            view = instance_in(instance, face_ids.shape[0])
-            row = instance_in(instance, attributes.shape[0])
-            values = attributes[row]
-            for sample in range(thread * run, (thread + 1) * run):
-                face = face_ids[view, sample]
-                if face >= 0:
-                    adj = adj_image[instance, sample]
-                    if adj_barycentrics:
-                        by_weights = adj_weights(values, faces[face], adj)
-                        adj_barycentrics[view, sample] = adj_barycentrics[view, sample] + by_weights
-                    if adj_attributes:
-                        add_to_corners(adj_attributes[row], faces[face], barycentrics[view, sample], adj)
-
-    return interpolate_adjoint
-
-
 def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> wp.array:
     """Interpolate an attribute of the vertices over the samples, perspective-correct.
 
     Args:
-        fragments: What each sample sees.
-        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or those of another topology
-            of the same mesh (uv_faces), face by face.
+        fragments: The fragments of the samples.
+        faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or faces of another topology of the
+            same mesh (uv_faces), face by face.
         attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute].
             Either batch may be 1 and then serves every instance of the other.
     Returns:
@@ -139,24 +102,13 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     device, width = face_ids.device, face_ids.shape[2]
     run = run_length(device, width)
-    run_count = face_ids[0].size // run
-    inputs = [*fragments.rows, faces, attributes, run]
-    return differentiable(
-        lambda image: launch(
-            _make_interpolate(attributes.dtype),
-            instances * run_count,
-            cost=_COST * run,
-            inputs=inputs,
-            outputs=[rows(image)],
-        ),
-        lambda adj_image: launch(
-            _make_interpolate_adjoint(attributes.dtype),
-            run_count,
-            cost=_COST * run * instances,
-            inputs=[*inputs, rows(adj_image)],
-            outputs=[rows(fragments.barycentrics.grad)],
-            sums=[attributes.grad],
-        ),
-        result=wp.zeros((instances, *face_ids.shape[1:]), dtype=attributes.dtype, device=device),
-        variables=[fragments.barycentrics, attributes],
+    image = wp.zeros((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
+    launch(
+        _make_interpolate(attributes.dtype),
+        run_dimensions(device, face_ids[0].size // run, instances),
+        cost=_COST * run,
+        inputs=[*fragments.rows, faces, attributes, run],
+        outputs=[image],
+        shared=[attributes],
     )
+    return image.reshape((instances, *face_ids.shape[1:]))

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow.maths import sh
-from warpshadow.maths.directions import CHUNK, fibonacci
+from warpshadow.maths.directions import BUNDLE, CHUNK, fibonacci
+from warpshadow.maths.spatial_sort import compact_order
 
 SET_COUNT = 16
 """Independent sets of directions; neighboring receivers take different ones, so that error is noise, not bands."""
 
 _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
+
+_SUN = 30.0
+"""Times as bright as all on average is a sun …"""
+
+_SUN_SHARE = 0.35
+"""… and suns get so much of shared directions at most."""
+
+_UNSEEN_SHARE = 0.3
+"""Of the importance of light, which stays where receivers do not see it."""
+
+_LEAST_ROWS, _MOST_ROWS = 64, 512
+"""Of a map that is cut."""
 
 
 class LightSamples(NamedTuple):
@@ -71,6 +85,143 @@ def _map_directions(rows: np.ndarray, v: np.ndarray, columns: np.ndarray, height
     return np.stack([np.sin(phi) * sine, cosine, -np.cos(phi) * sine], axis=-1)
 
 
+def cut_map(
+    radiance: np.ndarray, count: int, find_shares: Callable[[LightSamples], np.ndarray] | None = None
+) -> LightSamples:
+    """Cut an equirectangular map into rectangles of about the same importance, and take a direction of each.
+
+    This is the median cut of Debevec [2005, "A median cut algorithm for light probe sampling"], for any count, through
+    pixels where they are large. A direction is the mean of its rectangle's light, and stands for all of it: so
+    receivers that see a whole rectangle get exactly its light, whatever their normal, and those on whose horizon it
+    lies get it little by little.
+
+    Importance is luminance, to which even light adds a tenth. But suns, what is :data:`_SUN` times as bright as all is
+    on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
+
+    Args:
+        radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
+        count: Number of directions, a multiple of 16; runs of 16 and of 4 are close to each other.
+        find_shares: Finds, given directions, what share of receivers' light comes from each, shape [direction]. Where
+            given, importance, but for that of suns, goes to what receivers see, in a second cut: to a room's window.
+    """
+    radiance = _of_size(np.asarray(radiance, np.float64))
+    height, width, _ = radiance.shape
+    solid_angle = np.repeat(sh.pixel_solid_angles(height)[:, None], width, axis=1)
+    brightness = np.abs(radiance).mean(axis=2)
+    power = brightness * solid_angle
+    importance = _UNIFORM_SHARE * solid_angle / (4 * np.pi)
+    total = power.sum()
+    is_sun = brightness > _SUN * total / (4 * np.pi)
+    if brightness.any():
+        power /= total
+        share = power[is_sun].sum()
+        power[is_sun] *= min(_SUN_SHARE / max(share, _SUN_SHARE), 1.0)
+        importance += (1 - _UNIFORM_SHARE) * power / power.sum()
+
+    def cut(importance: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        table = np.zeros((height + 1, width + 1))
+        table[1:, 1:] = importance.cumsum(axis=0).cumsum(axis=1)
+        return list(_cut(table, np.array([0.0, height]), np.array([0.0, width]), count))
+
+    def sample(cuts: list[tuple[np.ndarray, np.ndarray]]) -> LightSamples:
+        means = (_mean_light(radiance, solid_angle, rows, columns) for rows, columns in cuts)
+        directions, light = (np.stack(item) for item in zip(*means, strict=True))
+        return LightSamples(directions[None], light[None])
+
+    cuts = cut(importance)
+    samples = sample(cuts)
+    if find_shares is not None:
+        weighted = importance.copy()
+        for (rows, columns), share in zip(cuts, find_shares(samples), strict=True):
+            (top, bottom), (left, right) = rows.round().astype(int), columns.round().astype(int)
+            weighted[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * share
+        weighted *= importance[~is_sun].sum() / max(weighted[~is_sun].sum(), 1e-300)
+        samples = sample(cut(np.where(is_sun, importance, weighted)))
+    order = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
+    return LightSamples(samples.directions[:, order], samples.radiance[:, order])
+
+
+def _of_size(radiance: np.ndarray) -> np.ndarray:
+    """The map with :data:`_LEAST_ROWS` or more: pixels are cut; and with not many more, where they are averaged."""
+    height = len(radiance)
+    if height < _LEAST_ROWS:
+        times = -(-_LEAST_ROWS // height)
+        return radiance.repeat(times, axis=0).repeat(times, axis=1)
+    step = height // _MOST_ROWS
+    if step < 2:
+        return radiance
+    rows = height // step
+    weights = sh.pixel_solid_angles(height)[:, None, None]
+    starts = np.arange(rows) * height // rows, np.arange(2 * rows) * height // rows
+    sums = np.add.reduceat(np.add.reduceat(radiance * weights, starts[0], axis=0), starts[1], axis=1)
+    # pixels of the smaller map are as high as the larger one's by a row of these at most
+    return sums / (sh.pixel_solid_angles(rows)[:, None, None])
+
+
+def _cut(
+    table: np.ndarray, rows: np.ndarray, columns: np.ndarray, count: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Cut a rectangle of a map, from one place to another along each axis, into a number of equal importance.
+
+    Args:
+        table: Importance of all above and left of each corner of pixels, [height + 1, width + 1].
+        rows, columns: Where it begins and ends.
+        count: Number of rectangles.
+    """
+    if count == 1:
+        yield rows, columns
+        return
+    step = np.pi / (len(table) - 1)
+    middle = np.clip((len(table) - 1) / 2, *rows)
+    is_tall = np.ptp(rows) > np.ptp(columns) * np.sin(step * middle)
+    axis_ends, table_along, ends = (rows, table, columns) if is_tall else (columns, table.T, rows)
+    low, high = (_between(table_along.T, end) for end in ends)
+    sums = high - low
+    first, last = _between(sums, axis_ends[0]), _between(sums, axis_ends[1])
+    half = count // 2
+    requested = first + (last - first) * half / count
+    place = float(np.interp(requested, sums, np.arange(len(sums)))) if last > first else np.nan
+    if not axis_ends[0] < place < axis_ends[1]:
+        place = axis_ends[0] + (axis_ends[1] - axis_ends[0]) * half / count
+    for part, parts in (np.array([axis_ends[0], place]), half), (np.array([place, axis_ends[1]]), count - half):
+        yield from _cut(table, *((part, columns) if is_tall else (rows, part)), parts)
+
+
+def _between(values: np.ndarray, place: float) -> np.ndarray:
+    """Values of the first axis at a place between its items."""
+    item = min(int(place), len(values) - 2)
+    return values[item] + (place - item) * (values[item + 1] - values[item])
+
+
+def _mean_light(
+    radiance: np.ndarray, solid_angle: np.ndarray, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean direction of the light of a rectangle of a map, and its light in that direction, ∫ L d·ω dω."""
+    height = len(radiance)
+    row_parts, column_parts = _parts(rows), _parts(columns)
+    column_grid, row_grid = np.meshgrid((column_parts[0] + column_parts[1]) / 2, row_parts[0])
+    directions = _map_directions(
+        row_grid.astype(int), (row_parts[0] + row_parts[1])[:, None] / 2 % 1, column_grid, height
+    )
+    pixels = np.ix_(row_parts[0].astype(int), column_parts[0].astype(int))
+    weights = np.outer(np.diff(row_parts, axis=0), np.diff(column_parts, axis=0)) * solid_angle[pixels]
+    light = radiance[pixels] * weights[..., None]
+    moments = np.einsum("ijk,ijc->ck", directions, light)
+    brightness = np.abs(light).mean(axis=2)
+    if not brightness.any():
+        brightness = weights
+    mean = np.einsum("ijk,ij->k", directions, brightness)
+    mean /= max(np.linalg.norm(mean), 1e-300)
+    return mean, moments @ mean
+
+
+def _parts(ends: np.ndarray) -> np.ndarray:
+    """Cut what lies between two places at whole numbers: where each part begins and ends, shape [2, part]."""
+    whole = np.arange(np.floor(ends[0]) + 1, np.ceil(ends[1]))
+    places = np.concatenate([ends[:1], whole, ends[1:]])
+    return np.stack([places[:-1], places[1:]])
+
+
 class CellSamples(NamedTuple):
     """Directions drawn from light on a device, and the cells that they belong to.
 
@@ -107,7 +258,7 @@ def even_samples(count: int, directions: np.ndarray) -> LightSamples:
     """Directions that are even over the sphere, and the middles of cells without one, for light of 1 in one channel.
 
     Each cell gets its part of the light, 4π/Q, by however many samples fall into it. Measured with 1024 samples of 128
-    cells: what an open ground gets of a cell is off by 2.4% (rms), and by 13% if all samples weigh the same.
+    cells: the light of a cell on an open ground is off by 2.4% (rms), and by 13% if all samples weigh the same.
 
     Args:
         count: Number of samples that are even.

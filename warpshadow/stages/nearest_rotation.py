@@ -14,7 +14,7 @@ def _nearest_rotations(
     matrices: wp.array2d(dtype=wp.mat33),
     # out
     rotations: wp.array2d(dtype=wp.mat33),
-    kept: wp.array2d(dtype=wp.mat33),
+    cached: wp.array2d(dtype=wp.mat33),
 ):
     """A thread owns a rotation, U diag(1, 1, det UVᵀ) Vᵀ of the singular value decomposition M = U Σ Vᵀ."""
     batch, body = wp.tid()
@@ -24,7 +24,7 @@ def _nearest_rotations(
     middle = wp.diag(wp.vec3d(one, one, wp.sign(wp.determinant(u) * wp.determinant(v))))
     rotation = wp.mat33(u * middle * wp.transpose(v))
     rotations[batch, body] = rotation
-    kept[batch, body] = rotation
+    cached[batch, body] = rotation
 
 
 @wp.kernel(enable_backward=False)
@@ -61,13 +61,14 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
 
     Differentiable: matrices.
     """
-    kept = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device)  # the caller may change those that it gets
+    # the caller may overwrite the gradients that it gets
+    cached = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device)
 
     def forward(rotations: wp.array) -> None:
-        launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, kept])
+        launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, cached])
 
     def adjoint(adj_rotations: wp.array) -> None:
-        inputs = [matrices, kept, adj_rotations]
+        inputs = [matrices, cached, adj_rotations]
         launch(_nearest_rotations_adjoint, matrices.shape, inputs=inputs, outputs=[matrices.grad])
 
-    return differentiable(forward, adjoint, result=wp.empty_like(kept), variables=[matrices])
+    return differentiable(forward, adjoint, result=wp.empty_like(cached), variables=[matrices])

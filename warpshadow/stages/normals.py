@@ -117,7 +117,7 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
 
         n_v = normalize(Σ_{faces at v} (x_j − x_i) × (x_k − x_i))
 
-    Sums are float64, since areas are squares, and lengths of normals those of areas: a mesh may have any scale. On a
+    Sums are float64, since areas are squares of lengths: a mesh may have any scale. On a
     GPU their order, so their last bits, may differ between runs; see ``wp.config.deterministic``.
 
     Args:

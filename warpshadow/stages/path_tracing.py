@@ -30,12 +30,12 @@ _STEP_U, _STEP_V = wp.uint32(3242174889), wp.uint32(2447445414)
 """Roberts' R2 sequence, which spreads the first directions of a receiver's paths, in parts of 2³²."""
 
 
-class Surfaces(NamedTuple):
-    """What light bounces from, one instance.
+class PathSurfaces(NamedTuple):
+    """Surfaces that light bounces from, one instance.
 
     Args:
         mesh: All bodies.
-        casting: Those that block direct light, None for none.
+        casting: Mesh that blocks direct light, None for none.
         faces: Vertex indices of the mesh, vec3i of shape [face].
         normals: Unit normals of the vertices, vec3 of shape [vertex].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [vertex].
@@ -57,7 +57,7 @@ class Surfaces(NamedTuple):
 
 
 @wp.struct
-class _Surfaces:
+class _SurfaceArrays:
     """The same in kernels."""
 
     mesh: wp.uint64
@@ -74,8 +74,8 @@ class _Surfaces:
 
 
 @wp.func
-def _albedo(surfaces: _Surfaces, face: int, weights: wp.vec3):
-    """What a point of a face reflects: bilinear in the finest level of its texture, or between vertices."""
+def _albedo(surfaces: _SurfaceArrays, face: int, weights: wp.vec3):
+    """Reflectance at a point of a face: bilinear in the finest level of its texture, or between vertices."""
     texture = surfaces.texture_of_face[face]
     if texture < 0:
         return at_point(surfaces.vertex_albedo, surfaces.faces[face], weights)
@@ -90,9 +90,9 @@ def _toward(normal: wp.vec3, u: float, v: float):
     section 16.6.1].
     """
     z = 1.0 - 2.0 * u
-    across = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    sine = wp.sqrt(wp.max(1.0 - z * z, 0.0))
     angle = 2.0 * wp.pi * v
-    return wp.normalize(normal + wp.vec3(across * wp.cos(angle), across * wp.sin(angle), z))
+    return wp.normalize(normal + wp.vec3(sine * wp.cos(angle), sine * wp.sin(angle), z))
 
 
 @wp.func
@@ -106,7 +106,7 @@ def _trace_bounces(
     first_row: int,
     worker: int,
     # in
-    surfaces: _Surfaces,
+    surfaces: _SurfaceArrays,
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     first_receiver: int,
@@ -149,7 +149,7 @@ def _trace_bounces(
 
 
 def trace_bounces(
-    surfaces: Surfaces,
+    surfaces: PathSurfaces,
     points: wp.array,
     normals: wp.array,
     samples: LightSamples,
@@ -160,11 +160,11 @@ def trace_bounces(
 ) -> wp.array:
     """Trace the light that reaches receivers after it bounced; add direct light (:func:`.trace_shading`) to it.
 
-    Rays that meet a face see it from either side. Direct light at what they meet is blocked by the casting bodies
-    alone, as at receivers.
+    Rays that meet a face see it from either side. Direct light at their hits is blocked by the casting bodies alone, as
+    at receivers.
 
     Args:
-        surfaces: What it bounces from.
+        surfaces: The surfaces it bounces from.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light; each hit takes one of all the sets.
@@ -194,8 +194,8 @@ def trace_bounces(
     return light
 
 
-def _struct(surfaces: Surfaces) -> _Surfaces:
-    struct = _Surfaces()
+def _struct(surfaces: PathSurfaces) -> _SurfaceArrays:
+    struct = _SurfaceArrays()
     struct.mesh, struct.casting = mesh_id(surfaces.mesh), mesh_id(surfaces.casting)
     struct.positions, struct.faces, struct.normals = surfaces.mesh.points, surfaces.faces, surfaces.normals
     struct.vertex_albedo, struct.texture_of_face = surfaces.vertex_albedo, surfaces.texture_of_face

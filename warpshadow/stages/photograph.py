@@ -1,15 +1,15 @@
-"""Photographs: bodies put into one, with the shadows that they cast on what it shows.
+"""Photographs: bodies put into one, with the shadows that they cast on its surfaces.
 
-Some bodies of the scene, the catchers, stand for what the photograph shows. They are not drawn. Where a sample sees one
+Some bodies of the scene, the catchers, model surfaces in the photograph. They are not drawn. Where a sample sees one
 that receives the light S with all bodies and S₀ with catchers alone, the photograph P becomes [Debevec 1998, section 6,
 by a ratio in place of a difference, which asks for no albedo]
 
     P (1 + (S − S₀) r),    r = S₀⁺ / (S₀⁺² + ε²)
 
-which is P S / S₀ where S₀ ≫ ε, up to a factor 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is
-1/256 of the mean of S₀ over the samples that would see catchers without the other bodies: what a photograph of 8 bits
-does not tell from black. The factor of P is averaged over the samples of a pixel and smoothed at silhouettes, P is not:
-what has no shadow stays as it is.
+which is P S / S₀ where S₀ ≫ ε, up to a factor 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is 1/256
+of the mean of S₀ over the samples that would see catchers without the other bodies: less than a photograph of 8 bits
+tells from black. The factor of P is averaged over the samples of a pixel and smoothed at silhouettes, P is not: pixels
+without a shadow stay as they are.
 """
 
 from typing import NamedTuple
@@ -68,8 +68,8 @@ def _divide(
         rest[batch, sample] = wp.vec4()
 
 
-class Division(NamedTuple):
-    """What samples reflect of what they receive, vec3 of shape [batch, height, width], and show beside that."""
+class RatioImage(NamedTuple):
+    """Light that samples reflect, vec3 of shape [batch, height, width], and the photograph beside that."""
 
     drawn: wp.array
     """Where they see a body that is drawn."""
@@ -79,13 +79,13 @@ class Division(NamedTuple):
     """1 − S₀ r where they see a catcher, 1 where there is nothing; vec4."""
 
 
-def divide_samples(face_ids: wp.array, catches: wp.array, reflected: wp.array, unshadowed: wp.array) -> Division:
-    """Divide samples into those that show bodies and those that show the photograph, in the light or in shadow.
+def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array, unshadowed: wp.array) -> RatioImage:
+    """Split samples into samples of bodies and samples of the photograph, in the light or in shadow.
 
     Args:
         face_ids: Face that each sample sees, −1 for none, int32 of shape [batch, height, width].
         catches: Whether a face is one of a catcher, bool of shape [face].
-        reflected: What the samples reflect, vec3 of shape [batch, height, width].
+        reflected: Light that the samples reflect, vec3 of shape [batch, height, width].
         unshadowed: S₀, and whether a sample would see a catcher without the other bodies, 1 or 0; vec4 likewise.
             Any batch may be 1 and then serves every instance.
 
@@ -102,7 +102,7 @@ def divide_samples(face_ids: wp.array, catches: wp.array, reflected: wp.array, u
     size = count, face_ids[0].size
     parts = [wp.empty(size, dtype=dtype, device=device) for dtype in (wp.vec3, wp.vec3, wp.vec4)]
     launch(_divide, size, inputs=[rows(face_ids), catches, rows(reflected), rows(unshadowed), floors], outputs=parts)
-    return Division(*(part.reshape((count, *face_ids.shape[1:])) for part in parts))
+    return RatioImage(*(part.reshape((count, *face_ids.shape[1:])) for part in parts))
 
 
 @wp.kernel
@@ -117,12 +117,12 @@ def _compose(
 ):
     """A thread owns a pixel."""
     batch, row, column = wp.tid()
-    taken = photograph[instance_in(batch, photograph.shape[0]), row, column]
+    consumed = photograph[instance_in(batch, photograph.shape[0]), row, column]
     color = drawn[instance_in(batch, drawn.shape[0]), row, column]
     a = caught[instance_in(batch, caught.shape[0]), row, column]
     b = rest[instance_in(batch, rest.shape[0]), row, column]
     factor = wp.vec3(a[0] + b[0], a[1] + b[1], a[2] + b[2])
-    composed[batch, row, column] = wp.vec3(color[0], color[1], color[2]) + wp.cw_mul(taken, factor)
+    composed[batch, row, column] = wp.vec3(color[0], color[1], color[2]) + wp.cw_mul(consumed, factor)
 
 
 @wp.kernel(enable_backward=False)
@@ -144,7 +144,7 @@ def _cover(
 
 
 def over_nothing(drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
-    """Draw bodies over nothing; their shadows are coverage, the mean of what they take of a white photograph.
+    """Draw bodies over nothing; their shadows are coverage, the mean of the share they take of a white photograph.
 
     Args:
         drawn, caught, rest: As for :func:`compose`.
@@ -163,8 +163,8 @@ def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.ar
 
     Args:
         photograph: Linear RGB, vec3 of shape [batch, height, width].
-        drawn: The film of what samples reflect of what they receive, vec4 of shape [batch, height, width].
-        caught: That of ``inverse`` of what they receive, likewise.
+        drawn: The film of the reflected light, vec4 of shape [batch, height, width].
+        caught: The film of ``inverse`` times the light at the samples, likewise.
         rest: That of ``rest``, likewise.
             Any batch may be 1 and then serves every instance.
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.stages.rotations import check_orthonormal
 
@@ -59,13 +59,31 @@ def _turn(
     turned[batch, body] = rotations[instance_in(batch, rotations.shape[0]), body] * at_rest
 
 
+@wp.kernel
+def _move_pivots(
+    # in
+    pivots: wp.array2d(dtype=wp.vec3),
+    rotations: wp.array2d(dtype=wp.mat33),
+    translations: wp.array2d(dtype=wp.vec3),
+    scales: wp.array2d(dtype=wp.float32),
+    sign: float,
+    # out
+    moved: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a body of an instance."""
+    batch, body = wp.tid()
+    pose = instance_in(batch, scales.shape[0])
+    arm = rotations[pose, body] * pivots[instance_in(batch, pivots.shape[0]), body]
+    moved[batch, body] = translations[pose, body] + sign * scales[pose, body] * arm
+
+
 @dataclass(frozen=True)
 class Poses:
-    """Similarities x → s R x + t of every body of every instance.
+    """Similarities x → s R x + t of every body of every instance; they turn it about the origin of its own space.
 
     Args:
-        rotations: mat33 of shape [batch, body], from :func:`rotation_matrices`. Entries of RᵀR may differ from those of
-            the identity by 0.05.
+        rotations: mat33 of shape [batch, body], from :func:`rotation_matrices`. Entries of RᵀR may differ from the
+            identity by 0.05.
         translations: Offsets [scene units], vec3 of shape [batch, body].
         scales: Factors, float32 of shape [batch, body].
 
@@ -84,6 +102,29 @@ class Poses:
         check.shape("scales", self.scales.shape, self.rotations.shape)
         if not self.rotations.device.is_capturing:
             check_orthonormal(self.rotations.numpy().astype(np.float64))
+
+    def about(self, pivots: wp.array) -> "Poses":
+        """The poses x → s R (x − pivot) + t, if these have t: it is where the pivot goes.
+
+        Args:
+            pivots: A point of each body in its own space, vec3 of shape [batch, body]; either batch may be 1.
+
+        Differentiable: pivots, rotations, translations, scales.
+        """
+        return self._shifted(pivots, -1.0)
+
+    def of_pivots(self, pivots: wp.array) -> "Poses":
+        """The inverse of :meth:`about`: with translations to where pivots are. Differentiable likewise."""
+        return self._shifted(pivots, 1.0)
+
+    def _shifted(self, pivots: wp.array, sign: float) -> "Poses":
+        count = common_batch({"pivot": pivots, "scales": self.scales})
+        check.shape("pivot", pivots.shape, ("batch", self.scales.shape[1]))
+        arrays = {"rotations": self.rotations, "translations": self.translations, "scales": self.scales}
+        check.finite_arrays(arrays | {"pivot": pivots})
+        moved = wp.empty((count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
+        launch(_move_pivots, moved.shape, inputs=[pivots, *arrays.values(), sign], outputs=[moved])
+        return Poses(expand(self.rotations, count), moved, expand(self.scales, count))
 
     def points(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Move points with their bodies.
@@ -117,7 +158,7 @@ class Poses:
         return turned
 
     def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
-        """Shape of what moves."""
+        """Shape of the moving arrays."""
         check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
         arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
         check.finite_arrays(arrays, nonnegative=["scales"])

@@ -102,7 +102,7 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
 
 
 def check_clip_space(clip_matrices: wp.array) -> None:
-    """Raise ValueError for matrices whose z is not the near plane: those of others have a depth there, of slope 1.
+    """Raise ValueError for matrices whose z is not the near plane: other matrices have a depth there, of slope 1.
 
     A far plane or a step of an optimizer makes that row differ a little from ours, which changes nothing that is seen.
     """

@@ -1,10 +1,10 @@
 """Quadtree: receivers at the corners of squares of the image, which are small where light changes quickly.
 
 On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. So its receivers are
-what the corners of squares of 4 × 4 pixels see, and squares are cut into four, and these again, where what samples get
-by interpolation is not what they would see themselves (Ward's irradiance caching, in the image). That is told by
-*probes*, the corners of squares of 2 × 2 pixels, at which somebody knows the light well enough. In a square of corners
-a b / c d are two triangles a b c and d c b, in which samples interpolate linearly.
+the fragments at the corners of squares of 4 × 4 pixels, and squares are cut into four, and these again, where the light
+that samples interpolate differs from their own (Ward's irradiance caching, in the image). That is told by *probes*, the
+corners of squares of 2 × 2 pixels, at which somebody knows the light well enough. In a square of corners a b / c d are
+two triangles a b c and d c b, in which samples interpolate linearly.
 
 A square holds if its corners see one side of one body, and, if it is larger than a pixel, samples within it would be
 off by less than the tolerance. Samples within it that see another side, or whose pixel is no part of a square that
@@ -37,7 +37,7 @@ class Quadtree(NamedTuple):
     numbers: wp.array  # [view, row, column] int32, number of the square, at its first pixel
     corners: np.ndarray  # [square, 4] a b c d of each: view · samples + sample
     is_corner: np.ndarray  # [view, sample] bool
-    keys: wp.array  # [side] int32, the same for the sides that share squares; −1 for those that are in none
+    keys: wp.array  # [side] int32, the same for sides that share squares; −1 for sides that are in none
 
     @property
     def triangles(self) -> np.ndarray:
@@ -45,24 +45,25 @@ class Quadtree(NamedTuple):
         return self.corners[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
 
 
-def probe_grid(size: tuple[int, int], across: int) -> tuple[np.ndarray, np.ndarray]:
+def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the samples that are probes; the last may stand there twice.
 
     Args:
         size: Height and width of the image [samples].
-        across: Samples of a pixel across and down.
+        supersampling: Samples of a pixel across and down.
     """
-    counts = (PROBE * -(-length // (across * LARGEST)) + 1 for length in size)
+    counts = (PROBE * -(-length // (supersampling * LARGEST)) + 1 for length in size)
     rows_, columns = (
-        np.minimum(PROBE * across * np.arange(count), length - 1) for count, length in zip(counts, size, strict=True)
+        np.minimum(PROBE * supersampling * np.arange(count), length - 1)
+        for count, length in zip(counts, size, strict=True)
     )
     return rows_, columns
 
 
 @wp.func
-def sample_at(row: int, column: int, across: int, height: int, width: int):
+def sample_at(row: int, column: int, supersampling: int, height: int, width: int):
     """The sample at the upper left of a pixel; beyond the image's end the last."""
-    return wp.min(row * across, height - 1) * width + wp.min(column * across, width - 1)
+    return wp.min(row * supersampling, height - 1) * width + wp.min(column * supersampling, width - 1)
 
 
 @wp.func
@@ -99,7 +100,7 @@ def _bend(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row
 def _gap(
     shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), key: int, at: wp.vec2i, a: wp.vec2i, b: wp.vec2i
 ):
-    """What interpolation between two probes misses at a third."""
+    """Error of interpolation between two probes, at a third one."""
     gap = float(0.0)
     if keys[at[0], at[1]] == key:
         gap = wp.abs(shares[at[0], at[1]] - 0.5 * (shares[a[0], a[1]] + shares[b[0], b[1]]))
@@ -113,7 +114,7 @@ def _cut_squares(
     keys: wp.array(dtype=wp.int32),
     probe_keys: wp.array3d(dtype=wp.int32),
     probe_shares: wp.array3d(dtype=float),
-    across: int,
+    supersampling: int,
     height: int,
     width: int,
     tolerance: float,
@@ -168,32 +169,32 @@ def _cut_squares(
                 if y < sizes.shape[1] and x < sizes.shape[2]:
                     own = size
                     if size == 1:
-                        key = _key_at(seen, keys, sample_at(y, x, across, height, width))
+                        key = _key_at(seen, keys, sample_at(y, x, supersampling, height, width))
                         for corner in range(1, 4):
-                            other = sample_at(y + corner / 2, x + corner % 2, across, height, width)
+                            other = sample_at(y + corner / 2, x + corner % 2, supersampling, height, width)
                             if key < 0 or _key_at(seen, keys, other) != key:
                                 own = 0
                     sizes[view, y, x] = own
 
 
 def find_quadtree(
-    sides: wp.array, keys: np.ndarray, probe_shares: np.ndarray, across: int, *, tolerance: float = TOLERANCE
+    sides: wp.array, keys: np.ndarray, probe_shares: np.ndarray, supersampling: int, *, tolerance: float = TOLERANCE
 ) -> Quadtree:
     """Find the squares in which samples interpolate.
 
     Args:
         sides: Side that each sample sees, −1 for none, int32 of shape [view, height, width].
-        keys: For each side a number that those share that lie in one plane, −1 for those that have no squares.
+        keys: A number for each side, equal for sides in one plane, −1 for sides without squares.
         probe_shares: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
             [view, row, column]; anything where they see no side that has squares.
-        across: Samples of a pixel across and down.
+        supersampling: Samples of a pixel across and down.
         tolerance: Error of interpolation at which a square is cut, in the unit of the shares.
     """
     device, (view_count, height, width) = sides.device, sides.shape
-    flat, shape = rows(sides), (view_count, height // across, width // across)
+    flat, shape = rows(sides), (view_count, height // supersampling, width // supersampling)
     keys_there = constant(keys, wp.int32, device)
     sizes = wp.empty(shape, dtype=wp.int32, device=device)
-    probe_keys = keys_of(sides, keys, across)
+    probe_keys = keys_of(sides, keys, supersampling)
     inputs = [
         flat,
         keys_there,
@@ -203,27 +204,27 @@ def find_quadtree(
     launch(
         _cut_squares,
         (view_count, probe_keys.shape[1] // 2),
-        inputs=[*inputs, across, height, width, tolerance],
+        inputs=[*inputs, supersampling, height, width, tolerance],
         outputs=[sizes],
     )
-    found = sizes.numpy()
+    result = sizes.numpy()
     row, column = np.arange(shape[1])[:, None], np.arange(shape[2])
-    is_first = found == 1
+    is_first = result == 1
     for size in (2, LARGEST):
-        is_first |= (found == size) & (row % size == 0) & (column % size == 0)
+        is_first |= (result == size) & (row % size == 0) & (column % size == 0)
     view, row, column = np.nonzero(is_first)
     numbers = np.zeros(shape, np.int32)
     numbers[is_first] = np.arange(len(view))
-    ends = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * found[is_first][:, None, None]
-    rows_ = np.minimum((row[:, None] + ends[..., 0]) * across, height - 1)
-    columns = np.minimum((column[:, None] + ends[..., 1]) * across, width - 1)
+    ends = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * result[is_first][:, None, None]
+    rows_ = np.minimum((row[:, None] + ends[..., 0]) * supersampling, height - 1)
+    columns = np.minimum((column[:, None] + ends[..., 1]) * supersampling, width - 1)
     corners = (view[:, None] * height + rows_) * width + columns
     is_corner = np.zeros(flat.shape, bool)
     is_corner.ravel()[corners] = True
     return Quadtree(sizes, wp.array(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
 
 
-def keys_of(sides: wp.array, keys: np.ndarray, across: int) -> np.ndarray:
+def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
     """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
-    row, column = probe_grid(sides.shape[1:], across)
+    row, column = probe_grid(sides.shape[1:], supersampling)
     return np.append(keys, -1)[sides.numpy()[:, row[:, None], column]]

@@ -1,6 +1,6 @@
 """Rasterize triangles: which face each sample of an image sees, and where on it.
 
-Samples and clip space are those of :mod:`warpshadow.stages.screen`. Coverage is decided in integers, so it is exact:
+Samples and clip space follow :mod:`warpshadow.stages.screen`. Coverage is decided in integers, so it is exact:
 vertices snap to 1/4096 sample, a sample sees the face that holds its center, and a center on an edge belongs to one of
 the two faces that share it (the top-left rule). Both sides of a face are drawn. Of the faces over a sample the nearest
 wins; of equally near ones, that of the lowest index.
@@ -28,7 +28,7 @@ _ONE = 1 << 12
 _HALF = _ONE // 2
 _SHIFT = 12
 _LIMIT = 1 << 28
-_WILD = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind the eye or beyond the limit
+_CLIPPED = -(1 << 31)  # the x of a vertex that has no fixed-point position: behind the eye or beyond the limit
 
 # In boxes wider than this each row is trimmed to the span inside the edges; else testing samples is faster.
 _TRIM_WIDTH = 8
@@ -44,7 +44,7 @@ _Edge = wp.types.vector(length=3, dtype=wp.int64)
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """What each sample sees.
+    """Fragment of each sample.
 
     Args:
         face_ids: Index of the visible face, -1 where there is none, int32, shape [batch, height, width].
@@ -65,7 +65,7 @@ class Fragments:
 
     @functools.cached_property
     def flat(self) -> list[wp.array]:
-        """The arrays as [sample], those of instances after one another."""
+        """The arrays as [sample], instance after instance."""
         return [self.face_ids.flatten(), self.barycentrics.flatten()]
 
 
@@ -88,7 +88,7 @@ def _snap(
     p = clip_positions[instance, vertex]
     if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2]) and wp.isfinite(p[3])):
         wp.atomic_add(faults, instance, 0, 1)
-    corner = wp.vec2i(_WILD, _WILD)
+    corner = wp.vec2i(_CLIPPED, _CLIPPED)
     depth = 0.0
     if p[3] > 0.0:
         inverse = wp.float64(1.0) / wp.float64(p[3])
@@ -119,14 +119,14 @@ def _homogeneous(p: wp.vec4, width: int, height: int):
 
 
 @wp.func
-def _wild_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec2i):
+def _clipped_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec2i):
     """Line of an edge with a vertex behind the eye or far away.
 
     In homogeneous coordinates the line is a x b, wherever its ends are. It is rounded to integers, made to
     pass through an end that has a snapped position, and computed in one order of a and b, so that both faces
     of the edge get the same.
     """
-    if a_corner[0] != _WILD and b_corner[0] != _WILD:
+    if a_corner[0] != _CLIPPED and b_corner[0] != _CLIPPED:
         return _edge(a_corner, b_corner)
     swap = a[0] > b[0] or (a[0] == b[0] and (a[1] > b[1] or (a[1] == b[1] and a[2] > b[2])))
     line = wp.where(swap, wp.cross(b, a), wp.cross(a, b))
@@ -139,10 +139,10 @@ def _wild_edge(a: wp.vec3d, b: wp.vec3d, a_corner: wp.vec2i, b_corner: wp.vec2i)
         offset = line[2] / (line[0] * line[0] + line[1] * line[1])
     anchor_x = wp.int64(0)
     anchor_y = wp.int64(0)
-    if a_corner[0] != _WILD:
+    if a_corner[0] != _CLIPPED:
         anchor_x = wp.int64(a_corner[0])
         anchor_y = wp.int64(a_corner[1])
-    elif b_corner[0] != _WILD:
+    elif b_corner[0] != _CLIPPED:
         anchor_x = wp.int64(b_corner[0])
         anchor_y = wp.int64(b_corner[1])
     elif slope == wp.float64(0.0) or wp.abs(offset) > wp.float64(_LIMIT):
@@ -189,7 +189,9 @@ def _trim(span: wp.vec2i, step: wp.int64, value: wp.int64):
 
 
 @wp.func
-def _tame_plane(a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, area: wp.int64, depth_a: float, depth_b: float, depth_c: float):
+def _unclipped_plane(
+    a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, area: wp.int64, depth_a: float, depth_b: float, depth_c: float
+):
     """Depth of a face as a linear function of sample indices: plane0 column + plane1 row + plane2."""
     scale = wp.float64(_ONE) / wp.float64(area)
     ab = wp.float64(depth_b - depth_a) * scale
@@ -202,8 +204,8 @@ def _tame_plane(a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, area: wp.int64, depth_a: 
 
 
 @wp.func
-def _wild_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
-    """`_tame_plane` for a face with vertices behind the eye or far away."""
+def _clipped_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, z: wp.vec3d):
+    """`_unclipped_plane` for a face with vertices behind the eye or far away."""
     ab = wp.cross(a, b)
     plane = (z[0] * wp.cross(b, c) + z[1] * wp.cross(c, a) + z[2] * ab) / wp.dot(ab, c)
     half = wp.float64(_HALF)
@@ -256,13 +258,13 @@ def _cover(
     a = corners[instance, i]
     b = corners[instance, j]
     c = corners[instance, k]
-    wild = a[0] == _WILD or b[0] == _WILD or c[0] == _WILD
+    clipped = a[0] == _CLIPPED or b[0] == _CLIPPED or c[0] == _CLIPPED
 
     left = 0
     right = width - 1
     top = 0
     bottom = height - 1
-    if not wild:
+    if not clipped:
         left = wp.max(left, _first_index(wp.min(a[0], wp.min(b[0], c[0]))))
         right = wp.min(right, _first_index(wp.max(a[0], wp.max(b[0], c[0])) + 1) - 1)
         top = wp.max(top, _first_index(wp.min(a[1], wp.min(b[1], c[1]))))
@@ -277,7 +279,7 @@ def _cover(
     farthest = 0
     nearest = int(_DEPTH_ONE + 1)
     sign = wp.int64(1)
-    if wild:
+    if clipped:
         clip_a = clip_positions[instance, i]
         clip_b = clip_positions[instance, j]
         clip_c = clip_positions[instance, k]
@@ -290,11 +292,11 @@ def _cover(
         if volume == wp.float64(0.0):
             return
         sign = wp.where(volume > wp.float64(0.0), wp.int64(1), wp.int64(-1))
-        edge_a = _wild_edge(fixed_b, fixed_c, b, c)
-        edge_b = _wild_edge(fixed_c, fixed_a, c, a)
-        edge_c = _wild_edge(fixed_a, fixed_b, a, b)
+        edge_a = _clipped_edge(fixed_b, fixed_c, b, c)
+        edge_b = _clipped_edge(fixed_c, fixed_a, c, a)
+        edge_c = _clipped_edge(fixed_a, fixed_b, a, b)
         z = wp.vec3d(wp.float64(clip_a[2]), wp.float64(clip_b[2]), wp.float64(clip_c[2]))
-        plane = _wild_plane(fixed_a, fixed_b, fixed_c, z)
+        plane = _clipped_plane(fixed_a, fixed_b, fixed_c, z)
     else:
         area = edge_c[0] * wp.int64(c[0]) + edge_c[1] * wp.int64(c[1]) + edge_c[2]
         if area == wp.int64(0):
@@ -303,7 +305,7 @@ def _cover(
         depth_a = depths[instance, i]
         depth_b = depths[instance, j]
         depth_c = depths[instance, k]
-        plane = _tame_plane(a, b, c, area, depth_a, depth_b, depth_c)
+        plane = _unclipped_plane(a, b, c, area, depth_a, depth_b, depth_c)
         # Rounding must not carry the depth of a sliver beyond that of its vertices.
         farthest = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
         nearest = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)

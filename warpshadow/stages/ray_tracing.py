@@ -1,17 +1,15 @@
-"""What the approximations are judged by: the mesh itself, by rays through its bounding volume hierarchy."""
+"""The reference for the approximations: the mesh itself, by rays through its bounding volume hierarchy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.device.progress import progress_bar
-from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.light_samples import CellSamples, LightSamples
 
 RAY_COST = 200.0
@@ -22,7 +20,8 @@ ROUNDING = 2.0**-21
 
 UPRIGHT = 1.0e-3
 """Cosine between a face's normal and a receiver's below which the face is a wall at whose foot the receiver lies: it is
-in front of it then, whatever rounding says."""
+in front of it then, against rounding.
+"""
 
 RAISE = 1.0e-4
 """Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
@@ -42,20 +41,20 @@ def _seen_from(point: wp.vec3, normal: wp.vec3, corner_a: wp.vec3, corner_b: wp.
     a = wp.vec3d(corner_a) - wp.vec3d(point)
     b = wp.vec3d(corner_b) - wp.vec3d(point)
     c = wp.vec3d(corner_c) - wp.vec3d(point)
-    across = wp.cross(b - a, c - a)
-    drop = wp.dot(across, a)  # from the plane to the receiver, times |across|
+    face_normal = wp.cross(b - a, c - a)
+    drop = wp.dot(face_normal, a)  # from the plane to the receiver, times |face_normal|
     largest = wp.max(wp.max(wp.abs(corner_a), wp.abs(corner_b)), wp.max(wp.abs(corner_c), wp.abs(point)))
     lies_on = bool(False)
-    if wp.abs(drop) <= wp.float64(ROUNDING) * wp.dot(wp.abs(across), wp.vec3d(largest)):
-        length = wp.length(across)
-        upward = wp.dot(across, wp.vec3d(normal))
+    if wp.abs(drop) <= wp.float64(ROUNDING) * wp.dot(wp.abs(face_normal), wp.vec3d(largest)):
+        length = wp.length(face_normal)
+        upward = wp.dot(face_normal, wp.vec3d(normal))
         lies_on = wp.abs(upward) >= wp.float64(UPRIGHT) * length
         height = wp.where(upward < wp.float64(-UPRIGHT) * length, -RAISE, RAISE)
-        move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * across
+        move = (drop / length + wp.float64(height) * wp.sqrt(length)) / length * face_normal
         a -= move
         b -= move
         c -= move
-    return a, b, c, across, lies_on
+    return a, b, c, face_normal, lies_on
 
 
 @wp.func
@@ -66,10 +65,10 @@ def _volumes(toward: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
-def _meets(toward: wp.vec3, a: wp.vec3d, across: wp.vec3d, volumes: wp.vec3d):
+def _meets(toward: wp.vec3, a: wp.vec3d, face_normal: wp.vec3d, volumes: wp.vec3d):
     """Whether a ray meets a face."""
     is_inside = wp.min(volumes) >= wp.float64(0.0) or wp.max(volumes) <= wp.float64(0.0)
-    return is_inside and wp.dot(across, a) * wp.dot(across, wp.vec3d(toward)) > wp.float64(0.0)
+    return is_inside and wp.dot(face_normal, a) * wp.dot(face_normal, wp.vec3d(toward)) > wp.float64(0.0)
 
 
 @wp.func
@@ -85,14 +84,14 @@ def _slope(toward: wp.vec3):
 @wp.func
 def is_met(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
     """Whether a ray from a receiver meets a face of a mesh."""
-    a, b, c, across, _lies_on = _seen_from(
+    a, b, c, face_normal, _lies_on = _seen_from(
         point,
         normal,
         wp.mesh_get_point(mesh, 3 * face),
         wp.mesh_get_point(mesh, 3 * face + 1),
         wp.mesh_get_point(mesh, 3 * face + 2),
     )
-    return _meets(toward, a, across, _volumes(toward, a, b, c))
+    return _meets(toward, a, face_normal, _volumes(toward, a, b, c))
 
 
 @wp.func
@@ -116,7 +115,7 @@ def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
 
 @wp.struct
 class Hit:
-    """What a ray meets first."""
+    """First hit of a ray."""
 
     face: int
     """Number of the face, -1 for none."""
@@ -128,9 +127,9 @@ class Hit:
 
 @wp.func
 def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
-    """What a ray from a receiver meets first; nothing where it leaves below the face that the receiver lies on.
+    """First hit of a ray from a receiver; none where it leaves below the face that the receiver lies on.
 
-    Such rays are those of smooth normals, which lean away from faces. Direct light has none from there, too.
+    Smooth normals, which lean away from faces, have such rays. Direct light has none from there, too.
     """
     hit = Hit()
     hit.face = -1
@@ -138,7 +137,7 @@ def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
     query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
     face = int(0)
     while wp.bvh_query_next(query, face, distance):
-        a, b, c, across, lies_on = _seen_from(
+        a, b, c, face_normal, lies_on = _seen_from(
             point,
             normal,
             wp.mesh_get_point(mesh, 3 * face),
@@ -146,9 +145,9 @@ def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
             wp.mesh_get_point(mesh, 3 * face + 2),
         )
         volumes = _volumes(toward, a, b, c)
-        if _meets(toward, a, across, volumes):
-            slope = wp.dot(across, wp.vec3d(toward))
-            reached = float(wp.dot(across, a) / slope)
+        if _meets(toward, a, face_normal, volumes):
+            slope = wp.dot(face_normal, wp.vec3d(toward))
+            reached = float(wp.dot(face_normal, a) / slope)
             if reached < distance:
                 distance = reached
                 hit.face = wp.where(lies_on, -1, face)
@@ -186,7 +185,7 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     Receivers may lie on the mesh. Directions below a receiver's horizon (n·ω ≤ 0) are not traced and count as blocked.
 
     Args:
-        mesh: What blocks the light, one mesh for all batches; build it once, it holds the hierarchy. None for nothing.
+        mesh: The blockers, one mesh for all batches; build it once, it holds the hierarchy. None for nothing.
         points: Receiver positions [scene units], vec3, shape [batch, vertex].
         normals: Unit normals of the receivers, vec3, shape [batch, vertex].
         directions: Unit directions toward the light, vec3, shape [direction].
@@ -246,7 +245,7 @@ def trace_shading(
     """Trace the shading of receivers: the radiance of a white surface, single bounce, as a path tracer gives it.
 
     Args:
-        mesh: What blocks the light, None for nothing.
+        mesh: The blockers, None for none.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light.
@@ -270,42 +269,6 @@ def trace_shading(
             cost=RAY_COST * directions.shape[1],
         )
     return shading
-
-
-def trace_transfer(
-    mesh: wp.Mesh | None,
-    points: wp.array,
-    normals: wp.array,
-    functions: Callable[[np.ndarray], np.ndarray],
-    count: int,
-    *,
-    progress: bool = False,
-) -> wp.array:
-    """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
-
-    Args:
-        mesh: What blocks the light, None for nothing.
-        points: Receiver positions [scene units], vec3 of shape [receiver].
-        normals: Unit normals, vec3 of shape [receiver].
-        functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
-            coefficient].
-        count: Number of directions, evenly over the sphere.
-        progress: Show a progress bar where it takes longer than a second.
-
-    Returns:
-        Transfer vectors, float32 of shape [receiver, coefficient].
-
-    Differentiable: no.
-    """
-    directions = fibonacci(-(-count // CHUNK) * CHUNK)
-    towards = wp.array(directions, dtype=wp.vec3, device=points.device)
-    values = (4 / len(directions) * functions(directions)).astype(np.float32)
-    transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
-    for part in parts(points.shape[0], 2**22 // len(directions), progress):
-        visibility = trace_visibility(mesh, points[part].reshape((1, -1)), normals[part].reshape((1, -1)), towards)
-        cosine = np.maximum(normals[part].numpy() @ directions.T.astype(np.float32), 0)
-        transfer[part] = (visibility.numpy()[0] * cosine) @ values
-    return wp.array(transfer, device=points.device)
 
 
 @wp.kernel(enable_backward=False)
@@ -351,10 +314,10 @@ def trace_cells(
     """Trace how much light each cell of directions sends past a mesh: :func:`trace_shading`, apart for each cell.
 
     Args:
-        mesh: What blocks the light, None for nothing.
+        mesh: The blockers, None for none.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
-        numbers: What tells the receivers apart, int32 of shape [receiver]: one gets the same rays whoever is with it.
+        numbers: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any company.
         samples: Directions drawn from the light.
         progress: Show a progress bar where it takes longer than a second.
 
@@ -376,11 +339,14 @@ def trace_cells(
     return light
 
 
-def parts(total: int, size: int, progress: bool, what: str = "tracing rays") -> Iterator[slice]:
-    """Cut a range into slices of at most ``size``, with a progress bar over them that says what is done."""
+def parts(total: int, size: int, progress: bool, what: str = "tracing rays", *, first: int = 0) -> Iterator[slice]:
+    """Cut a range into slices of at most ``size``, with a labeled progress bar over them.
+
+    Rows before ``first`` count as done.
+    """
     size = max(size, 1)
-    with progress_bar(total, what, "point", wanted=progress) as bar:
-        for start in range(0, total, size):
+    with progress_bar(total, what, "point", done=first, shows=progress) as bar:
+        for start in range(first, total, size):
             stop = min(start + size, total)
             yield slice(start, stop)
             bar.update(stop - start)

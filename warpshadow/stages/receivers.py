@@ -16,7 +16,7 @@ from warpshadow.device.launch import launch
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterize import Fragments
-from warpshadow.stages.sample_receivers import Span, find_sample_receivers, spans_of
+from warpshadow.stages.sample_receivers import SeenSurface, Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -37,7 +37,7 @@ class Receivers(NamedTuple):
     on_static: np.ndarray = np.empty(0, int)  # [on static], the vertices that the first receivers are
     spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
     vertices: wp.array | None = None  # [vertex receiver] int32, the vertices and backs that the first of them are, …
-    seen: Fragments | None = None  # … and what the rest see: sides and barycentrics, [batch, own]; −1 for none
+    seen: Fragments | None = None  # … and the fragments of the rest: sides and barycentrics, [batch, own]; −1 for none
 
     def without_owners(self) -> "Receivers":
         """The same receivers, as points of which nobody knows the body."""
@@ -57,7 +57,7 @@ def _gather(
     points: wp.array2d(dtype=wp.vec3),
     point_normals: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver: a vertex, or what samples see, −1 for nothing."""
+    """A thread owns a receiver: a vertex, or a fragment, −1 for nothing."""
     batch, receiver = wp.tid()
     instance = instance_in(batch, positions.shape[0])
     own = receiver - vertices.shape[0]
@@ -80,15 +80,15 @@ def _add_faces(
     faces: wp.array(dtype=wp.vec3i),
     receiver_count: int,
     # out
-    with_own: wp.array(dtype=wp.vec3i),
+    with_self_light: wp.array(dtype=wp.vec3i),
 ):
     """A thread owns a face: of the mesh, or of an own receiver."""
-    face = wp.tid()  # with_own may have more
+    face = wp.tid()  # with_self_light may have more
     own = receiver_count + face - faces.shape[0]
     corners = wp.vec3i(own, own, own)
     if own < receiver_count:
         corners = faces[face]
-    with_own[face] = corners
+    with_self_light[face] = corners
 
 
 class Numbering(NamedTuple):
@@ -96,11 +96,11 @@ class Numbering(NamedTuple):
 
     vertices: (
         wp.array | None
-    )  # [receiver − on static] int32, those not on static bodies; None for all vertices as they are
-    on_static: np.ndarray  # [on static], those on static bodies, which are the first receivers
+    )  # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
+    on_static: np.ndarray  # [on static], the receivers on static bodies, which come first
     faces: wp.array  # [face or side] vec3i
     of_vertices: wp.array  # [vertex, and their backs] int32, -1 for none
-    spans: tuple[Span, ...] = ()  # of those not on static bodies, where bodies are told apart
+    spans: tuple[Span, ...] = ()  # of receivers not on static bodies, where bodies are told apart
 
     @property
     def moving_count(self) -> int:
@@ -128,8 +128,8 @@ def number_receivers(
         is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
         sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
-        bodies: Body of each vertex, −1 for those that need not be told apart, shape [vertex]: receivers of a body then
-            follow each other. None where all share what blocks them.
+        bodies: Body of each vertex, −1 for vertices that need not be told apart, shape [vertex]: receivers of a body
+            then follow each other. None where all share their blockers.
     """
     device, (side_count, vertex_count) = faces.device, keeps_vertex.shape
     if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
@@ -164,8 +164,9 @@ def find_receivers(
     numbering: Numbering,
     wants_samples: np.ndarray,
     bodies: np.ndarray | None = None,
-    across: int = 1,
+    supersampling: int = 1,
     quadtree: Quadtree | None = None,
+    shares_surfaces: bool = False,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -173,14 +174,16 @@ def find_receivers(
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
-        fragments: What each sample sees, one batch for all or one each.
-        numbering: The vertices that are receivers: all of those of a face that a sample sees, unless the face wants
+        fragments: The fragments, one batch for all or one each.
+        numbering: The vertices that are receivers: all vertices of a face that a sample sees, unless the face wants
             samples; with their backs where fragments have sides.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
-        bodies: Body of each face, −1 for those that need not be told apart, shape [face]; None where all share what
-            blocks them, as for :func:`number_receivers`.
-        across: Samples of a pixel across and down: those that see the same face share a receiver.
+        bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
+            blockers, as for :func:`number_receivers`.
+        supersampling: Supersampling, the samples of a pixel across and down: samples of a pixel with the same face
+            share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
+        shares_surfaces: Whether those that see different faces of one smooth surface share a receiver, too.
 
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
@@ -197,7 +200,12 @@ def find_receivers(
         batch_count = common_batch({"positions": positions, "fragments": sides})
         side_count, receiver_count = len(receiver_faces), numbering.receiver_count
         keys = np.zeros(len(faces), int) if bodies is None else bodies
-        own = find_sample_receivers(receiver_fragments, side_count, wants_samples, keys, across, quadtree)
+        surface = None
+        if shares_surfaces and len(positions) == 1:
+            seen_points = points_seen(positions, normals, faces, Fragments(*receiver_fragments.rows))
+            surface = SeenSurface(*seen_points, positions[0], faces)
+        arguments = receiver_fragments, side_count, wants_samples, keys, supersampling, quadtree, surface
+        own = find_sample_receivers(*arguments)
         receiver_fragments, seen = own.fragments, own.seen
         moving_count = numbering.moving_count
         spans += tuple(Span(body, moving_count + first, moving_count + end) for body, first, end in own.spans)
@@ -211,16 +219,16 @@ def find_receivers(
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)
     vertices = of_vertices if vertices is None else vertices
     points = _points(batch_count, positions, normals, faces, vertices, seen)
-    found = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
+    result = Receivers(*points, receiver_faces, of_vertices, receiver_fragments, on_static)
     if bodies is None:
-        return found
-    return found._replace(spans=spans, vertices=vertices, seen=seen if seen and seen.face_ids.size else None)
+        return result
+    return result._replace(spans=spans, vertices=vertices, seen=seen if seen and seen.face_ids.size else None)
 
 
 def _points(
     count: int, positions: wp.array, normals: wp.array, faces: wp.array, vertices: wp.array, seen: Fragments | None
 ) -> tuple[wp.array, wp.array]:
-    """Points and normals of vertices and of what is seen, for a number of instances. Differentiable: all but faces."""
+    """Points and normals of vertices and of fragments, for a number of instances. Differentiable: all but faces."""
     device = positions.device
     if seen is None:
         seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
@@ -247,8 +255,8 @@ def receivers_on_faces(
         faces: Vertex indices, vec3i of shape [face].
         sides: Faces, from the front or from behind, int of shape [receiver].
         barycentrics: Where on them, shape [receiver, 3].
-        bodies: Body of each, −1 for those that need not be told apart, shape [receiver], runs of the same one after
-            another. None where all share what blocks them.
+        bodies: Body of each, −1 for receivers that need not be told apart, shape [receiver], runs of the same one after
+            another. None where all share their blockers.
 
     Differentiable: positions, normals.
     """
@@ -261,7 +269,7 @@ def receivers_on_faces(
 
 
 def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: Fragments) -> tuple[wp.array, wp.array]:
-    """Points and normals of what is seen, sides and barycentrics [view, receiver]: vec3 of shape [batch, receiver].
+    """Points and normals of fragments, sides and barycentrics [view, receiver]: vec3 of shape [batch, receiver].
 
     Differentiable: positions, normals, barycentrics.
     """
@@ -271,17 +279,17 @@ def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: F
 
 
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
-    """Find the vertices that have a part in an image: those of faces that samples see, and of edges at silhouettes.
+    """Find the vertices that have a part in an image: corners of visible faces, and of edges at silhouettes.
 
     Args:
-        fragments: What each sample sees, of any number of instances.
+        fragments: The fragments, of any number of instances.
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`, whose edges have colors of their
             own.
         vertex_count: Number of vertices.
 
     Returns:
-        bool of shape [1, vertex], or [2, vertex] where fragments have sides: what any instance sees, so that all have
-        as many receivers.
+        bool of shape [1, vertex], or [2, vertex] where fragments have sides: the union over all instances, so that all
+        have as many receivers.
     """
     faces, edges, face_count = silhouettes.faces.numpy(), silhouettes.edges.numpy(), len(silhouettes.faces)
     sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)

@@ -14,10 +14,10 @@ SHORTEST = 1.0e-18
 """Shorter quaternions and columns have no direction: its gradient would be out of float32's range."""
 
 PARALLEL = 1.0e-6
-"""Columns at a smaller angle [radians] are parallel: what is between them is rounding."""
+"""Columns at a smaller angle [radians] are parallel: the angle is rounding."""
 
 NOT_ORTHONORMAL = 0.05
-"""Largest entry of |RᵀR − I| of what is taken for a rotation: a step of 0.01 in all nine numbers stays below."""
+"""Largest entry of |RᵀR − I| of a matrix that counts as a rotation: a step of 0.01 in all nine numbers stays below."""
 
 
 @wp.kernel
@@ -97,20 +97,18 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
     """Make rotation matrices of free parameters.
 
     Args:
-        parameters: Shape [batch, body]; the dtype says what they are:
-            vec4, quaternions (x, y, z, w) of any length from 1e-18 on;
-            vec3, axis-angle vectors [radians], smooth at 0;
-            :data:`Vec6`, the first two columns, of which Gram–Schmidt makes a rotation (Zhou et al. 2019);
-            mat33, any matrix, whose nearest rotation is taken.
+        parameters: Shape [batch, body]; the dtype decides their meaning: vec4, quaternions (x, y, z, w) of any length
+            from 1e-18 on; vec3, axis-angle vectors [radians], smooth at 0; :data:`Vec6`, the first two columns, of
+            which Gram–Schmidt makes a rotation (Zhou et al. 2019); mat33, any matrix, whose nearest rotation is taken.
 
     Returns:
         Rotations, mat33 of shape [batch, body].
 
     Raises:
-        ValueError: for another dtype, for NaN, Inf and numbers beyond 1e18, and for what is no rotation: quaternions
-            and columns of length 0, parallel columns, and matrices that are as near to several rotations, as those of
-            rank 1 and mirrored rotations are. (Reading them waits for a GPU. While a CUDA graph is captured that cannot
-            be, and nothing is checked.)
+        ValueError: for another dtype, for NaN, Inf and numbers beyond 1e18, and for parameters without a rotation:
+            quaternions and columns of length 0, parallel columns, and matrices that are as near to several rotations,
+            as matrices of rank 1 and mirrored rotations are. (Reading them waits for a GPU. While a CUDA graph is
+            captured that cannot be, and nothing is checked.)
 
     Differentiable: parameters.
     """
@@ -136,9 +134,9 @@ def _check_rotations(parameters: wp.array) -> None:
         _refuse(np.linalg.norm(values, axis=-1) < SHORTEST, f"quaternions shorter than {SHORTEST:g}")
         return
     if parameters.dtype is wp.mat33:
-        largest, middle, least = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
+        largest, middle, minimum = np.moveaxis(np.linalg.svd(values, compute_uv=False), -1, 0)
         _refuse(largest < SHORTEST, f"matrices smaller than {SHORTEST:g}")
-        gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * least
+        gaps = middle + np.sign(np.linalg.det(values / largest[..., None, None])) * minimum
         _refuse(gaps < PARALLEL * largest, "matrices as near to several rotations, as mirrored ones are,")
         return
     x, y = values[..., :3], values[..., 3:]

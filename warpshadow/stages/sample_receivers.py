@@ -22,8 +22,15 @@ TILE = 16
 """Pixels of a side of the tiles whose receivers follow each other."""
 
 
+ALIKE = 0.9
+"""Cosine between normals of samples of a pixel from which they may share a receiver …"""
+
+LEVEL = 0.3
+"""… where a line from one to the other is not steeper than that: the sine of its angle to the surface."""
+
+
 class Span(NamedTuple):
-    """Receivers of one body that follow each other; of body −1 are those of all that share what blocks them."""
+    """Consecutive receivers of one body; body −1 has all receivers that share their blockers."""
 
     body: int
     first: int
@@ -37,6 +44,15 @@ def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
     return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
+class SeenSurface(NamedTuple):
+    """The points that samples see."""
+
+    points: wp.array  # [view, sample] vec3
+    normals: wp.array  # [view, sample] vec3
+    positions: wp.array  # [vertex] vec3
+    faces: wp.array  # [face] vec3i
+
+
 class SampleReceivers(NamedTuple):
     """Receivers that samples have."""
 
@@ -46,10 +62,19 @@ class SampleReceivers(NamedTuple):
     spans: tuple[Span, ...]
 
 
+@wp.func
+def _is_one_surface(point: wp.vec3, normal: wp.vec3, other: wp.vec3, other_normal: wp.vec3):
+    """Whether two points lie on one smooth surface, which is not steep between them."""
+    step = other - point
+    return wp.dot(normal, other_normal) > ALIKE and wp.abs(wp.dot(normal, step)) <= LEVEL * wp.length(step)
+
+
 @wp.kernel(enable_backward=False)
 def _find_sharing(
     # in
     sides: wp.array2d(dtype=wp.int32),
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
     barycentrics: wp.array2d(dtype=wp.vec3),
     wants_samples: wp.array(dtype=wp.bool),
     sizes: wp.array3d(dtype=wp.int32),
@@ -57,7 +82,7 @@ def _find_sharing(
     is_corner: wp.array2d(dtype=wp.bool),
     keys: wp.array(dtype=wp.int32),
     width: int,
-    across: int,
+    supersampling: int,
     run: int,
     # out
     firsts: wp.array2d(dtype=wp.int32),
@@ -67,14 +92,15 @@ def _find_sharing(
     """A thread owns a run of pixels of a row.
 
     A sample gets the first sample with which it shares a receiver, −1 if its receivers are vertices, or −2 − t in a
-    triangle t; and the weights of its receivers. A corner of squares is shared by those of its pixel that see its body.
+    triangle t; and the weights of its receivers. A corner of squares is shared by the samples of its pixel that see its
+    body.
     """
     view, thread = wp.tid()
-    pixels = width // across
+    pixels = width // supersampling
     height = sides.shape[1] // width
     row = thread * run // pixels
     for column in range(thread * run - row * pixels, (thread + 1) * run - row * pixels):
-        corner = (row * width + column) * across
+        corner = (row * width + column) * supersampling
         size = int(0)
         square = int(0)
         square_key = int(-1)
@@ -87,15 +113,15 @@ def _find_sharing(
                 top = row & -size
                 left = column & -size
                 square = -2 - 2 * numbers[view, top, left]
-                square_key = keys[sides[view, sample_at(top, left, across, height, width)]]
-                wide = wp.min((left + size) * across, width - 1) - left * across
-                tall = wp.min((top + size) * across, height - 1) - top * across
+                square_key = keys[sides[view, sample_at(top, left, supersampling, height, width)]]
+                wide = wp.min((left + size) * supersampling, width - 1) - left * supersampling
+                tall = wp.min((top + size) * supersampling, height - 1) - top * supersampling
                 step = wp.vec2(1.0 / float(wp.max(wide, 1)), 1.0 / float(wp.max(tall, 1)))
-                low = float(across) * wp.vec2(float(column - left) * step[0], float(row - top) * step[1])
+                low = float(supersampling) * wp.vec2(float(column - left) * step[0], float(row - top) * step[1])
             if is_corner[view, corner]:
                 corner_key = keys[sides[view, corner]]
-        for i in range(across):
-            for j in range(across):
+        for i in range(supersampling):
+            for j in range(supersampling):
                 sample = corner + i * width + j
                 side = sides[view, sample]
                 weight = barycentrics[view, sample]
@@ -117,10 +143,16 @@ def _find_sharing(
                 elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
                     first = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
-                    for k in range(i * across + j):
-                        other = corner + k // across * width + k % across
+                    for k in range(i * supersampling + j):
+                        other = corner + k // supersampling * width + k % supersampling
                         if first == sample and sides[view, other] == side:
-                            first = other
+                            first = firsts[view, other]
+                        # (kernels evaluate both sides of "and")
+                        if points and first == sample and firsts[view, other] == other:  # noqa: SIM102
+                            if _is_one_surface(
+                                points[view, sample], normals[view, sample], points[view, other], normals[view, other]
+                            ):
+                                first = other
                 firsts[view, sample] = first
                 weights[view, sample] = weight
                 is_own = first == sample
@@ -130,7 +162,7 @@ def _find_sharing(
 
 
 @wp.kernel(enable_backward=False)
-def _see_own(
+def _see_fragments(
     # in
     sides: wp.array2d(dtype=wp.int32),
     firsts: wp.array2d(dtype=wp.int32),
@@ -143,7 +175,9 @@ def _see_own(
     own_sides: wp.array2d(dtype=wp.int32),
     samples: wp.array2d(dtype=wp.int32),
 ):
-    """A thread owns a run of samples. Receivers have numbers, or else a room each in those of their face's body."""
+    """A thread owns a run of samples.
+    Receivers have numbers, or else a room each among the receivers of their face's body.
+    """
     view, thread = wp.tid()
     for sample in range(thread * run, (thread + 1) * run):
         side = sides[view, sample]
@@ -167,21 +201,36 @@ def _see_own(
 
 
 @wp.func
-def _shares(firsts: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int):
-    """Whether a receiver at a first sample is at the mean of others, too: a corner of squares is not."""
-    return other == sample or (firsts[other] == sample and not is_corner)
+def _shares(
+    firsts: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.int32), is_corner: bool, sample: int, other: int
+):
+    """Whether a receiver at a first sample is at the mean of others, too, of its face: a corner of squares is not."""
+    return other == sample or (firsts[other] == sample and sides[other] == sides[sample] and not is_corner)
+
+
+@wp.func
+def _within(point: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentrics of a point in the plane of a face, negative beyond its edges."""
+    doubled_normal = wp.cross(b - a, c - a)
+    doubled = wp.max(wp.length_sq(doubled_normal), 1.0e-37)
+    v = wp.dot(wp.cross(a - c, point - c), doubled_normal) / doubled
+    w = wp.dot(wp.cross(b - a, point - a), doubled_normal) / doubled
+    return wp.vec3(1.0 - v - w, v, w)
 
 
 @wp.kernel(enable_backward=False)
 def _find_means(
     # in
+    points: wp.array2d(dtype=wp.vec3),
+    positions: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
     sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
     firsts: wp.array2d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     samples: wp.array2d(dtype=wp.int32),
     width: int,
-    across: int,
+    supersampling: int,
     # out
     seen_sides: wp.array2d(dtype=wp.int32),
     means: wp.array2d(dtype=wp.vec3),
@@ -199,13 +248,35 @@ def _find_means(
         if is_corner:
             at_corner = is_corner[view, sample]
         total = wp.vec3()
-        corner = (sample // width // across * width + sample % width // across) * across
-        for i in range(across * across):
-            other = corner + i // across * width + i % across
-            if _shares(firsts[view], at_corner, sample, other):
+        corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
+        for i in range(supersampling * supersampling):
+            other = corner + i // supersampling * width + i % supersampling
+            if _shares(firsts[view], sides[view], at_corner, sample, other):
                 total += barycentrics[view, other]
                 count += 1
         mean = total / float(count)
+        if points:
+            # the mean point of all faces that share, on that which has it, or is nearest to having it
+            middle = wp.vec3()
+            shared = int(0)
+            for i in range(supersampling * supersampling):
+                other = corner + i // supersampling * width + i % supersampling
+                if firsts[view, other] == sample:
+                    middle += points[view, other]
+                    shared += 1
+            if shared > count:
+                middle = middle / float(shared)
+                inside = float(-wp.inf)
+                for i in range(supersampling * supersampling):
+                    other = corner + i // supersampling * width + i % supersampling
+                    if firsts[view, other] == sample:
+                        face = faces[sides[view, other] % faces.shape[0]]
+                        weights = _within(middle, positions[face[0]], positions[face[1]], positions[face[2]])
+                        if wp.min(weights) > inside:
+                            inside = wp.min(weights)
+                            side = sides[view, other]
+                            mean = wp.max(weights, wp.vec3())
+                mean = mean / (mean[0] + mean[1] + mean[2])
     seen_sides[view, receiver] = side
     means[view, receiver] = mean
     counts[view, receiver] = count
@@ -214,12 +285,13 @@ def _find_means(
 @wp.kernel(enable_backward=False)
 def _find_means_adjoint(
     # in
+    sides: wp.array2d(dtype=wp.int32),
     firsts: wp.array2d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     samples: wp.array2d(dtype=wp.int32),
     counts: wp.array2d(dtype=wp.int32),
     width: int,
-    across: int,
+    supersampling: int,
     adj_means: wp.array2d(dtype=wp.vec3),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
@@ -232,10 +304,10 @@ def _find_means_adjoint(
         if is_corner:
             at_corner = is_corner[view, sample]
         adj = adj_means[view, receiver] / float(counts[view, receiver])
-        corner = (sample // width // across * width + sample % width // across) * across
-        for i in range(across * across):
-            other = corner + i // across * width + i % across
-            if _shares(firsts[view], at_corner, sample, other):
+        corner = (sample // width // supersampling * width + sample % width // supersampling) * supersampling
+        for i in range(supersampling * supersampling):
+            other = corner + i // supersampling * width + i % supersampling
+            if _shares(firsts[view], sides[view], at_corner, sample, other):
                 wp.atomic_add(adj_barycentrics, view, other, adj)
 
 
@@ -244,8 +316,9 @@ def find_sample_receivers(
     side_count: int,
     wants_samples: np.ndarray,
     bodies: np.ndarray,
-    across: int,
+    supersampling: int,
     quadtree: Quadtree | None = None,
+    surface: SeenSurface | None = None,
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
@@ -256,11 +329,13 @@ def find_sample_receivers(
         fragments: Sides that samples see, and barycentrics.
         side_count: Faces that receivers at vertices have.
         wants_samples: Faces whose samples have receivers, bool of shape [face].
-        bodies: Body of each face, −1 for those that need not be told apart, shape [face].
-        across: Samples of a pixel across and down.
+        bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
+        supersampling: Samples of a pixel across and down.
         quadtree: Squares at whose corners there are receivers; None for none.
+        surface: What samples see, of one instance, where those of a pixel share a receiver that see different faces
+            of one smooth surface, too; None where they do not.
 
-    Differentiable: barycentrics, in those that receivers see.
+    Differentiable: barycentrics, where receivers see them.
     """
     shape, device = fragments.face_ids.shape, fragments.face_ids.device
     sides, barycentrics = fragments.rows
@@ -272,12 +347,13 @@ def find_sample_receivers(
     firsts, own_sides = (wp.empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = wp.empty(sides.shape, dtype=wp.vec3, device=device)
     is_first = wp.empty(sides.shape, dtype=wp.bool, device=device)
-    run = run_length(device, width // across)
+    run = run_length(device, width // supersampling)
     launch(
         _find_sharing,
-        (view_count, sample_count // across**2 // run),
+        (view_count, sample_count // supersampling**2 // run),
         inputs=[
             sides,
+            *((surface.points, surface.normals) if surface else (None, None)),
             barycentrics,
             constant(wants_samples, wp.bool, device),
             sizes,
@@ -285,7 +361,7 @@ def find_sample_receivers(
             is_corner,
             keys,
             width,
-            across,
+            supersampling,
             run,
         ],
         outputs=[firsts, weights, is_first],
@@ -299,9 +375,9 @@ def find_sample_receivers(
         room = rooms[sides.numpy().ravel()[chosen] % len(bodies)]
         if quadtree is not None:
             # in tiles: light is found fastest where neighbors follow each other
-            tile = chosen // width // (TILE * across) * width + chosen % width // (TILE * across)
-            order = np.argsort(tile, kind="stable")
-            chosen, room = chosen[order], room[order]
+            tile = chosen // width // (TILE * supersampling) * width + chosen % width // (TILE * supersampling)
+            permutation = np.argsort(tile, kind="stable")
+            chosen, room = chosen[permutation], room[permutation]
         numbers_of_chosen, ends = _in_rooms(chosen // sample_count, room, view_count, len(names))
         numbers_of = np.empty(sides.size, np.int32)
         numbers_of[chosen] = numbers_of_chosen
@@ -311,19 +387,20 @@ def find_sample_receivers(
     samples = wp.full((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
     run = run_length(device, width)
     launch(
-        _see_own,
+        _see_fragments,
         (view_count, sample_count // run),
         inputs=[sides, firsts, is_first, numbers, constant(rooms, wp.int32, device), side_count, run],
         outputs=[own_sides, samples],
     )
     seen_sides, counts = (wp.empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
-    inputs = [sides, barycentrics, firsts, is_corner, samples, width, across]
+    on_surface = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
+    inputs = [*on_surface, sides, barycentrics, firsts, is_corner, samples, width, supersampling]
     means = differentiable(
         lambda means: launch(_find_means, samples.shape, inputs=inputs, outputs=[seen_sides, means, counts]),
         lambda adj_means: launch(
             _find_means_adjoint,
             samples.shape,
-            inputs=[firsts, is_corner, samples, counts, width, across, adj_means],
+            inputs=[sides, firsts, is_corner, samples, counts, width, supersampling, adj_means],
             outputs=[barycentrics.grad],
         ),
         result=wp.empty(samples.shape, dtype=wp.vec3, device=device),
@@ -355,16 +432,16 @@ def _in_rooms(view: np.ndarray, room: np.ndarray, view_count: int, room_count: i
     counts = np.bincount(part, minlength=view_count * room_count)
     ends = np.concatenate([[0], np.cumsum(counts.reshape(view_count, room_count).max(axis=0))])
     places = np.empty(len(part), int)
-    order = np.argsort(part, kind="stable")
-    places[order] = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
+    permutation = np.argsort(part, kind="stable")
+    places[permutation] = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
     return places + ends[room], ends
 
 
 def see_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:
-    """What some samples see: sides and barycentrics [view, sample], without a gradient.
+    """Fragments of some samples: sides and barycentrics [view, sample], without a gradient.
 
     Args:
-        fragments: What all see.
+        fragments: The fragments of all samples.
         samples: Which, int of shape [view, sample], −1 for none.
     """
     sides = rows(fragments.face_ids if fragments.sides is None else fragments.sides)

@@ -90,7 +90,7 @@ def relative_adjoint(position: wp.vec2, adj_relative: wp.vec3):
 
 @wp.func
 def volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """What a ray spans with two vertices each, given relative to it: all of one sign inside of the face abc."""
+    """Volumes spanned by a ray with two vertices each, given relative to it: all of one sign inside of the face abc."""
     return wp.vec3(b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0])
 
 

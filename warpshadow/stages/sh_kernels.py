@@ -86,9 +86,9 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
                 odd = Lane(0.0)
                 if m > 0:
                     odd = adj_coefficients[center - m]
-                around = wp.cw_mul(even, cosine) + wp.cw_mul(odd, sine)
-                adj_zonal[band] = adj_zonal[band] + wp.cw_mul(legendre, around)
-                adj_z += wp.cw_mul(zonal[band], wp.cw_mul(slope, around))
+                surrounding = wp.cw_mul(even, cosine) + wp.cw_mul(odd, sine)
+                adj_zonal[band] = adj_zonal[band] + wp.cw_mul(legendre, surrounding)
+                adj_z += wp.cw_mul(zonal[band], wp.cw_mul(slope, surrounding))
                 weight = float(m) * wp.cw_mul(zonal[band], legendre)
                 adj_x += wp.cw_mul(weight, wp.cw_mul(even, cosine_below) + wp.cw_mul(odd, sine_below))
                 adj_y += wp.cw_mul(weight, wp.cw_mul(odd, cosine_below) - wp.cw_mul(even, sine_below))
@@ -110,7 +110,7 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
 
 @wp.struct
 class ProductTable:
-    """Triple products: pairs (i, j) and values, those of k at first[k] … first[k+1]."""
+    """Triple products: pairs (i, j) and values, entries of k at first[k] … first[k+1]."""
 
     first: wp.array(dtype=wp.int32)
     pairs: wp.array(dtype=wp.vec2i)
@@ -125,7 +125,7 @@ def product_table(
     bands_of_k: int | None = None,
     symmetric: bool = False,
 ) -> ProductTable:
-    """Copy :func:`triple_products` to a device, those with k in the first ``bands_of_k`` bands, all by default."""
+    """Copy :func:`triple_products` to a device, entries with k in the first ``bands_of_k`` bands, all by default."""
     first, i, j, value = triple_products(order, bands_of_j, symmetric)
     table = ProductTable()
     table.first = wp.array(np.minimum(first, first[(bands_of_k or order) ** 2]).astype(np.int32), device=device)

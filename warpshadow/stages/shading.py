@@ -69,7 +69,7 @@ def _shade(
     # out
     shading: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver; chunks of coefficients reach the vector units, and those left over follow."""
+    """A thread owns a receiver; whole chunks of coefficients use the vector units, the remainder follows."""
     batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
     seen = instance_in(batch, transfer.shape[0])
     lit = instance_in(batch, light.shape[0])
@@ -132,7 +132,7 @@ def _shade_adjoint_light(
     # out
     adj_light: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a chunk of coefficients, the last one those left over, and a slab of receivers:  L̄ = Σ T s̄."""
+    """A thread owns a chunk of coefficients, the last one the remainder, and a slab of receivers:  L̄ = Σ T s̄."""
     row, batch, slab = wp.tid()
     chunk = first_row + row
     seen = instance_in(batch, transfer.shape[0])
@@ -170,14 +170,14 @@ def _channels(light: wp.array) -> wp.array:
     return channels
 
 
-def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -> wp.array:
+def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST) -> wp.array:
     """Light receivers: the radiance T · L of a white surface.
 
     Args:
         transfer: Transfer vectors, float32 of shape [batch, vertex, coefficient].
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
             Either batch may be 1 and then serves every instance of the other.
-        most: Largest magnitude of a coefficient.
+        maximum: Largest magnitude of a coefficient.
 
     Returns:
         Shading, vec3 of shape [batch, vertex].
@@ -185,7 +185,7 @@ def shade(transfer: wp.array, light: wp.array, *, most: float = check.LARGEST) -
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))
-    check.finite_arrays({"light": light}, most=most)
+    check.finite_arrays({"light": light}, maximum=maximum)
     for name, array in (("transfer", transfer), ("light", light)):
         if not array.is_contiguous:
             raise ValueError(f"{name}: got a strided array, expected a contiguous one")
@@ -297,7 +297,12 @@ def _shade_cells_adjoint(
 
 
 def shade_cells(
-    transmittance: wp.array, normals: wp.array, directions: np.ndarray, light: wp.array, *, most: float = check.LARGEST
+    transmittance: wp.array,
+    normals: wp.array,
+    directions: np.ndarray,
+    light: wp.array,
+    *,
+    maximum: float = check.LARGEST,
 ) -> wp.array:
     """Light receivers by known light in cells: Σ_q T_q max(n·ω_q, 0) (4/Q) L_q.
 
@@ -308,7 +313,7 @@ def shade_cells(
         normals: Unit normals n, vec3 of shape [batch, receiver].
         directions: Unit vectors ω, NumPy of shape [direction, 3].
         light: L, linear RGB, vec3 of shape [batch, direction]; its batch may be 1.
-        most: Largest magnitude of light.
+        maximum: Largest magnitude of light.
 
     Returns:
         Shading, vec3 of shape [batch, receiver].
@@ -319,7 +324,7 @@ def shade_cells(
     check_count("directions", count)
     check.shape("transmittance", transmittance.shape, (*normals.shape, count))
     check.shape("light", light.shape, ("batch", count))
-    check.finite_arrays({"light": light}, most=most)
+    check.finite_arrays({"light": light}, maximum=maximum)
     if not transmittance.is_contiguous:
         raise ValueError("transmittance: got a strided array, expected a contiguous one")
     if device.is_cpu:

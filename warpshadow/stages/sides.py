@@ -2,7 +2,8 @@
 
 An open surface shows both, and each has a light of its own: that of normals which point to where it is seen from. So
 sides have numbers. Of F faces, face f is side f from the front, and side F + f from behind; likewise vertex v of V is
-number v, with its normal, and number V + v, with the opposite one. The corners of side F + f are those of f, plus V.
+number v, with its normal, and number V + v, with the opposite one. The corners of side F + f are the corners of f, plus
+V.
 """
 
 from dataclasses import replace
@@ -105,7 +106,7 @@ def find_sides(
     """Find which side of its face each sample sees.
 
     Args:
-        fragments: What each sample sees, of shape [batch, height, width].
+        fragments: The fragments, of shape [batch, height, width].
         faces: Vertex indices, vec3i of shape [face].
         two_sided: The faces of which both sides can be seen, int32 of shape [item].
         positions: Vertices [scene units], vec3 of shape [batch, vertex].

@@ -36,7 +36,7 @@ from warpshadow.stages.screen import (
 )
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import NOTHING, Seen, edge_line, make_seen
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, edge_line, make_fragment_arrays
 
 LEAST_DISTANCE = 0.02
 """Distance of an edge [samples] below which rounding outweighs how color changes on the way to it."""
@@ -47,7 +47,7 @@ _COST = 20.0
 
 @wp.func
 def _slope_of_face(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positions: wp.array(dtype=wp.vec4)):
-    """Gradient by position, at a point of a face, of what has values at its corners.
+    """Gradient by position, at a point of a face, of an attribute of its corners.
 
     Barycentrics are to each other as the last components of these normals of the planes through the eye and an edge.
     """
@@ -74,7 +74,7 @@ def _pull(
     receiver_faces: wp.array(dtype=wp.vec3i),
     shading: wp.array2d(dtype=wp.vec3),
     albedo: wp.array2d(dtype=wp.vec3),
-    seen: Seen,
+    seen: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     edge_colors: wp.array3d(dtype=wp.vec4),
@@ -114,7 +114,7 @@ def _pull(
                     if has_neighbor(at, way, width, seen.height):
                         is_flat = is_flat and seen.face_ids[neighbor(at, way, width)] == face
                 rises = wp.vec2()
-                spans = wp.vec2()  # lengths over which those were measured [samples]
+                spans = wp.vec2()  # lengths over which the differences were measured [samples]
                 if not is_flat:
                     for way in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
@@ -162,12 +162,12 @@ def moving_radiance(
     """Radiance of samples of moving surfaces: :func:`warpshadow.stages.film.sample_radiance`, by mean slopes.
 
     Args:
-        fragments: What each sample sees, of faces of receivers.
+        fragments: The fragments, of faces of receivers.
         faces: Indices of receivers, vec3i of shape [face].
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
-        clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex].
+        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
 
     Returns:
@@ -198,7 +198,7 @@ def moving_radiance(
                 faces,
                 shading,
                 rows(albedo),
-                make_seen(silhouettes.fragments, silhouettes.faces, clip_positions),
+                make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
                 silhouettes.entries,
                 silhouettes.edges,
                 edge_colors,

@@ -1,4 +1,4 @@
-"""Sparse matrices that are multiplied with colors: what patches get of sources, sites of patches, patches of texels."""
+"""Sparse matrices multiplied with colors: patches from sources, receivers from patches, patches from texels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RUN = 32
 
 
 class Entries(NamedTuple):
-    """Entries of a sparse matrix, those of a row after one another."""
+    """Entries of a sparse matrix, row after row."""
 
     starts: wp.array  # [row + 1] int32
     columns: wp.array  # [entry] int32
@@ -84,7 +84,7 @@ def _multiply(
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a run of rows of an instance: their products, and what is added, which may be what they were."""
+    """A thread owns a run of rows of an instance: their products, added to a term, which may be the previous values."""
     row_count = starts.shape[0] - 1
     batch, thread = split_row(first_row + wp.tid(), (row_count + run - 1) // run)
     of_instance = values[batch]

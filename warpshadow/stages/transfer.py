@@ -16,7 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import (
     Chunk,
     as_chunks,
-    group_count,
+    block_count,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -47,7 +47,7 @@ wp.set_module_options({"max_unroll": 1})
 def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_group, dot, load, load_rows, store_rows = fn.find_group, fn.dot, fn.load, fn.load_rows, fn.store_rows
+    find_block, dot, load, load_rows, store_rows = fn.find_block, fn.dot, fn.load, fn.load_rows, fn.store_rows
     add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
@@ -66,7 +66,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers: the SH product of their visibility and clamped cosine."""
         row = first_row + wp.tid()
-        batch, group = find_group(row, normals.shape[1])
+        batch, group = find_block(row, normals.shape[1])
         place = scratch_place(worker, row)
         cosine = scratch[place, 0]
         for i in range(wp.static(order**2)):
@@ -94,7 +94,7 @@ def _sh_transfer_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
 def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_group, dot, load, load_rows = fn.find_group, fn.dot, fn.load, fn.load_rows
+    find_block, dot, load, load_rows = fn.find_block, fn.dot, fn.load, fn.load_rows
     add_rows, add_vectors = fn.add_rows, fn.add_vectors
     add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
@@ -117,7 +117,7 @@ def _sh_transfer_adjoint_kernel(order: int, is_shadowed: bool, lanes: int) -> wp
     ):
         """A thread owns a group of receivers. Γ is symmetric:  T = V * H  has  V̄ = H * T̄  and  H̄ = V * T̄."""
         row = first_row + wp.tid()
-        batch, group = find_group(row, normals.shape[1])
+        batch, group = find_block(row, normals.shape[1])
         place = scratch_place(worker, row)
         adj_row = scratch[place, 0]
         factor = scratch[place, 1]
@@ -172,7 +172,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     batch_count, vertex_count = normals.shape
     if visibility is not None:
         check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
-    row_count = batch_count * group_count(vertex_count, lanes)
+    row_count = batch_count * block_count(vertex_count, lanes)
     variables = [visibility, normals]
     scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = PRODUCT_COST * lanes * order**2 * bands**2
@@ -203,7 +203,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
 @functools.cache
 def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    find_group, load_rows, add_rows = fn.find_group, fn.load_rows, fn.add_rows
+    find_block, load_rows, add_rows = fn.find_block, fn.load_rows, fn.add_rows
     multiply = make_multiply(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -221,7 +221,7 @@ def _sh_product_kernel(order: int, lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers, to whose products it adds. Factors may have bands 0 … n' < n only."""
         row = first_row + wp.tid()
-        batch, group = find_group(row, products.shape[1])
+        batch, group = find_block(row, products.shape[1])
         place = scratch_place(worker, row)
         first = scratch[place, 0]
         second = scratch[place, 1]
@@ -257,7 +257,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     device = visibility.device
     lanes = lane_count(device)
     batch_count, vertex_count, _ = visibility.shape
-    row_count = batch_count * group_count(vertex_count, lanes)
+    row_count = batch_count * block_count(vertex_count, lanes)
 
     def add_product(first: wp.array, second: wp.array, table: ProductTable, total: wp.array) -> None:
         launch(

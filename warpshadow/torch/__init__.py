@@ -7,7 +7,7 @@ mesh included; an iteration is then a matrix product and a gather.
 from warpshadow.torch.autograd import apply
 from warpshadow.torch.cameras import clip_matrices_from_opengl
 from warpshadow.torch.mixed import MixedRenderer
-from warpshadow.torch.renderer import TorchRenderer
+from warpshadow.torch.renderer import LayerTensors, TorchRenderer
 from warpshadow.torch.rotations import rotation_matrices
 
-__all__ = ["MixedRenderer", "TorchRenderer", "apply", "clip_matrices_from_opengl", "rotation_matrices"]
+__all__ = ["LayerTensors", "MixedRenderer", "TorchRenderer", "apply", "clip_matrices_from_opengl", "rotation_matrices"]

@@ -1,4 +1,4 @@
-"""Arguments: tensors that become those of a function of Warp arrays, checked."""
+"""Arguments: check tensors, and pass them as Warp arrays."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
+from warpshadow.pipeline.merged_scene import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 
 
@@ -20,12 +20,12 @@ class Arguments:
 
     def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
         self.device = device
-        self._cameras = cameras  # a batch that there is beside those of tensors
+        self._cameras = cameras  # a batch beside the tensors' own
         self._has_batch = cameras is not None  # of results
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
-        self._bodies: dict[str, dict[str, Any]] = {}  # of geometries, those that move and those that are deformed
+        self._bodies: dict[str, dict[str, Any]] = {}  # of geometries: the moving ones and the deformed ones
 
     def add(
         self,
@@ -35,14 +35,14 @@ class Arguments:
         shape: tuple[int | str, ...],
         meaning: str = "",
         *,
-        said: str | None = None,
+        messages: str | None = None,
     ) -> None:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it.
 
-        Messages about it call it ``said``, by default its name.
+        Messages about it call it ``messages``, by default its name.
         """
         shape = (*shape, *item_shape(dtype))
-        _check_tensor(said or name, tensor, self.device, shape, meaning)
+        _check_tensor(messages or name, tensor, self.device, shape, meaning)
         has_batch = tensor.ndim > len(shape)
         self._has_batch |= has_batch
         self.names.append(name)
@@ -73,11 +73,11 @@ class Arguments:
 
     def arrays(self) -> dict[str, wp.array]:
         """The tensors as arrays, which require a gradient as they do."""
-        found = {}
+        result = {}
         for name, tensor, dtype in zip(self.names, self.tensors, self.dtypes, strict=True):
-            found[name] = as_array(tensor, dtype)
-            found[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
-        return found
+            result[name] = as_array(tensor, dtype)
+            result[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
+        return result
 
     def apply(self, function: Callable[[Mapping[str, wp.array]], Any], *, affine: Collection[str] = ()) -> Any:
         """Apply a function of arrays by their names, as :func:`~warpshadow.torch.apply` does.

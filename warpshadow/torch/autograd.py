@@ -6,13 +6,33 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import ParamSpec, TypeVar, overload
 
 import torch
 import warp as wp
 
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_call
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function that ``torch.compile`` leaves as it is: it launches Warp's kernels, which cannot be traced.
+
+    ``torch.compiler.disable`` would do at once, but imports the compiler, for more than a second.
+    """
+
+    @functools.wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():  # only while this very line is traced
+            return torch.compiler.disable(called)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    # code of its own, since the compiler gives up on code of which it has compiled eight variants
+    called.__code__ = called.__code__.replace(co_name=function.__name__)  # type: ignore[attr-defined]
+    return called
 
 
 @overload
@@ -37,6 +57,7 @@ def apply(
 ) -> torch.Tensor: ...
 
 
+@uncompiled
 def apply(
     function: Callable[..., wp.array | tuple[wp.array, ...]],
     *tensors: torch.Tensor,
@@ -48,13 +69,13 @@ def apply(
     """Apply a differentiable function of Warp arrays to tensors.
 
     Args:
-        function: Takes an array for each tensor and returns an array, or a tuple of them; what it launches is recorded
-            on a tape of this thread's if a tensor requires a gradient.
+        function: Takes an array for each tensor and returns an array, or a tuple of them; its launches are recorded on
+            a tape of this thread's if a tensor requires a gradient.
         tensors: Float32; contiguous or not. Items of a dtype lie in the last dimensions: a [batch, vertex, 3] tensor
             is an array of vec3 of shape [batch, vertex].
         dtypes: Warp's dtype of each.
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
-        names: What messages call the tensors, by default ``tensors[0]`` and so on.
+        names: Names of the tensors in messages, by default ``tensors[0]`` and so on.
         affine: Names of tensors in each of which alone the function is affine.
 
     Returns:
@@ -85,7 +106,7 @@ def _let_waiting_threads_sleep() -> None:
     the threads of our own pool, they use up their share of the cores by spinning, and the thread that all wait for is
     the last to run: each operation on more than 32 768 numbers then takes tens of milliseconds. GNU's OpenMP spins for
     microseconds once it has more threads than there are cores (its manual, GOMP_SPINCOUNT). So it is given some that
-    sleep for good. No setting of torch changes; and what the environment says about waiting is left alone.
+    sleep for good. No setting of torch changes; and settings of the environment about waiting are left alone.
     """
     is_said = "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ
     if is_said or sys.platform != "linux" or not torch.backends.openmp.is_available():
@@ -107,7 +128,7 @@ def _let_waiting_threads_sleep() -> None:
 def as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
     array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
-    if not tensor.is_inference():  # a renderer on a GPU knows by it what has not been written to
+    if not tensor.is_inference():  # by it a renderer on a GPU knows which arrays have not been written to
         array.origin, array.version = tensor if tensor._base is None else tensor._base, tensor._version
     return array
 
@@ -132,7 +153,7 @@ class _Call:
             if direction is None:
                 continue
             if name not in self.affine:
-                known = ", ".join(each for each in self.names if each in self.affine)
+                known = ", ".join(item for item in self.names if item in self.affine)
                 raise NotImplementedError(
                     f"{name}: got asked for a second derivative (create_graph=True, hessian or functional.jvp), "
                     f"expected one of first order{f'; of second order there are those of {known}' if known else ''}"
@@ -144,9 +165,9 @@ class _Call:
 
     def _at(self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The results where one tensor has another value."""
-        given = [*tensors[:number], value, *tensors[number + 1 :]]
-        wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in given)
-        return _WarpFunction.apply(self, wants, *given)
+        arguments = [*tensors[:number], value, *tensors[number + 1 :]]
+        wants = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in arguments)
+        return _WarpFunction.apply(self, wants, *arguments)
 
 
 class _Playback:
@@ -156,7 +177,7 @@ class _Playback:
         self._tape, self._arguments, self._results, self._is_played = tape, arguments, results, False
 
     def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
-        """The gradient to each argument, given those of the results; None where it requires none."""
+        """The gradient to each argument, given the results' gradients; None where it requires none."""
         with one_call, _current_stream(adjoints[0].device), unrecorded():
             if self._is_played:  # before, gradients are zero
                 self._tape.zero()
@@ -204,26 +225,28 @@ class _WarpAdjoint(torch.autograd.Function):
     """Gradients that may be differentiated again: d⟨v, Jᵀa⟩ = d⟨a, J v⟩, and J v of an affine function is one call."""
 
     @staticmethod
-    def forward(ctx, call: _Call, playback: _Playback, count: int, *given: torch.Tensor):
+    def forward(ctx, call: _Call, playback: _Playback, count: int, *arguments: torch.Tensor):
         ctx.call, ctx.count = call, count
-        ctx.save_for_backward(*given)
+        ctx.save_for_backward(*arguments)
         ctx.set_materialize_grads(False)
-        return playback.gradients(given[count:])
+        return playback.gradients(arguments[count:])
 
     @staticmethod
     def backward(ctx, *directions: torch.Tensor | None):
         creates_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             # seen anew, so that a path from one of them to another is not followed here
-            given = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
-            changes = ctx.call.moved(given[: ctx.count], directions)
-            pairs = zip(given[ctx.count :], changes, strict=True)
+            arguments = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
+            changes = ctx.call.moved(arguments[: ctx.count], directions)
+            pairs = zip(arguments[ctx.count :], changes, strict=True)
             total = torch.stack([(adjoint * change).sum() for adjoint, change in pairs]).sum()
-            wanted = [tensor for tensor in given if tensor.requires_grad] if total.requires_grad else []
-            found = iter(
-                torch.autograd.grad(total, wanted, create_graph=creates_graph, allow_unused=True) if wanted else ()
+            requested = [tensor for tensor in arguments if tensor.requires_grad] if total.requires_grad else []
+            result = iter(
+                torch.autograd.grad(total, requested, create_graph=creates_graph, allow_unused=True)
+                if requested
+                else ()
             )
-        gradients = [next(found, None) if tensor.requires_grad else None for tensor in given]
+        gradients = [next(result, None) if tensor.requires_grad else None for tensor in arguments]
         return None, None, None, *gradients
 
 

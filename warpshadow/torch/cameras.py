@@ -3,15 +3,16 @@
 import torch
 
 from warpshadow import check
-from warpshadow.torch.autograd import check_float32
+from warpshadow.torch.autograd import check_float32, uncompiled
 
 _ROUNDING = 1e-3  # of a matrix's rows, as a part of their length: float32, where the far plane is far away
 
 
+@uncompiled
 def clip_matrices_from_opengl(matrices: torch.Tensor) -> torch.Tensor:
     """Convert maps from world to clip space of OpenGL and nvdiffrast: y up, z/w from −1 at the near plane to 1.
 
-    Images are then ours, row 0 on top; those of nvdiffrast begin at the bottom.
+    Images are then ours, row 0 on top; nvdiffrast's begin at the bottom.
 
     Args:
         matrices: Projection times view, perspectives that multiply column vectors, [4, 4] or [batch, 4, 4].
@@ -20,7 +21,7 @@ def clip_matrices_from_opengl(matrices: torch.Tensor) -> torch.Tensor:
         The same cameras, near planes included, as :meth:`TorchRenderer.forward` takes them, of the same shape.
 
     Raises:
-        ValueError: for those without perspective, or whose near plane is not at z/w = −1, such as Direct3D's.
+        ValueError: for matrices without perspective, or whose near plane is not at z/w = −1, such as Direct3D's.
 
     Differentiable: matrices, but for the near plane.
     """

@@ -2,8 +2,8 @@
 
 Meshes that differ have other faces and other spheres, and a launch works on one scene. So each scene has a renderer of
 its own, which is called once, with all images of its scene. The other way would be a scene of all bodies, of which each
-instance puts away those that it does not show. Measured on 64 images of 64 × 64 pixels, of eight shapes that move, on
-two busy cores, in ms of CPU time an image, and the most memory that the process had:
+instance hides the ones it does not show. Measured on 64 images of 64 × 64 pixels, of eight shapes that move, on two
+busy cores, in ms of CPU time an image, and the most memory that the process had:
 
                                  forward    forward and backward    memory
     image by image               12.3       24.8                    1.1 GB
@@ -23,9 +23,9 @@ import torch
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.pipeline.assembly import Geometry, as_geometry
+from warpshadow.pipeline.merged_scene import Geometry, as_geometry
 from warpshadow.scene.scene import BodyLike, PerBody
-from warpshadow.torch.autograd import check_float32
+from warpshadow.torch.autograd import check_float32, uncompiled
 from warpshadow.torch.renderer import TorchRenderer
 
 
@@ -38,17 +38,17 @@ class _Placed(list[Geometry[torch.Tensor] | None]):
 class MixedRenderer(torch.nn.Module):
     """Render batches whose images are of different scenes.
 
-    ``which`` says of which scene each image is. The other arguments are those of a
-    :class:`~warpshadow.torch.TorchRenderer`, with an item for each image; what has no batch dimension, or one of 1,
-    serves all. Scenes may have different bodies: a dimension of bodies is as long as the scene with the most needs it,
-    one of vertices as the mesh with the most, and each scene reads what comes first. The rest is padding, whose
-    gradient is 0: ``torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)`` makes it.
+    ``which`` says of which scene each image is. The other arguments are as for a
+    :class:`~warpshadow.torch.TorchRenderer`, with an item for each image; an argument without a batch dimension, or
+    with one of 1, serves all. Scenes may have different bodies: a dimension of bodies is as long as the scene with the
+    most needs it, one of vertices as the mesh with the most, and each scene reads the first items. The rest is padding,
+    whose gradient is 0: ``torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)`` makes it.
 
     Args:
         renderers: One for each scene, of one basis, device, image size and near plane.
 
     Attributes:
-        renderers: The same, as a ``torch.nn.ModuleList``. Each keeps what it finds of its scene.
+        renderers: The same, as a ``torch.nn.ModuleList``. Each caches the results of its scene.
 
     It is moved, copied, pickled and saved as its renderers are, and has no parameters.
     """
@@ -62,13 +62,13 @@ class MixedRenderer(torch.nn.Module):
             {key: body.mesh.vertex_count for number, body in enumerate(scene.bodies) for key in (number, body.called)}
             for scene in scenes
         ]
-        self._most_vertices: dict[BodyLike, int] = {}  # of what has a number or a name
+        self._most_vertices: dict[BodyLike, int] = {}  # of items with a number or a name
         for counts in self._vertex_counts:
             self._most_vertices |= {key: max(n, self._most_vertices.get(key, 0)) for key, n in counts.items()}
 
     @property
     def basis(self) -> Basis:
-        """What free light is expressed in."""
+        """Basis of free light."""
         return self._renderer(0).basis
 
     @property
@@ -76,6 +76,7 @@ class MixedRenderer(torch.nn.Module):
         """Where its tensors are."""
         return self._renderer(0).device
 
+    @uncompiled
     def forward(
         self,
         which: torch.Tensor | Sequence[int],
@@ -90,29 +91,29 @@ class MixedRenderer(torch.nn.Module):
 
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch]. The host reads them: best on a CPU.
-            light: As of a TorchRenderer; what is left out is each scene's own.
+            light: As of a TorchRenderer; a missing one is each scene's own.
             albedo: Likewise: a list for as many bodies as the scene with the most has, or a mapping by numbers or
                 names. A scene passes over bodies that it has not.
             textures: Likewise.
-            geometry: From :meth:`placed` with the same ``which``; or a list of what the renderers' own ``placed`` made,
-                for each scene that of its images, in their order, None where it has no image.
+            geometry: From :meth:`placed` with the same ``which``; or a list of the results of the renderers' own
+                ``placed``, for each scene that of its images, in their order, None where it has no image.
             clip_matrices: As of a TorchRenderer; any of the renderers composes them.
 
         Returns:
-            Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: what the renderer of
-            each scene returns for its images.
+            Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: the images of the
+            renderers of each scene.
 
         Differentiable: light, albedo, textures, geometry, clip_matrices.
         """
         batch = _Batch(which, len(self.renderers))
         lights, cameras = batch.split("light", light, 2), batch.split("clip_matrices", clip_matrices, 2)
         colors = {
-            body: batch.split(f"albedo[{body!r}]", self._checked_colors(body, given), 2)
-            for body, given in self._by_body("albedo", albedo).items()
+            body: batch.split(f"albedo[{body!r}]", self._checked_colors(body, arguments), 2)
+            for body, arguments in self._by_body("albedo", albedo).items()
         }
         maps = {
-            body: batch.split(f"textures[{body!r}]", given, 3)
-            for body, given in self._by_body("textures", textures).items()
+            body: batch.split(f"textures[{body!r}]", arguments, 3)
+            for body, arguments in self._by_body("textures", textures).items()
         }
         geometries = batch.of_scenes(geometry)
         drawn = {}
@@ -127,6 +128,7 @@ class MixedRenderer(torch.nn.Module):
             )
         return batch.join(drawn)
 
+    @uncompiled
     def placed(
         self,
         which: torch.Tensor | Sequence[int],
@@ -135,6 +137,7 @@ class MixedRenderer(torch.nn.Module):
         scales: torch.Tensor | None = None,
         *,
         moving: Iterable[BodyLike] | None = None,
+        pivot: str | None = None,
     ) -> list[Geometry[torch.Tensor] | None]:
         """Place the bodies of each image in the world.
 
@@ -145,6 +148,8 @@ class MixedRenderer(torch.nn.Module):
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scenes'.
             moving: Bodies that the poses move, as of a TorchRenderer; a scene passes over those that it has not.
+            pivot: "center" for rotations about the middle of each body, as of a TorchRenderer; None for the origin of
+                its own space.
 
         Returns:
             For each scene the geometry of its images, None where it has none.
@@ -152,49 +157,58 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: rotations, translations, scales.
         """
         batch = _Batch(which, len(self.renderers))
-        given = {"rotations": (rotations, (3, 3)), "translations": (translations, (3,)), "scales": (scales, ())}
-        poses = [batch.split(name, self._checked_poses(name, *each), 1 + len(each[1])) for name, each in given.items()]
+        arguments = {"rotations": (rotations, (3, 3)), "translations": (translations, (3,)), "scales": (scales, ())}
+        poses = [
+            batch.split(name, self._checked_poses(name, *entry), 1 + len(entry[1])) for name, entry in arguments.items()
+        ]
         bodies = None if moving is None else self._known("moving", moving)
         geometries = _Placed([None] * len(self.renderers))
         if any(
-            tensor is not None and tensor.ndim > 1 + len(item) and len(tensor) > 1 for tensor, item in given.values()
+            tensor is not None and tensor.ndim > 1 + len(item) and len(tensor) > 1
+            for tensor, item in arguments.values()
         ):
             geometries.which = batch.numbers
         for scene in batch.rows:
             renderer, counts = self._renderer(scene), self._vertex_counts[scene]
             R, t, s = (_cut(of(scene), n, len(renderer.scene.bodies)) for of, n in zip(poses, (3, 2, 1), strict=True))
             moved = None if bodies is None else [body for body in bodies if body in counts]
-            geometries[scene] = renderer.placed(R, t, s, moving=moved)
+            geometries[scene] = renderer.placed(R, t, s, moving=moved, pivot=pivot)
         return geometries
 
-    def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The bodies' poses, as copies; ``poses[which]`` are those of images, as :meth:`placed` takes them.
+    @uncompiled
+    def scene_poses(self, *, pivot: str | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The bodies' poses, as copies; ``poses[which]`` are the poses of images, as :meth:`placed` takes them.
+
+        Args:
+            pivot: As for :meth:`placed`.
 
         Returns:
             Rotations [scene, body, 3, 3], translations [scene, body, 3] and scales [scene, body], for as many bodies as
-            the scene with the most has; those that others have not stand as they are modeled.
+            the scene with the most has; bodies that a scene lacks stand as they are modeled.
         """
         scene_count, body_count = len(self.renderers), self._body_count
         rotations = torch.eye(3, device=self.device).repeat(scene_count, body_count, 1, 1)
         translations = torch.zeros(scene_count, body_count, 3, device=self.device)
         scales = torch.ones(scene_count, body_count, device=self.device)
         for scene in range(scene_count):
-            own = self._renderer(scene).scene_poses()
+            own = self._renderer(scene).scene_poses(pivot=pivot)
             for all_poses, poses in zip((rotations, translations, scales), own, strict=True):
                 all_poses[scene, : len(poses)] = poses
         return rotations, translations, scales
 
+    @uncompiled
     def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The cameras, as copies; ``cameras[which]`` are those of images, as :meth:`clip_matrices` takes them.
+        """The cameras, as copies; ``cameras[which]`` are the cameras of images, as :meth:`clip_matrices` takes them.
 
         Returns:
             Rotations [scene, 3, 3] and translations [scene, 3] from the world to the camera (OpenCV's axes), and
             intrinsics [scene, 3, 3].
         """
         cameras = (self._renderer(scene).scene_cameras() for scene in range(len(self.renderers)))
-        R, t, K = (torch.stack(each) for each in zip(*cameras, strict=True))
+        R, t, K = (torch.stack(item) for item in zip(*cameras, strict=True))
         return R, t, K
 
+    @uncompiled
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:
@@ -213,44 +227,46 @@ class MixedRenderer(torch.nn.Module):
             check.choice(argument, body, self._most_vertices)
         return known
 
-    def _by_body(self, argument: str, given: PerBody[torch.Tensor] | None) -> dict[Any, torch.Tensor]:
-        """What is given for bodies, by their numbers or names."""
-        if given is None:
+    def _by_body(self, argument: str, arguments: PerBody[torch.Tensor] | None) -> dict[Any, torch.Tensor]:
+        """Arguments for bodies, by their numbers or names."""
+        if arguments is None:
             return {}
-        if isinstance(given, Mapping):
-            self._known(argument, given)
-            pairs = given.items()
+        if isinstance(arguments, Mapping):
+            self._known(argument, arguments)
+            pairs = arguments.items()
         else:
             check.instance(
-                argument, given, (list, tuple), f"a list of {self._body_count} items, or a mapping by bodies"
+                argument, arguments, (list, tuple), f"a list of {self._body_count} items, or a mapping by bodies"
             )
-            if len(given) != self._body_count:
+            if len(arguments) != self._body_count:
                 raise ValueError(
-                    f"{argument}: got {len(given)} items, expected {self._body_count}, "
+                    f"{argument}: got {len(arguments)} items, expected {self._body_count}, "
                     "one for each body of the scene with the most"
                 )
-            pairs = dict(enumerate(given)).items()
+            pairs = dict(enumerate(arguments)).items()
         return {body: tensor for body, tensor in pairs if tensor is not None}
 
-    def _checked_colors(self, body: BodyLike, given: torch.Tensor) -> torch.Tensor:
+    def _checked_colors(self, body: BodyLike, arguments: torch.Tensor) -> torch.Tensor:
         """Colors of a body, padded where they are one for each vertex."""
-        name, most = f"albedo[{body!r}]", self._most_vertices[body]
-        check_float32(name, given)
-        if given.ndim > 1 and given.shape[-2] != 1:
-            shape = ("batch", most, 3) if given.ndim > 2 else (most, 3)
-            check.shape(name, tuple(given.shape), shape, f"or one color; the mesh with the most vertices has {most}")
-        return given
+        name, maximum = f"albedo[{body!r}]", self._most_vertices[body]
+        check_float32(name, arguments)
+        if arguments.ndim > 1 and arguments.shape[-2] != 1:
+            shape = ("batch", maximum, 3) if arguments.ndim > 2 else (maximum, 3)
+            check.shape(
+                name, tuple(arguments.shape), shape, f"or one color; the mesh with the most vertices has {maximum}"
+            )
+        return arguments
 
-    def _checked_poses(self, name: str, given: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
+    def _checked_poses(self, name: str, arguments: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
         """Poses of as many bodies as the scene with the most has."""
-        if given is None:
+        if arguments is None:
             return None
-        check_float32(name, given)
+        check_float32(name, arguments)
         shape = self._body_count, *item
-        has_batch = given.ndim > len(shape)
+        has_batch = arguments.ndim > len(shape)
         meaning = "for as many bodies as the scene with the most has"
-        check.shape(name, tuple(given.shape), ("batch", *shape) if has_batch else shape, meaning)
-        return given
+        check.shape(name, tuple(arguments.shape), ("batch", *shape) if has_batch else shape, meaning)
+        return arguments
 
 
 class _Batch:
@@ -267,21 +283,21 @@ class _Batch:
         for row, scene in enumerate(numbers):
             self.rows.setdefault(scene, []).append(row)
 
-    def split(self, name: str, given: Any, ndim: int) -> Callable[[int], Any]:
-        """What the images of a scene are given: all that serves every image, or their items of a batch.
+    def split(self, name: str, arguments: Any, ndim: int) -> Callable[[int], Any]:
+        """The arguments of the images of a scene: all that serve every image, or their items of a batch.
 
         Args:
-            name: What messages call it.
-            given: A tensor; anything else is given to all.
+            name: Its name in messages.
+            arguments: A tensor; anything else is given to all.
             ndim: Dimensions of an item.
         """
-        if not isinstance(given, torch.Tensor) or given.ndim <= ndim or len(given) == 1:
-            return lambda scene: given
-        if len(given) != self.count:
-            raise ValueError(f"{name}: got a batch of {len(given)}, expected 1 or {self.count}, as which has")
+        if not isinstance(arguments, torch.Tensor) or arguments.ndim <= ndim or len(arguments) == 1:
+            return lambda scene: arguments
+        if len(arguments) != self.count:
+            raise ValueError(f"{name}: got a batch of {len(arguments)}, expected 1 or {self.count}, as which has")
         if len(self.rows) == 1:
-            return lambda scene: given
-        items = given.unbind()  # once: the gradient of a choice of items is as large as the whole
+            return lambda scene: arguments
+        items = arguments.unbind()  # once: the gradient of a choice of items is as large as the whole
         return lambda scene: torch.stack([items[row] for row in self.rows[scene]])
 
     def of_scenes(
@@ -299,9 +315,9 @@ class _Batch:
                 f"geometry: got that of placed with which = {check.described([*geometry.which])}, expected that of the "
                 f"same which, {check.described([*self.numbers])}: its poses are those of images in their order"
             )
-        for scene, given in enumerate(geometry):
+        for scene, arguments in enumerate(geometry):
             count = len(self.rows.get(scene, ()))
-            got = 0 if given is None else _instances(as_geometry(f"geometry[{scene}]", given))
+            got = 0 if arguments is None else _instances(as_geometry(f"geometry[{scene}]", arguments))
             if got != count and not (got == 1 and count):
                 raise ValueError(
                     f"geometry[{scene}]: got {got} instances, expected {count}, as many images as which has of the "
@@ -324,32 +340,32 @@ def _instances(geometry: Geometry[torch.Tensor]) -> int:
     return len(geometry.positions) if geometry.positions.ndim > 2 else 1
 
 
-def _cut(given: Any, ndim: int, count: int) -> Any:
+def _cut(arguments: Any, ndim: int, count: int) -> Any:
     """Without padding: the first items of the dimension that begins the last ``ndim``, unless one item serves all."""
-    if given is None or given.ndim < ndim or given.shape[-ndim] == 1:
-        return given
-    return given.narrow(-ndim, 0, count)
+    if arguments is None or arguments.ndim < ndim or arguments.shape[-ndim] == 1:
+        return arguments
+    return arguments.narrow(-ndim, 0, count)
 
 
 def _alike(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     """Renderers whose images are a batch, checked."""
     check.instance("renderers", renderers, Iterable, "a list of TorchRenderers, one for each scene")
-    given = list(renderers)
-    if not given:
+    arguments = list(renderers)
+    if not arguments:
         raise ValueError("renderers: got none, expected at least one")
-    for number, renderer in enumerate(given):
+    for number, renderer in enumerate(arguments):
         name = f"renderers[{number}]"
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
         if renderer.warp.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
-        got, expected = _described(renderer), _described(given[0])
-        if got != expected or not _is_same(renderer.basis, given[0].basis):
+        got, expected = _described(renderer), _described(arguments[0])
+        if got != expected or not _is_same(renderer.basis, arguments[0].basis):
             raise ValueError(f"{name}: got {got}, expected {expected}, as the first has")
-    return given
+    return arguments
 
 
 def _described(renderer: TorchRenderer) -> str:
-    """What renderers have in common whose images are a batch."""
+    """Shared by renderers whose images are a batch."""
     camera, basis = renderer.cameras[0], renderer.basis
     return (
         f"{camera.width} × {camera.height} pixels, near = {camera.near:g}, {renderer.device}, and a "

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,39 +13,65 @@ from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.assembly import GEOMETRY_DTYPES, Geometry
 from warpshadow.pipeline.explain import Explanation
+from warpshadow.pipeline.merged_scene import GEOMETRY_DTYPES, Geometry
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments
+from warpshadow.torch.autograd import uncompiled
 from warpshadow.tuning.renderer import Renderer
+
+
+class LayerTensors(NamedTuple):
+    """Layers of images beside color, with a batch dimension before the others where images have one."""
+
+    depth: torch.Tensor
+    """Distance along the view [scene units] at pixel centers, 0 where nothing is; [height, width]."""
+    normals: torch.Tensor
+    """Unit normals in the world at pixel centers, towards the camera's side of open surfaces; [height, width, 3]."""
+    bodies: torch.Tensor
+    """Number of the body at pixel centers, from 0, −1 for none; int32 of [height, width]. Not differentiable."""
+    masks: torch.Tensor
+    """Part of each pixel that each body covers; [body, height, width]."""
+
+    @property
+    def coverage(self) -> torch.Tensor:
+        """Part of each pixel that any body covers, the alpha of the image; [height, width]."""
+        return self.masks.sum(dim=-3)
 
 
 class TorchRenderer(torch.nn.Module):
     """Render a scene whose light, reflectance, geometry and camera are tensors.
 
-    Tensors are float32 on the renderer's device. What has no batch dimension, or one of 1, serves every instance.
+    Tensors are float32 on the renderer's device. One without a batch dimension, or with one of 1, serves all instances.
+    Images are linear RGB, premultiplied with coverage, and coverage, [height, width, 4], row 0 on top. Rotations are
+    matrices that take points of a mesh to the right-handed world, whose y is up: :func:`rotation_matrices` makes them
+    of axis-angle vectors in radians (``Body.rotation`` is in degrees). Cameras have OpenCV's axes.
 
     Args:
-        scene: The scene; what a call is not given is taken from it.
+        scene: The scene; arguments that a call omits are taken from it.
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
             batch.
         device: Device of the tensors and the kernels.
-        basis: What free light is expressed in: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for what the
-            scene's method computes in.
+        basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
+            the scene's method.
         progress: Show progress where something takes longer than a second.
 
     Attributes:
         warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
 
+    Functions under ``torch.compile`` may call it: it and the functions of this package run as they are, between parts
+    that are compiled, so ``fullgraph=True`` refuses them.
+
     Threads may share it, and it can be copied and pickled, as :class:`warpshadow.Renderer` can. It has no parameters.
     ``to`` and ``cuda`` move it, which computes all anew there; ``half`` and ``double`` are refused. Its ``state_dict``
-    holds what tensors beside it refer to: the basis of the light, and the bodies with their numbers of vertices.
+    holds the meaning of tensors beside it: the basis of the light, and the bodies with their numbers of vertices.
     ``load_state_dict`` raises ValueError where they are others.
     """
 
+    @uncompiled
     def __init__(
         self,
         scene: Scene,
@@ -60,21 +86,21 @@ class TorchRenderer(torch.nn.Module):
 
     @property
     def scene(self) -> Scene:
-        """The scene; a method "auto" has been replaced by what was chosen."""
+        """The scene; a method "auto" has been replaced by the chosen one."""
         return self.warp.scene
 
     def extra_repr(self) -> str:
-        """What it renders, for its repr."""
+        """Its bodies and images, for its repr."""
         return repr(self.warp)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Those that see the scene."""
+        """The scene's cameras."""
         return self.warp.cameras
 
     @property
     def basis(self) -> Basis:
-        """What free light is expressed in."""
+        """Basis of free light."""
         return self.warp.basis
 
     @property
@@ -95,17 +121,18 @@ class TorchRenderer(torch.nn.Module):
         return super()._apply(fn, recurse)
 
     def get_extra_state(self) -> torch.Tensor:
-        """What tensors beside it refer to, for ``state_dict``: JSON as bytes, since some formats hold tensors alone."""
+        """Meaning of tensors beside it, for ``state_dict``: JSON as bytes, since some formats hold tensors alone."""
         bodies = [[body.called, body.mesh.vertex_count] for body in self.scene.bodies]
         meaning = {"basis": type(self.basis).__name__, "coefficients": self.basis.size, "bodies": bodies}
         return torch.tensor(list(json.dumps(meaning).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: torch.Tensor) -> None:
         """Raise ValueError unless a ``state_dict`` is of a renderer whose tensors mean the same."""
-        given, own = (bytes(each.tolist()).decode() for each in (state, self.get_extra_state()))
-        if given != own:
-            raise ValueError(f"state_dict: got that of a TorchRenderer with {given}, expected {own}")
+        stored, own = (bytes(item.tolist()).decode() for item in (state, self.get_extra_state()))
+        if stored != own:
+            raise ValueError(f"state_dict: got that of a TorchRenderer with {stored}, expected {own}")
 
+    @uncompiled
     @one_at_a_time
     def forward(
         self,
@@ -123,9 +150,9 @@ class TorchRenderer(torch.nn.Module):
                 [batch, coefficient, 3]; or known light, which is shaded more accurately than free light can be, by
                 default the scene's.
             albedo: Reflectance of bodies in linear RGB, one color [3], one for each vertex [vertex, 3], or either in a
-                batch, [batch, 1 or vertex, 3]: a list for all bodies, None for what the scene has, or a mapping for
-                some, by their numbers or names: ``{"bunny": color}``. Values above 1, which a Body refuses, are taken
-                as they are: free ones may pass 1 on their way.
+                batch, [batch, 1 or vertex, 3]: a list for all bodies, None for the scene's own, or a mapping for some,
+                by their numbers or names: ``{"bunny": color}``. Values above 1, which a Body refuses, are taken as they
+                are: free ones may pass 1 on their way.
             textures: Reflectance of bodies as images, [height, width, 3] or [batch, height, width, 3], which needs uvs;
                 a list or a mapping likewise.
             geometry: Vertices and spheres in world space, from :meth:`placed`; by default the scene's, which stand
@@ -141,16 +168,42 @@ class TorchRenderer(torch.nn.Module):
             to light, and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        given = self._given(light, albedo, textures, geometry, clip_matrices)
+        stored = self._given(light, albedo, textures, geometry, clip_matrices)
 
         def draw(arrays: Mapping[str, wp.array]) -> wp.array:
-            inputs = self._inputs(given, arrays, light)
+            inputs = self._inputs(stored, arrays, light)
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
             return self.warp.draw(**inputs, view=self.warp.view(*seen))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
-        return given.apply(draw, affine=[name for name in given.names if is_affine.get(name.partition("[")[0])])
+        return stored.apply(draw, affine=[name for name in stored.names if is_affine.get(name.partition("[")[0])])
 
+    @uncompiled
+    @one_at_a_time
+    def layers(
+        self, *, geometry: Geometry[torch.Tensor] | None = None, clip_matrices: torch.Tensor | None = None
+    ) -> LayerTensors:
+        """Find depth, normals, bodies and their masks: what images show beside color.
+
+        Args:
+            geometry, clip_matrices: As for :meth:`forward`.
+
+        Differentiable: geometry, clip_matrices. Depth and normals change as the surface at a pixel's center moves, and
+            have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
+            images have.
+        """
+        stored = self._given(None, None, None, geometry, clip_matrices)
+
+        def find(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
+            view = self.warp.view(stored.geometry("geometry", arrays), arrays.get("clip_matrices"))
+            result = self.warp.layer_arrays(view)
+            return (*result[:3], *result.masks)
+
+        depth, normals, bodies, *quartets = stored.apply(find)
+        masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
+        return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
+
+    @uncompiled
     @one_at_a_time
     def insert(
         self,
@@ -162,7 +215,7 @@ class TorchRenderer(torch.nn.Module):
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Render the bodies in a photograph of what the scene's shadow catchers stand for.
+        """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
@@ -177,13 +230,14 @@ class TorchRenderer(torch.nn.Module):
 
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        given = self._given(light, albedo, textures, geometry, clip_matrices)
+        stored = self._given(light, albedo, textures, geometry, clip_matrices)
         camera = self.cameras[0]
-        given.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
-        return given.apply(
-            lambda arrays: self.warp.insert(arrays["photograph"], **self._inputs(given, arrays, light)),
+        stored.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
+        return stored.apply(
+            lambda arrays: self.warp.insert(arrays["photograph"], **self._inputs(stored, arrays, light)),
         )
 
+    @uncompiled
     @one_at_a_time
     def explain(
         self,
@@ -194,9 +248,9 @@ class TorchRenderer(torch.nn.Module):
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
     ) -> Explanation:
-        """Say what a call with the same arguments computes and what it leaves out, as :meth:`Renderer.explain` does."""
-        given = self._given(light, albedo, textures, geometry, clip_matrices)
-        return self.warp.explain(**self._inputs(given, given.arrays(), light))
+        """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
+        stored = self._given(light, albedo, textures, geometry, clip_matrices)
+        return self.warp.explain(**self._inputs(stored, stored.arrays(), light))
 
     def _given(
         self,
@@ -208,50 +262,51 @@ class TorchRenderer(torch.nn.Module):
     ) -> Arguments:
         """The tensors among the arguments of a call, checked."""
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
-        given = Arguments(self.device, cameras=self.cameras if has_cameras else None)
+        stored = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
-            given.add("light", light, wp.vec3, (self.basis.size,), what)
+            stored.add("light", light, wp.vec3, (self.basis.size,), what)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            given.add_geometry("geometry", geometry, self.warp.rest())
+            stored.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            given.add("clip_matrices", clip_matrices, wp.mat44, ())
+            stored.add("clip_matrices", clip_matrices, wp.mat44, ())
         for number, tensor in enumerate(self.scene.per_body(albedo, "albedo")):
             if tensor is not None:
                 counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
                 shape = counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,)
-                given.add(f"albedo[{number}]", tensor, wp.vec3, shape, said=self._said("albedo", albedo, number))
+                stored.add(f"albedo[{number}]", tensor, wp.vec3, shape, messages=self._said("albedo", albedo, number))
         for number, tensor in enumerate(self.scene.per_body(textures, "textures")):
             if tensor is not None:
                 remedy = check.channels_last(np.shape(tensor))
-                said = self._said("textures", textures, number)
-                given.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, said=said)
-        return given
+                messages = self._said("textures", textures, number)
+                stored.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, messages=messages)
+        return stored
 
-    def _said(self, argument: str, given: PerBody[torch.Tensor] | None, number: int) -> str:
-        """What messages call an item for a body: by the name of the body where that was given."""
-        keys = given if isinstance(given, Mapping) else ()
+    def _said(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
+        """Name of an item for a body in messages: by the name of the body where that was given."""
+        keys = stored if isinstance(stored, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
 
     def _inputs(
         self,
-        given: Arguments,
+        stored: Arguments,
         arrays: Mapping[str, wp.array],
         light: torch.Tensor | EnvironmentMap | None,
     ) -> dict[str, Any]:
-        """What the renderer of arrays is given in place of tensors."""
+        """The array arguments of the renderer, in place of tensors."""
         bodies = range(len(self.scene.bodies))
         colors = [arrays.get(f"albedo[{number}]") for number in bodies]
         return {
             "light": arrays.get("light", light),
             "albedo": [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors],
             "textures": [arrays.get(f"textures[{number}]") for number in bodies],
-            "geometry": given.geometry("geometry", arrays),
+            "geometry": stored.geometry("geometry", arrays),
             "clip_matrices": arrays.get("clip_matrices"),
         }
 
+    @uncompiled
     @one_at_a_time
     def placed(
         self,
@@ -261,20 +316,24 @@ class TorchRenderer(torch.nn.Module):
         *,
         rest: Geometry[torch.Tensor] | None = None,
         moving: Iterable[BodyLike] | None = None,
+        pivot: str | torch.Tensor | None = None,
     ) -> Geometry[torch.Tensor]:
-        """Place the bodies in the world: x → s R x + t.
+        """Place the bodies in the world: x → s R (x − pivot) + t.
 
         Args:
             rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`, which takes
-                radians where a ``Body.rotation`` is in degrees. Entries of RᵀR
-                may differ from those of the identity by 0.05, which a step of 0.01 in each of the nine numbers leaves
-                them; to go on from there, ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
+                radians where a ``Body.rotation`` is in degrees. Entries of RᵀR may differ from the identity by 0.05,
+                which a step of 0.01 in each of the nine numbers leaves them; to go on from there,
+                ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
             moving: Bodies that the poses move, by number or name; None for any. The others stand where the scene has
-                them, without a gradient, and what is found out about them once is kept: so the shadows that they cast
-                on one another are those of their meshes. What ``rest`` deforms is among those that move.
+                them, without a gradient, and results about them are cached: so the shadows that they cast on one
+                another are their meshes' shadows. Bodies that ``rest`` deforms count as moving.
+            pivot: Point of each body's own space that it is turned about and that ``translations`` put in its place:
+                "center", the middle of its mesh's bounds, or points, [body, 3] or [batch, body, 3]; None for the
+                origin, which is the one of the mesh's file. ``scene_poses(pivot=…)`` are the poses to begin with.
 
         Returns:
             Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one; tensors of their
@@ -285,34 +344,45 @@ class TorchRenderer(torch.nn.Module):
         """
         count = len(self.scene.bodies)
         scales = self.scene_poses()[2] if scales is None else scales
-        given = Arguments(self.device)
+        stored = Arguments(self.device)
         remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
-        given.add("rotations", rotations, wp.mat33, (count,), remedy)
-        given.add("translations", translations, wp.vec3, (count,))
-        given.add("scales", scales, wp.float32, (count,))
-        given.expand()
+        stored.add("rotations", rotations, wp.mat33, (count,), remedy)
+        stored.add("translations", translations, wp.vec3, (count,))
+        stored.add("scales", scales, wp.float32, (count,))
+        if isinstance(pivot, torch.Tensor):
+            stored.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
+        stored.expand()
         if rest is not None:
-            given.add_geometry("rest", rest, self.warp.rest())
+            stored.add_geometry("rest", rest, self.warp.rest())
 
         def place(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
             poses = Poses(arrays["rotations"], arrays["translations"], arrays["scales"])
-            return self.warp.placed(poses, given.geometry("rest", arrays), moving=moving)
+            about = arrays.get("pivot", pivot)
+            return self.warp.placed(poses, stored.geometry("rest", arrays), moving=moving, pivot=about)
 
-        return given.apply_geometry(place)
+        return stored.apply_geometry(place)
 
-    def scene_poses(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    @uncompiled
+    def scene_poses(
+        self, *, pivot: str | torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The bodies' poses as :meth:`placed` takes them, as copies.
+
+        Args:
+            pivot: As for :meth:`placed`, without a batch: translations are then where the pivots are.
 
         Returns:
             Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body]. A
             ``Body.rotation`` is in degrees; :func:`rotation_matrices` takes radians.
         """
-        poses = self.warp.scene_poses()
+        points = pivot.detach().cpu().numpy() if isinstance(pivot, torch.Tensor) else pivot
+        poses = self.warp.scene_poses(pivot=points)
         rotations, translations, scales = (
             wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales)
         )
         return rotations, translations, scales
 
+    @uncompiled
     def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cameras as :meth:`clip_matrices` takes them, as copies; one camera has no batch.
 
@@ -322,10 +392,11 @@ class TorchRenderer(torch.nn.Module):
         """
         names = "rotation", "translation", "intrinsics"
         stacked = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
-        of_cameras = (torch.tensor(each, dtype=torch.float32, device=self.device) for each in stacked)
-        R, t, K = of_cameras if self.warp.has_camera_batch else (each[0] for each in of_cameras)
+        of_cameras = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked)
+        R, t, K = of_cameras if self.warp.has_camera_batch else (item[0] for item in of_cameras)
         return R, t, K
 
+    @uncompiled
     @one_at_a_time
     def deformed(
         self,
@@ -342,9 +413,9 @@ class TorchRenderer(torch.nn.Module):
             body: The body, its number or name.
             positions: Its vertices in its own space, [vertex, 3] or [batch, vertex, 3].
             centers: Its spheres' centers, [sphere, 3] or [batch, sphere, 3].
-            radii: Its spheres' radii, [sphere] or [batch, sphere].
-                What is None stays as it is in ``rest``; but its spheres follow its vertices, both centers and radii,
-                unless ``centers`` are given (:mod:`warpshadow.stages.bound_spheres`).
+            radii: Its spheres' radii, [sphere] or [batch, sphere]. An item None stays as it is in ``rest``; but its
+                spheres follow its vertices, both centers and radii, unless ``centers`` are given
+                (:mod:`warpshadow.stages.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are.
 
         Returns:
@@ -353,19 +424,20 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all.
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
-        given = Arguments(self.device)
+        stored = Arguments(self.device)
         for name, tensor in parts.items():
             if tensor is not None:
-                given.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
+                stored.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
         if rest is not None:
-            given.add_geometry("rest", rest, self.warp.rest())
+            stored.add_geometry("rest", rest, self.warp.rest())
 
         def exchange(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
             shape = {name: arrays.get(name) for name in parts}
-            return self.warp.deformed(body, **shape, rest=given.geometry("rest", arrays))
+            return self.warp.deformed(body, **shape, rest=stored.geometry("rest", arrays))
 
-        return given.apply_geometry(exchange)
+        return stored.apply_geometry(exchange)
 
+    @uncompiled
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes, as :meth:`Renderer.deformation_graph` does.
 
@@ -373,6 +445,7 @@ class TorchRenderer(torch.nn.Module):
         """
         return self.warp.deformation_graph(body, count=count)
 
+    @uncompiled
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:
@@ -389,12 +462,12 @@ class TorchRenderer(torch.nn.Module):
         Differentiable: all, so focal lengths and the principal point, too.
         """
         camera = self.cameras[0]
-        given = Arguments(self.device)
-        given.add("intrinsics", intrinsics, wp.mat33, ())
-        given.add("rotations", rotations, wp.mat33, ())
-        given.add("translations", translations, wp.vec3, ())
+        stored = Arguments(self.device)
+        stored.add("intrinsics", intrinsics, wp.mat33, ())
+        stored.add("rotations", rotations, wp.mat33, ())
+        stored.add("translations", translations, wp.vec3, ())
 
         def compose(arrays: Mapping[str, wp.array]) -> wp.array:
             return compose_clip_matrices(*arrays.values(), size=(camera.width, camera.height), near=camera.near)
 
-        return given.apply(compose)
+        return stored.apply(compose)

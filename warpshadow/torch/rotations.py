@@ -7,16 +7,17 @@ from warpshadow import check
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.stages import rotations
 from warpshadow.stages.rotations import Vec6
-from warpshadow.torch.autograd import apply, check_float32
+from warpshadow.torch.autograd import apply, check_float32, uncompiled
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 
 
+@uncompiled
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     """Make rotation matrices of free parameters, as :func:`warpshadow.stages.rotations.rotation_matrices` does.
 
     Args:
-        parameters: Shape [..., n], where n says what they are: 4, quaternions (x, y, z, w) of any length but 0; 3,
+        parameters: Shape [..., n], where n decides their meaning: 4, quaternions (x, y, z, w) of any length but 0; 3,
             axis-angle vectors [radians], smooth at 0; 6, the first two columns; 9, the rows of any matrix, whose
             nearest rotation is taken (``matrices.flatten(-2)``).
 
@@ -24,8 +25,8 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
         Rotations, shape [..., 3, 3].
 
     Raises:
-        ValueError: for another n, and for what is no rotation, as :func:`warpshadow.stages.rotations.rotation_matrices`
-            says.
+        ValueError: for another n, and for parameters without a rotation, as
+        :func:`warpshadow.stages.rotations.rotation_matrices` says.
 
     Differentiable: parameters.
     """

@@ -20,7 +20,7 @@ _MOSTLY = 0.5
 """Part of a pixel that bodies cover, above which it is theirs."""
 
 _TENTH = 0.1
-"""More of what is inserted than of the photograph may be white before that is remarked on."""
+"""Share of white pixels, more among the inserted bodies than in the photograph, above which a remark is made."""
 
 
 def insert(
@@ -31,7 +31,7 @@ def insert(
     device: wp.DeviceLike = "cpu",
     progress: bool = True,
 ) -> np.ndarray:
-    """Put the bodies of a scene into a photograph, with their shadows on what the shadow catchers stand for.
+    """Put the bodies of a scene into a photograph, with their shadows on the surfaces that the shadow catchers model.
 
     Where the photograph shows a catcher, it is multiplied by the ratio of the light that the catcher receives with the
     other bodies to that without them; these are drawn over it, with soft edges. See
@@ -60,9 +60,9 @@ def insert(
     height, width, _ = pixels.shape
     camera, gain = fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
     renderer = Renderer(for_picture(replace(scene, camera=camera)), device=device, progress=progress)
-    given = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
+    arguments = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
-        image: np.ndarray = renderer.insert(given).numpy()[0] * np.float32(gain)
+        image: np.ndarray = renderer.insert(arguments).numpy()[0] * np.float32(gain)
     drawn = [number for number in range(len(scene.bodies)) if number not in scene.catchers]
     if remark := _overexposure(image, pixels, renderer.layers().masks[drawn].sum(axis=0), exposure):
         check.warn(remark)

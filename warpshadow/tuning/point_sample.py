@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.spatial_sort import z_order_of_cells
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility
 from warpshadow.stages.normals import vertex_normals
@@ -29,7 +29,7 @@ class PointReceivers(NamedTuple):
     corners: np.ndarray
     """Receivers of each point, of shape [point, 3]."""
     weights: np.ndarray
-    """What each of them counts, of shape [point, 3]."""
+    """Weights of the corners, of shape [point, 3]."""
 
 
 class PointSample:
@@ -51,7 +51,7 @@ class PointSample:
         bodies: Body of each point, shape [point].
 
     Raises:
-        ValueError: where the camera sees nothing, or no light falls on what it sees.
+        ValueError: where the camera sees nothing, or no light falls on the visible surfaces.
     """
 
     def __init__(
@@ -70,18 +70,18 @@ class PointSample:
         self._direction_count = direction_count
         self._bounces = scene.bounces if bounces is None else bounces
         bare = replace(scene, visibility=Visibility(method="none"), supersampling=1, bounces=0)
-        stage = Renderer(bare, device=device)
+        stage = SceneRenderer(bare, device=device)
         self._view = stage.view()
         face_ids = self._view.fragments.face_ids.numpy()[0]
         chosen = _spread(face_ids >= 0, count, seed)
         if not len(chosen):
             raise ValueError("scene: the camera sees no body, expected one in the image")
         positions = stage.geometry().positions.numpy()[0]
-        normals = vertex_normals(stage.geometry().positions, stage.assembly.faces).numpy()[0]
+        normals = vertex_normals(stage.geometry().positions, stage.merged_scene.faces).numpy()[0]
         # the backs of vertices are numbered after them
         self._positions, self._normals = np.tile(positions, (2, 1)), np.concatenate([normals, -normals])
         self._sides, self._vertices, self._weights = seen_on_faces(self._view, chosen)
-        self.bodies = stage.assembly.body_of_face[face_ids.ravel()[chosen]]
+        self.bodies = stage.merged_scene.body_of_face[face_ids.ravel()[chosen]]
         self._scene = scene
         self._chosen = [body.receivers for body in stage.scene.bodies]
         if not self.truth.any():
@@ -104,7 +104,7 @@ class PointSample:
         return self.shading(scene)
 
     def decided(self, scene: Scene) -> Scene:
-        """A variant of the scene with what a renderer of the whole image chooses for receivers "auto"."""
+        """A variant of the scene with the receivers that a renderer of the whole image chooses for "auto"."""
         bodies = (
             replace(body, receivers=chosen) if body.receivers == AUTO else body
             for body, chosen in zip(scene.bodies, self._chosen, strict=True)
@@ -118,15 +118,17 @@ class PointSample:
             Linear RGB, float32 of shape [point, 3].
         """
         scene = self.decided(scene)
-        # it draws no image, so that what else a renderer prepares may be as small as can be
+        # it draws no image, so a renderer may prepare as little as possible
         glimpse = replace(scene.camera, width=1, height=1)
-        renderer = Renderer(scene, cameras=[glimpse], device=self.device, progress=self._progress)
+        renderer = SceneRenderer(scene, cameras=[glimpse], device=self.device, progress=self._progress)
         receivers = self.receivers([body.receivers for body in scene.bodies])
         sides = receivers.sides
-        order = np.argsort(renderer.assembly.body_of_face[sides % renderer.assembly.first_face[-1]], kind="stable")
+        permutation = np.argsort(
+            renderer.merged_scene.body_of_face[sides % renderer.merged_scene.first_face[-1]], kind="stable"
+        )
         shading = np.empty((len(sides), 3), np.float32)
-        view = renderer.on_faces(sides[order], receivers.barycentrics[order])
-        shading[order] = renderer.shade(view=view).numpy()[0]
+        view = renderer.on_faces(sides[permutation], receivers.barycentrics[permutation])
+        shading[permutation] = renderer.shade(view=view).numpy()[0]
         return np.einsum("pk,pkc->pc", receivers.weights, shading[receivers.corners])
 
     def receivers(self, of_bodies: Sequence[str]) -> PointReceivers:
@@ -150,7 +152,7 @@ class PointSample:
         return float(np.linalg.norm(shading - self.truth) / np.linalg.norm(self.truth))
 
     def interpolation_errors(self) -> np.ndarray:
-        """What interpolating between vertices adds to the error, the part of each body, of shape [body]."""
+        """Share of the error that interpolation between vertices adds, for each body, of shape [body]."""
         squares = ((self.interpolated_truth - self.truth) ** 2).sum(axis=1)
         sums = np.bincount(self.bodies, squares, minlength=len(self._scene.bodies))
         return np.sqrt(sums) / np.linalg.norm(self.truth)
@@ -167,10 +169,10 @@ def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarra
         Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered
         likewise, [point, 3]; and barycentric coordinates, [point, 3].
     """
-    fragments, assembly = view.fragments, view.assembly
+    fragments, merged_scene = view.fragments, view.merged_scene
     face_ids = fragments.face_ids.numpy()[0].ravel()[chosen]
     sides = face_ids if fragments.sides is None else fragments.sides.numpy()[0].ravel()[chosen]
-    vertices = assembly.faces.numpy()[face_ids] + assembly.first_vertex[-1] * (sides != face_ids)[:, None]
+    vertices = merged_scene.faces.numpy()[face_ids] + merged_scene.first_vertex[-1] * (sides != face_ids)[:, None]
     return sides, vertices, fragments.barycentrics.numpy()[0].reshape(-1, 3)[chosen]
 
 
@@ -200,7 +202,7 @@ def places_of_receivers(
 def _spread(mask: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Draw pixels of a mask [height, width], one from each of as many patches along a Z-order curve: flat indices."""
     rows, columns = np.nonzero(mask)
-    along = z_order_of_cells(np.stack([columns, rows], axis=-1))
-    count = min(count, len(along))
-    positions = (np.arange(count) + np.random.default_rng(seed).random(count)) * (len(along) / max(count, 1))
-    return np.ravel_multi_index((rows, columns), mask.shape)[along[positions.astype(int)]]
+    curve_order = z_order_of_cells(np.stack([columns, rows], axis=-1))
+    count = min(count, len(curve_order))
+    positions = (np.arange(count) + np.random.default_rng(seed).random(count)) * (len(curve_order) / max(count, 1))
+    return np.ravel_multi_index((rows, columns), mask.shape)[curve_order[positions.astype(int)]]

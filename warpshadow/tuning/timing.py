@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.progress import progress_bar
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.scene.scene import Scene
 from warpshadow.tuning.point_sample import places_of_receivers, seen_on_faces
 
@@ -26,9 +26,9 @@ def image_times(
 ) -> list[float]:
     """Estimate how long images take once kernels are compiled and renderers made.
 
-    The whole image is timed without shadows, once for each choice of receivers. What shadows add to that is timed on
-    TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them. Where light bounces, which takes time
-    for patches, too, whatever the receivers, whole images are timed.
+    The whole image is timed without shadows, once for each choice of receivers. The time of shadows is measured on
+    TIMED_RECEIVERS of the image's receivers, and extrapolated to all of them. Where light bounces, which takes time for
+    patches, too, for any number of receivers, whole images are timed.
 
     Args:
         scenes: Variants of a scene, which differ in visibility, spheres and receivers.
@@ -40,11 +40,11 @@ def image_times(
         Milliseconds of each scene's image, forward.
     """
     if any(scene.bounces for scene in scenes):
-        images = [whole_image(Renderer(scene, device=device)) for scene in scenes]
+        images = [whole_image(SceneRenderer(scene, device=device)) for scene in scenes]
         return median_times(images, runs, progress=progress)
     keys = [tuple(body.receivers for body in scene.bodies) for scene in scenes]
     firsts = dict(zip(reversed(keys), reversed(scenes), strict=True))
-    stages = {key: _Stage(scene, device) for key, scene in firsts.items()}
+    stages = {key: _SharedTiming(scene, device) for key, scene in firsts.items()}
     functions = [stages[key].sampled_shading(scene) for key, scene in zip(keys, scenes, strict=True)]
     of_stages = [function for stage in stages.values() for function in (stage.draw, stage.sampled_shading(stage.scene))]
     times = median_times([*functions, *of_stages], runs, progress=progress)
@@ -63,7 +63,7 @@ def median_times(functions: Sequence[Callable[[], object]], runs: int, *, progre
     """
     times: list[list[float]] = [[] for _ in functions]
     turns = range(runs * len(functions))
-    with progress_bar(len(turns), "timing", "call", wanted=progress) as bar:
+    with progress_bar(len(turns), "timing", "call", shows=progress) as bar:
         for turn in turns:
             function = functions[turn % len(functions)]
             function()
@@ -73,54 +73,54 @@ def median_times(functions: Sequence[Callable[[], object]], runs: int, *, progre
             wp.synchronize()
             times[turn % len(functions)].append(1e3 * (time.perf_counter() - start))
             bar.update()
-    return [statistics.median(each) for each in times]
+    return [statistics.median(item) for item in times]
 
 
-class _Stage:
-    """What all scenes with the same receivers share: the image without shadows, and a sample of its receivers.
+class _SharedTiming:
+    """Shared by all scenes with the same receivers: the image without shadows, and a sample of its receivers.
 
     Attributes:
         scene: Any of them, without shadows.
         draw: Draws the image.
-        extrapolation: Receivers of the image over those of the sample.
+        extrapolation: Receivers of the image divided by receivers of the sample.
     """
 
     def __init__(self, scene: Scene, device: wp.DeviceLike):
-        shadowed = Renderer(scene, device=device)
+        shadowed = SceneRenderer(scene, device=device)
         self.scene = replace(shadowed.scene, visibility=scene.visibility.by("none"))
-        self._renderer = Renderer(self.scene, device=device)
+        self._renderer = SceneRenderer(self.scene, device=device)
         self._view = self._renderer.view()
         self.draw = whole_image(self._renderer)
         seen = np.flatnonzero(self._view.fragments.face_ids.numpy()[0] >= 0)
         sides, vertices, barycentrics = seen_on_faces(self._view, seen[:: scene.supersampling**2])  # one a pixel
-        assembly = self._renderer.assembly
-        bodies = assembly.body_of_face[sides % len(assembly.body_of_face)]
+        merged_scene = self._renderer.merged_scene
+        bodies = merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]
         samples_receive = np.array([body.receivers != "vertex" for body in self._renderer.scene.bodies])
         at, weights, _ = places_of_receivers(vertices, barycentrics, samples_receive[bodies])
-        corners = self._renderer.geometry().positions.numpy()[0][vertices[at] % assembly.first_vertex[-1]]
+        corners = self._renderer.geometry().positions.numpy()[0][vertices[at] % merged_scene.first_vertex[-1]]
         chosen = _neighborhoods(np.einsum("rk,rkc->rc", weights, corners))
         chosen = chosen[np.argsort(bodies[at[chosen]], kind="stable")]  # as on_faces wants them
         self._sample = sides[at[chosen]], weights[chosen]
         is_adaptive = any(body.receivers == "adaptive" for body in shadowed.scene.bodies)
-        found = (shadowed.view() if is_adaptive else self._view).receivers  # adaptive ones are where shadows end
-        self.extrapolation = found.points.shape[1] / len(chosen)
+        result = (shadowed.view() if is_adaptive else self._view).receivers  # adaptive ones are where shadows end
+        self.extrapolation = result.points.shape[1] / len(chosen)
 
     def sampled_shading(self, scene: Scene) -> Callable[[], object]:
         """Make the function that shades the sample as a scene does."""
         glimpse = replace(scene.camera, width=1, height=1)  # no image is drawn
-        renderer = Renderer(scene, cameras=[glimpse], device=self._renderer.device)
+        renderer = SceneRenderer(scene, cameras=[glimpse], device=self._renderer.device)
         return lambda: renderer.shade(view=renderer.on_faces(*self._sample))
 
 
 def _neighborhoods(points: np.ndarray) -> np.ndarray:
-    """Draw TIMED_RECEIVERS of points [point, 3], those nearest to a few of them: what is near is culled together."""
+    """Draw TIMED_RECEIVERS of points [point, 3], the nearest to a few of them: near points are culled together."""
     size = min(NEIGHBORS, len(points))
     middles = np.random.default_rng(0).choice(points, min(TIMED_RECEIVERS, len(points)) // size, replace=False)
     nearest = [np.argpartition(((points - middle) ** 2).sum(axis=1), size - 1)[:size] for middle in middles]
     return np.sort(nearest, axis=1).ravel()  # in the order of receivers
 
 
-def whole_image(renderer: Renderer) -> Callable[[], wp.array]:
+def whole_image(renderer: SceneRenderer) -> Callable[[], wp.array]:
     """Make the function that draws a whole image, of which nothing is kept from the call before.
 
     Each call has the bodies in another of two places, a hair's breadth from where the scene has them.

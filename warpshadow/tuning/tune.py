@@ -1,12 +1,13 @@
-"""Tuning: what each setting of a scene costs and how wrong it is, and the cheapest that is good enough.
+"""Tuning: the cost and error of each setting of a scene, and the cheapest that is good enough.
 
-Errors are those of shading at points that the camera sees, against rays through the meshes: see
+Errors are measured in shading at points that the camera sees, against rays through the meshes: see
 :mod:`warpshadow.tuning.point_sample`. They are the same each time. Times are measured: see
 :mod:`warpshadow.tuning.timing`.
 """
 
 import contextlib
 import itertools
+import os
 import sys
 import warnings
 import weakref
@@ -26,7 +27,7 @@ from warpshadow.scene.scene import AUTO, SCENE, SPHERE_METHODS, Bounces, Scene, 
 from warpshadow.spheres import Spheres, fit_spheres, is_fitted
 from warpshadow.stages.visibility.zonal_logs import LOGS
 from warpshadow.tuning.point_sample import PointSample
-from warpshadow.tuning.timing import image_times
+from warpshadow.tuning.timing import TIMED_RECEIVERS, image_times
 
 DIRECTION_COUNTS = (32, 64, 128, 256, 512)
 ORDERS = (4, 6, 8)
@@ -59,12 +60,12 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """The settings that were chosen for a scene, among those that were tried.
+    """The settings chosen for a scene, and all trials.
 
     Args:
         given: The scene as it was.
-        chosen: The best setting. Where none reaches what was wanted, the nearest: the fastest of those about as
-            accurate as can be, or the most accurate of those about as fast.
+        chosen: The best setting. If no setting reaches the target, the nearest one: the fastest of the settings about
+            as accurate as can be, or the most accurate of the settings about as fast.
         is_reached: Whether it reaches it.
         trials: All that was tried, the fastest first.
     """
@@ -96,8 +97,21 @@ class Tuning:
         tried = {trial.scene.bodies[number].blockers for trial in self.trials for number in own}
         return tuple(count for count in SPHERE_COUNTS if own and count not in tried)
 
+    def __str__(self) -> str:
+        """The table, the units of its errors and times, and the meaning of its marks."""
+        camera, samples = self.given.camera, self.given.supersampling
+        has_bounces = any(trial.scene.bounces for trial in self.trials)
+        sampled = "" if has_bounces else f"; shadows timed on {TIMED_RECEIVERS} of its receivers, extrapolated to all"
+        mark = "chosen" if self.is_reached else "nearest"
+        return (
+            "error: of the shading at points of the image, relative, against rays\n"
+            f"image: time of a warm one of {camera.width} × {camera.height}, {samples} × {samples} samples a pixel, "
+            f"after all bodies have moved{sampled}\n"
+            f"{self.table()}\n* no other is both faster and more accurate    > {mark}"
+        )
+
     def table(self) -> str:
-        """What was tried, a line each: "*" marks the Pareto front, ">" what was chosen."""
+        """The trials, a line each: "*" marks the Pareto front, ">" the chosen one."""
         front = pareto_front([(trial.milliseconds, trial.error) for trial in self.trials])
         fitted = fitted_counts(self.given)
         lines = [f"  {_HEAD}{'error':>8}{'image':>12}"]
@@ -107,10 +121,10 @@ class Tuning:
         return "\n".join(lines)
 
     def toml(self) -> str:
-        """The settings as lines of a scene file: [visibility], and what is to be changed of the bodies."""
+        """The settings as lines of a scene file: [visibility], and changes of the bodies."""
         visibility = self.scene.visibility
         keys = {"directional": ("method", "directions"), "log-sh": ("method", "order", "log")}
-        chosen = {key: getattr(visibility, key) for key in keys.get(visibility.method, ("method",))}
+        chosen = {key: getattr(visibility, key) for key in keys.get(str(visibility.method), ("method",))}
         blocks = [toml_tables.block("[visibility]", chosen)]
         if self.scene.bounces != self.given.bounces:
             blocks.insert(0, toml_tables.block("[light]", {"bounces": self.scene.bounces}))
@@ -133,8 +147,8 @@ def _columns(scene: Scene, fitted: Iterable[int]) -> str:
 
 def _error_table(settings: Sequence[Scene], errors: Sequence[float], fitted: Iterable[int]) -> str:
     """Errors of settings, a line each, the smallest first."""
-    order = np.argsort(errors, kind="stable")
-    lines = [f"{_columns(settings[number], fitted)}{errors[number]:8.2%}" for number in order]
+    permutation = np.argsort(errors, kind="stable")
+    lines = [f"{_columns(settings[number], fitted)}{errors[number]:8.2%}" for number in permutation]
     return "\n".join([f"{_HEAD}{'error':>8}", *lines])
 
 
@@ -149,7 +163,8 @@ def _method(visibility: Visibility) -> str:
         "directional": f" {visibility.directions}",
         "log-sh": f" {visibility.log} {visibility.order}",
     }
-    return visibility.method + details.get(visibility.method, "")
+    method = str(visibility.method)
+    return method + details.get(method, "")
 
 
 def _bounces(scene: Scene) -> str:
@@ -194,30 +209,35 @@ def tune(
         scene: The scene; its "auto" is not looked at.
         error: Largest relative error of the shading, such as 0.03.
         milliseconds: In place of an error the longest time of an image.
-        bounces: How often light bounces in what errors are against, such as 12 or "all": then 0, 1, 2 and 4 bounces are
-            tried, too, as far as there are so many, and "all". By default the scene's, which are not varied.
+        bounces: How often light bounces in the reference, such as 12 or "all": then 0, 1, 2 and 4 bounces are tried,
+            too, as far as there are so many, and "all". By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
             number is, and others where fits are kept already.
         device: Where to render.
         progress: Show progress, and all errors before anything is timed.
 
     Returns:
-        What was chosen, and all that was tried. Where none reaches what was wanted it is the nearest.
+        The choice, and all trials. If no setting reaches the target, it is the nearest.
 
     Raises:
         ValueError: where the camera sees nothing.
+
+    Warns:
+        Where the machine is busy already: its load average is above its number of cores.
     """
     check.instance("scene", scene, Scene, SCENE)
     device = check.device("device", device)
-    given = {"error": error, "milliseconds": milliseconds}
-    wanted = next((value for value in given.values() if value is not None), None)
-    if wanted is None or None not in given.values():
-        raise ValueError(f"error, milliseconds: got {'neither' if wanted is None else 'both'}, expected one of them")
-    check.positive("error" if milliseconds is None else "milliseconds", wanted)
+    arguments = {"error": error, "milliseconds": milliseconds}
+    requested = next((value for value in arguments.values() if value is not None), None)
+    if requested is None or None not in arguments.values():
+        raise ValueError(f"error, milliseconds: got {'neither' if requested is None else 'both'}, expected one of them")
+    check.positive("error" if milliseconds is None else "milliseconds", requested)
     if error is not None and error > 1:
         raise ValueError(f"error: got {error:g}, expected up to 1: 0.03 is 3%")
     if bounces is not None:
         check_bounces(bounces)
+    _warn_if_busy()
+    scene = scene.with_method()
     sample = PointSample(scene, bounces=bounces, device=device, progress=progress)
     is_coarse = sample.interpolation_errors() > COARSE
     fine = [
@@ -230,11 +250,11 @@ def tune(
     if bounces is not None:
         counts = (*BOUNCE_COUNTS, "all") if bounces == "all" else [count for count in BOUNCE_COUNTS if count <= bounces]
     bounced = [replace(scene, bounces=count) for count in counts]
-    settings = [setting for each in bounced for setting in _settings(each, fine, fits, device)]
+    settings = [setting for item in bounced for setting in _settings(item, fine, fits, device)]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what a setting would warn of shows in its error
+        warnings.simplefilter("ignore")  # a setting's warnings show in its error
         errors = []
-        with progress_bar(len(settings), "measuring errors", "setting", wanted=progress) as bar:
+        with progress_bar(len(settings), "measuring errors", "setting", shows=progress) as bar:
             for setting in settings:
                 errors.append(sample.error(sample.shading(setting)))
                 bar.update()
@@ -243,25 +263,36 @@ def tune(
         times = image_times(settings, device=device, progress=progress)
     trials = sorted(map(Trial, settings, errors, times), key=lambda trial: trial.milliseconds)
     if milliseconds is None:
-        reaching = [trial for trial in trials if trial.error <= wanted]
+        reaching = [trial for trial in trials if trial.error <= requested]
         chosen = _cheapest(reaching) if reaching else _nearest(trials)
     else:
-        reaching = [trial for trial in trials if trial.milliseconds <= wanted]
+        reaching = [trial for trial in trials if trial.milliseconds <= requested]
         chosen = min(reaching, key=lambda trial: trial.error) if reaching else _cheapest(trials)
     return Tuning(scene, chosen, bool(reaching), tuple(trials))
 
 
+def _warn_if_busy() -> None:
+    """Warn where others already use all cores."""
+    cores = os.cpu_count() or 1
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0  # Windows has none
+    if load > cores:
+        check.warn(
+            f"the machine is busy, load average {load:.1f} on {cores} cores: times will be too long, and settings may "
+            "be chosen by them that an idle machine would not choose; errors are the same"
+        )
+
+
 def _cheapest(trials: Sequence[Trial]) -> Trial:
-    """The fastest trial, or the most accurate of those that are about as fast."""
+    """The fastest trial, or the most accurate of trials that are about as fast."""
     longest = (1 + EQUAL) * min(trial.milliseconds for trial in trials)
     return min((trial for trial in trials if trial.milliseconds <= longest), key=lambda trial: trial.error)
 
 
 def _nearest(trials: Sequence[Trial]) -> Trial:
-    """The most accurate trial, or the fastest of those that are about as accurate."""
-    least = min(trial.error for trial in trials)
-    most = least + max(EQUAL * least, ERROR_STEP)
-    return min((trial for trial in trials if trial.error <= most), key=lambda trial: trial.milliseconds)
+    """The most accurate trial, or the fastest of trials that are about as accurate."""
+    minimum = min(trial.error for trial in trials)
+    maximum = minimum + max(EQUAL * minimum, ERROR_STEP)
+    return min((trial for trial in trials if trial.error <= maximum), key=lambda trial: trial.milliseconds)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -292,7 +323,7 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
     reaches the error the nearest comes with a warning.
 
     Args:
-        scene: The scene. One with another method is returned as it is.
+        scene: The scene. One with another method is returned as it is, and "directional" if it names none.
         device: Where to render.
         progress: Show progress.
 
@@ -300,25 +331,27 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
         The scene, "auto" replaced. It is the same object each time, so that the choice is made once for a scene.
     """
     if scene.visibility.method != AUTO:
-        return scene
+        return scene.with_method()
     if scene not in _resolved:
         _resolved[scene] = _resolve(scene, check.device("device", device), progress)
     return _resolved[scene]
 
 
 def _resolve(scene: Scene, device: wp.DeviceLike, progress: bool) -> Scene:
-    wanted = scene.visibility.error
+    requested = scene.visibility.error
     sample = PointSample(scene, device=device, progress=progress)
     tried: list[tuple[float, Scene]] = []
     for setting in _by_work(scene, sample):
         tried.append((sample.error(sample.shading(setting)), setting))
-        if tried[-1][0] <= wanted:
+        if tried[-1][0] <= requested:
             return setting
-    error, nearest = min(tried, key=lambda each: each[0])
-    least = _interpolation_error(scene, sample)
-    reason = "" if least < wanted else f"; interpolation between vertices alone has {least:.3f}: receivers = 'pixel'"
+    error, nearest = min(tried, key=lambda item: item[0])
+    minimum = _interpolation_error(scene, sample)
+    reason = (
+        "" if minimum < requested else f"; interpolation between vertices alone has {minimum:.3f}: receivers = 'pixel'"
+    )
     check.warn(
-        f"visibility: no setting of method = 'auto' reaches error = {wanted:g}; {describe(nearest)} "
+        f"visibility: no setting of method = 'auto' reaches error = {requested:g}; {describe(nearest)} "
         f"comes nearest, with {error:.3f}{reason}",
     )
     return nearest
@@ -331,7 +364,7 @@ def _interpolation_error(scene: Scene, sample: PointSample) -> float:
 
 
 def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
-    """What "auto" chooses from, the least work first."""
+    """Settings that "auto" chooses from, the least work first."""
     if not scene.bounces:  # bounced light needs visibility
         yield replace(scene, visibility=scene.visibility.by("none"))
     yield from _all_directions(scene)
@@ -341,8 +374,8 @@ def _by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
         else int(count)
         for number, count in fitted_counts(scene).items()
     }
-    factor, most = 2, max(own.values(), default=SPHERE_COUNTS[-1])
-    while factor * most <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
+    factor, maximum = 2, max(own.values(), default=SPHERE_COUNTS[-1])
+    while factor * maximum <= SPHERE_COUNTS[-1] and _interpolation_error(scene, sample) < scene.visibility.error:
         yield from _all_directions(_with_spheres(scene, {number: factor * count for number, count in own.items()}))
         factor *= 2
 
@@ -355,9 +388,9 @@ def _all_directions(scene: Scene) -> Iterator[Scene]:
 
 
 def _settings(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:
-    """What is tried, a variant of the scene each: with its own receivers, and with fine ones."""
+    """Trials, a variant of the scene each: with its own receivers, and with fine ones."""
     for receivers in dict.fromkeys((_receivers(scene), tuple(fine))):
-        bodies = tuple(replace(body, receivers=each) for body, each in zip(scene.bodies, receivers, strict=True))
+        bodies = tuple(replace(body, receivers=item) for body, item in zip(scene.bodies, receivers, strict=True))
         placed = replace(scene, bodies=bodies)
         if not scene.bounces:
             yield replace(placed, visibility=scene.visibility.by("none"))
@@ -392,5 +425,5 @@ def _directional(visibility: Visibility) -> Iterator[Visibility]:
 
 
 def _harmonic(visibility: Visibility) -> Iterator[Visibility]:
-    for log, order in itertools.product(LOGS, ORDERS):
-        yield replace(visibility.by("log-sh"), log=log, order=order)
+    for log, permutation in itertools.product(LOGS, ORDERS):
+        yield replace(visibility.by("log-sh"), log=log, order=permutation)

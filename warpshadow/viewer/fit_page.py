@@ -1,7 +1,7 @@
 """The page of a fit: pictures, how the loss falls, and buttons that pause and stop it.
 
-It knows nothing of fits. It shows what it is told, and keeps what its buttons ask for until the fit asks in turn: a
-page that is slow or closed delays nothing.
+It knows nothing of fits. It shows the fit's messages, and stores the requests of its buttons until the fit polls them:
+a page that is slow or closed delays nothing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from warpshadow.viewer.door import Server, check_address
 from warpshadow.viewer.loss_plot import COLORS, loss_plot
+from warpshadow.viewer.server import Server, check_address
 
 _JPEG = 90
 _WIDTH = 760  # of the pictures' panel [CSS pixels]
@@ -35,7 +35,7 @@ class FitPage:
         check_address(host, port)
         self._server = Server(host, port)
         self.url = self._server.url
-        self._wishes = threading.Condition()  # guards what follows
+        self._wishes = threading.Condition()  # guards the attributes below
         self._pauses = self._stops = False
         gui = self._server.gui
         self._note = gui.add_html(_padded("preparing"))
@@ -47,7 +47,7 @@ class FitPage:
         self._pause.on_click(self._pause_or_go_on)
         self._stop.on_click(self._ask_to_stop)
 
-    # ------------------------------------------------------------------------------------------ what it is asked for
+    # ------------------------------------------------------------------------------------------ requests
 
     @property
     def is_watched(self) -> bool:
@@ -80,7 +80,7 @@ class FitPage:
             self._stops = True
             self._wishes.notify_all()
 
-    # ------------------------------------------------------------------------------------------ what it shows
+    # ------------------------------------------------------------------------------------------ display
 
     def show(self, note: str, losses: Sequence[Sequence[Sequence[float]]], stage: int, candidates: int) -> None:
         """Show how far a fit is.
@@ -94,14 +94,16 @@ class FitPage:
         self._note.content = _padded(html.escape(note))
         self._plot.content = _padded(loss_plot(losses))
         color = COLORS[stage % len(COLORS)]
-        least = [min(run, default=np.inf) for run in losses[stage]]
+        minimum = [min(run, default=np.inf) for run in losses[stage]]
         rows = []
         for number in range(candidates if candidates > 1 else 0):
-            has_begun = number < len(least) and np.isfinite(least[number])
-            style = f"color:{color}" if has_begun and least[number] == min(least) else ""
-            is_present = number == len(least) - 1
-            said = f"{least[number]:.3e}" if has_begun else "waits"
-            rows.append(f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{said}</td>')
+            has_begun = number < len(minimum) and np.isfinite(minimum[number])
+            style = f"color:{color}" if has_begun and minimum[number] == min(minimum) else ""
+            is_present = number == len(minimum) - 1
+            messages = f"{minimum[number]:.3e}" if has_begun else "waits"
+            rows.append(
+                f'<tr style="{style}"><td>{"▸" if is_present else ""}</td><td>{number + 1}</td><td>{messages}</td>'
+            )
         head = "<tr><td></td><td>candidate</td><td>least loss</td></tr>"
         self._candidates.content = _padded(f"<table>{head}{''.join(rows)}</table>") if rows else ""
 
@@ -117,10 +119,10 @@ class FitPage:
             self._pictures.image = pictures
 
     def fail(self, message: str | None) -> None:
-        """Show what went wrong in the view; None: nothing does any more."""
-        said = _padded(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
-        if said != self._failure.content:
-            self._failure.content = said
+        """Show an error in the view; None clears it."""
+        messages = _padded(f'<b style="color:#f66">{html.escape(message)}</b>') if message else ""
+        if messages != self._failure.content:
+            self._failure.content = messages
 
     def end(self, note: str) -> None:
         """Show how the fit ended, to be seen as long as browsers stay open."""
@@ -129,7 +131,7 @@ class FitPage:
         self._server.flush()
 
     def close(self) -> None:
-        """Serve no more; browsers keep what they show."""
+        """Stop serving; browsers keep the last state."""
         self._server.close()
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpshadow.scene.scene import Body
-from warpshadow.viewer.look import Pose
 from warpshadow.viewer.page_camera import quaternion, rotation
+from warpshadow.viewer.state import BodyPose
 
 
 def middle(body: Body) -> np.ndarray:
@@ -22,18 +22,18 @@ def radius(body: Body) -> float:
     return 0.5 * body.scale * float(np.linalg.norm(np.asarray(high, np.float64) - low))
 
 
-def handle_of(pose: Pose, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
+def handle_of(pose: BodyPose, body: Body, page_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the handles of a body are: quaternion, w first, and position [page units]."""
     turned = Rotation.from_rotvec(pose.rotation, degrees=True)
     return quaternion(turned), page_scale * (turned.apply(middle(body)) + pose.translation)
 
 
-def pose_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> Pose:
+def pose_of(wxyz: np.ndarray, position: np.ndarray, body: Body, page_scale: float) -> BodyPose:
     """Where a body is that was dragged by its handles.
 
     Raises:
-        ValueError: for what is not finite, and for a quaternion of 0.
+        ValueError: for numbers that are not finite, and for a quaternion of 0.
     """
     turned = rotation(wxyz)
     translation = np.asarray(position, np.float64) / page_scale - turned.apply(middle(body))
-    return Pose(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))
+    return BodyPose(tuple(turned.as_rotvec(degrees=True).tolist()), tuple(translation.tolist()))

@@ -13,17 +13,17 @@ import time
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
-from warpshadow.viewer.look import Look
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import Frame
-from warpshadow.viewer.quality import Pace, Quality
+from warpshadow.viewer.quality import FrameRate, Quality
+from warpshadow.viewer.state import ViewerState
 
 REST = 0.2
 """So long after the last request of any page all rests [s]."""
 
 
 class Page(Protocol):
-    """What the loop needs of a page. Its functions run in the page's own thread."""
+    """Interface of a page for the loop. Its functions run in the page's own thread."""
 
     def send(self, frame: Frame, delay: float) -> None:
         """Begin to send a picture, ``delay`` seconds after it was asked for."""
@@ -32,14 +32,14 @@ class Page(Protocol):
         """Return when the page has taken the last picture, or after a while if it does not say so."""
 
     def fail(self, message: str | None) -> None:
-        """Show what went wrong; None: nothing does any more."""
+        """Show an error; None clears it."""
 
 
 class Paint(Protocol):
-    """What paints: :meth:`warpshadow.viewer.painter.Painter.paint`."""
+    """The painter: :meth:`warpshadow.viewer.painter.Painter.paint`."""
 
-    def __call__(self, look: Look, page: PageCamera, quality: Quality, *, depth: bool) -> Frame:
-        """Paint what a page sees."""
+    def __call__(self, viewer_state: ViewerState, page: PageCamera, quality: Quality, *, depth: bool) -> Frame:
+        """Paint the image of a page."""
 
 
 class Loop:
@@ -47,134 +47,134 @@ class Loop:
 
     Args:
         paint: Paints a picture.
-        look: What is shown at first.
+        viewer_state: Initial viewer state.
         rest: So long after the last request all rests [s].
 
     Attributes:
-        look: What is shown.
+        viewer_state: The viewer state.
         depth: Whether pages are sent how far away everything is.
     """
 
-    def __init__(self, paint: Paint, look: Look, *, rest: float = REST):
-        self.look = look
+    def __init__(self, paint: Paint, viewer_state: ViewerState, *, rest: float = REST):
+        self.viewer_state = viewer_state
         self.depth = False
         self._paint, self._rest = paint, rest
         self._painting = threading.Lock()
-        self._asked = threading.Condition()  # guards what follows
-        self._seats: dict[Hashable, _Seat] = {}
+        self._asked = threading.Condition()  # guards the attributes below
+        self._clients: dict[Hashable, _Client] = {}
         self._last_asked = 0.0
 
     def join(self, name: Hashable, page: Page) -> None:
         """Let a page in; it is sent nothing until it says where it looks from."""
-        seat = _Seat(page)
+        client = _Client(page)
         with self._asked:
-            self._seats[name] = seat
-        threading.Thread(target=self._serve, args=(seat,), name=f"page {name}", daemon=True).start()
+            self._clients[name] = client
+        threading.Thread(target=self._serve, args=(client,), name=f"page {name}", daemon=True).start()
 
     def leave(self, name: Hashable) -> None:
         """Let a page go."""
         with self._asked:
-            seat = self._seats.pop(name, None)
-            if seat is not None:
-                seat.is_open = False
+            client = self._clients.pop(name, None)
+            if client is not None:
+                client.is_open = False
             self._asked.notify_all()
 
     def close(self) -> None:
         """Let all pages go."""
-        for name in list(self._seats):
+        for name in list(self._clients):
             self.leave(name)
 
     def look_from(self, name: Hashable, camera: PageCamera) -> None:
         """A page looks from somewhere else."""
         with self._asked:
-            seat = self._seats.get(name)
-            if seat is not None and camera != seat.camera:
-                seat.camera = camera
-                self._ask(seat)
+            client = self._clients.get(name)
+            if client is not None and camera != client.camera:
+                client.camera = camera
+                self._ask(client)
 
-    def change(self, **changes: Any) -> Look:
+    def change(self, **changes: Any) -> ViewerState:
         """Show something else to all pages.
 
         Args:
-            changes: Fields of :class:`Look`.
+            changes: Fields of :class:`ViewerState`.
 
         Raises:
-            ValueError: for what no look may have; then nothing changes.
+            ValueError: for an invalid state; then nothing changes.
         """
-        return self.update(lambda look: dataclasses.replace(look, **changes))
+        return self.update(lambda viewer_state: dataclasses.replace(viewer_state, **changes))
 
-    def update(self, change: Callable[[Look], Look]) -> Look:
-        """Show to all pages what is made of what is shown, with no other change between."""
+    def update(self, change: Callable[[ViewerState], ViewerState]) -> ViewerState:
+        """Send all pages a function of the current state, with no other change between."""
         with self._asked:
-            look = change(self.look)
-            if look != self.look:
-                self.look = look
-                self._ask(*self._seats.values())
-            return self.look
+            viewer_state = change(self.viewer_state)
+            if viewer_state != self.viewer_state:
+                self.viewer_state = viewer_state
+                self._ask(*self._clients.values())
+            return self.viewer_state
 
     def again(self, *, depth: bool | None = None) -> None:
         """Paint again for all pages, with or without depth."""
         with self._asked:
             self.depth = self.depth if depth is None else depth
-            self._ask(*self._seats.values())
+            self._ask(*self._clients.values())
 
     def camera_of(self, name: Hashable) -> PageCamera | None:
         """From where a page looks; None where it is gone, or has not said."""
         with self._asked:
-            seat = self._seats.get(name)
-            return None if seat is None else seat.camera
+            client = self._clients.get(name)
+            return None if client is None else client.camera
 
     @property
     def is_content(self) -> bool:
-        """Whether all pages have the best pictures of what they asked for, or the reason why they have none."""
+        """Whether all pages have their best pictures, or the reason why they have none."""
         with self._asked:
-            return all(seat.is_content and seat.asked is None for seat in self._seats.values())
+            return all(client.is_content and client.asked is None for client in self._clients.values())
 
-    def _ask(self, *seats: _Seat) -> None:
+    def _ask(self, *clients: _Client) -> None:
         self._last_asked = time.monotonic()
-        for seat in seats:
-            if seat.asked is None:  # a delay counts from the oldest request that a picture answers
-                seat.asked = self._last_asked
+        for client in clients:
+            if client.asked is None:  # a delay counts from the oldest request that a picture answers
+                client.asked = self._last_asked
         self._asked.notify_all()
 
     # ------------------------------------------------------------------------------------------ the thread of a page
 
-    def _serve(self, seat: _Seat) -> None:
-        pace, last = Pace(), None
-        while (job := self._next(seat, pace, last)) is not None:
-            camera, quality, asked = job
+    def _serve(self, client: _Client) -> None:
+        frame_rate, last = FrameRate(), None
+        while (job := self._next(client, frame_rate, last)) is not None:
+            camera, quality, requested = job
             try:
                 with self._painting:
                     start = time.monotonic()
-                    look = self.look
-                    frame = self._paint(look, camera, quality, depth=self.depth)
-            except Exception as error:  # whatever it is, the page says it, and the others go on
-                seat.page.fail(f"{type(error).__name__}: {error}")
+                    viewer_state = self.viewer_state
+                    frame = self._paint(viewer_state, camera, quality, depth=self.depth)
+            except Exception as error:  # report any error on the page, and go on with the others
+                client.page.fail(f"{type(error).__name__}: {error}")
                 last = None
                 continue
             seconds = time.monotonic() - start
             if quality.is_moving:
-                pace.took(seconds)
-            seat.page.fail(None)
-            seat.page.wait()
-            if seat.is_open:
-                seat.page.send(frame, time.monotonic() - asked)
+                frame_rate.took(seconds)
+            client.page.fail(None)
+            client.page.wait()
+            if client.is_open:
+                client.page.send(frame, time.monotonic() - requested)
             last = camera, quality, seconds
 
     def _next(
-        self, seat: _Seat, pace: Pace, last: tuple[PageCamera, Quality, float] | None
+        self, client: _Client, frame_rate: FrameRate, last: tuple[PageCamera, Quality, float] | None
     ) -> tuple[PageCamera, Quality, float] | None:
-        """What to paint next, and when it was asked for; waits for it. None where the page is gone."""
+        """Wait for the next request to paint, and return it with its time. None where the page is gone."""
         with self._asked:
-            while seat.is_open:
-                if seat.asked is not None and seat.camera is not None:
-                    asked, seat.asked, seat.is_content = seat.asked, None, False
-                    return seat.camera, pace.moving(), asked
+            while client.is_open:
+                if client.asked is not None and client.camera is not None:
+                    requested, client.asked, client.is_content = client.asked, None, False
+                    return client.camera, frame_rate.moving(), requested
                 better = None
                 if last is not None:
                     camera, quality, seconds = last
-                    better = pace.better(quality, seconds, camera.width * camera.height)
-                seat.is_content = better is None
+                    better = frame_rate.better(quality, seconds, camera.width * camera.height)
+                client.is_content = better is None
                 if better is None:
                     self._asked.wait()
                     continue
@@ -185,7 +185,7 @@ class Loop:
         return None
 
 
-class _Seat:
+class _Client:
     """A page, and the latest that it asked for."""
 
     def __init__(self, page: Page):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 COLORS = ("#4dabf7", "#ffa94d", "#69db7c", "#f783ac", "#b197fc", "#ffe066")
-"""Of the stages; those beyond begin again."""
+"""Colors of the stages; further stages begin again."""
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 360, 220, 44, 18
 _MOST_POINTS = 600  # of all lines: a page is sent all of them each time
@@ -16,7 +16,7 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
     """Draw losses over iterations, on a logarithmic scale.
 
     Args:
-        stages: Losses of the iterations of each descent of each stage; those that are not above 0, or not finite, are
+        stages: Losses of the iterations of each descent of each stage; values that are not above 0, or not finite, are
             left out.
 
     Returns:
@@ -30,21 +30,21 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
     low, high = min(logs), max(logs)
     low, high = low - 0.03 * (high - low) - 1e-3, high + 0.03 * (high - low) + 1e-3
 
-    def across(iteration: float) -> float:
+    def to_x(iteration: float) -> float:
         return _LEFT + (_WIDTH - _LEFT - 4) * iteration / max(count - 1, 1)
 
-    def down(log: float) -> float:
+    def to_y(log: float) -> float:
         return 4 + (_HEIGHT - _BOTTOM - 4) * (high - log) / (high - low)
 
     parts = []
     for log in _ticks(low, high):
-        y = down(log)
+        y = to_y(log)
         parts.append(f'<line x1="{_LEFT}" x2="{_WIDTH}" y1="{y:.1f}" y2="{y:.1f}" stroke="#444"/>')
         parts.append(f'<text x="{_LEFT - 4}" y="{y + 4:.1f}" text-anchor="end">{10**log:.2g}</text>')
     first, step = 0, math.ceil(count / _MOST_POINTS)
     for stage, run in runs:
-        kept = sorted({*range(0, len(run), step), len(run) - 1}) if run else []
-        points = [(across(first + n), down(math.log10(run[n]))) for n in kept if 0 < run[n] < math.inf]
+        shown_iterations = sorted({*range(0, len(run), step), len(run) - 1}) if run else []
+        points = [(to_x(first + n), to_y(math.log10(run[n]))) for n in shown_iterations if 0 < run[n] < math.inf]
         dots = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
         color = COLORS[stage % len(COLORS)]
         parts.append(f'<polyline points="{dots}" fill="none" stroke="{color}" stroke-width="1.5"/>')
@@ -55,7 +55,7 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Logarithms of 1, 2 and 5 in each decade between two, or of 1 alone where those are many."""
+    """Logarithms of 1, 2 and 5 in each decade between two, or of 1 alone where there would be many."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     steps = (1,) if high - low > 3 else (1, 2, 5)
     return [log for decade in decades for step in steps if low <= (log := decade + math.log10(step)) <= high]

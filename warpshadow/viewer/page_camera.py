@@ -1,4 +1,4 @@
-"""Cameras of pages: what a browser says of its own, checked, and made into ours.
+"""Cameras of pages: a browser's own camera, checked, and converted to ours.
 
 A page knows a world of its own, in which the scene is a few units large: its near plane, its orbit and its depths are
 made for such scenes. So lengths that it says are divided by a factor.
@@ -33,7 +33,7 @@ class PageCamera:
         height: Of the canvas [pixels].
 
     Raises:
-        ValueError: for what is not finite, or larger than any page is.
+        ValueError: for numbers that are not finite, or larger than any page is.
     """
 
     wxyz: tuple[float, ...]
@@ -45,8 +45,8 @@ class PageCamera:
     def __post_init__(self) -> None:
         """Check it."""
         wxyz, position = check.array("wxyz", self.wxyz, (4,)), check.array("position", self.position, (3,))
-        check.finite("wxyz", wxyz, most=1e3, least=-1e3)
-        check.finite("position", position, most=1e9, least=-1e9)
+        check.finite("wxyz", wxyz, maximum=1e3, minimum=-1e3)
+        check.finite("position", position, maximum=1e9, minimum=-1e9)
         if np.linalg.norm(wxyz) < 1e-6:
             raise ValueError(f"wxyz: got {wxyz.tolist()}, expected a quaternion that is not 0")
         if not _NARROWEST <= check.number("fov_y", self.fov_y) <= _WIDEST:
@@ -67,7 +67,7 @@ class PageCamera:
         return width, height
 
     def camera(self, size: tuple[int, int], *, page_scale: float, near: float) -> Camera:
-        """The camera whose image, stretched onto the canvas, is what the page sees.
+        """The camera whose image, stretched onto the canvas, shows the page's view.
 
         Args:
             size: Width and height of the image [pixels].

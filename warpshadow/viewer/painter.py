@@ -1,4 +1,4 @@
-"""Paints what a page sees: an image as a picture, and how far away everything in it is."""
+"""Paint the view of a page: an image as a picture, and its depth."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.assembly import Geometry
 from warpshadow.pipeline.choice_of_receivers import for_picture
+from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
 from warpshadow.tuning.renderer import Renderer
-from warpshadow.viewer.look import ERROR, Look
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
+from warpshadow.viewer.state import ERROR, ViewerState
 
-_BACKGROUND = 0.05  # linear gray behind what is not covered
+_BACKGROUND = 0.05  # linear gray behind uncovered pixels
 _COARSE_MAP = 64  # rows of the light while something moves: it is turned in a millisecond then
 _RENDERERS, _SIZES = 6, 8  # that are kept
 _HORIZON = 100.0  # a flat body goes to the horizon that is so many times as large as all bodies that are not flat
-_FAR = 160.0  # depth of what is not there [page units]; viser knows none beyond 167
+_FAR = 160.0  # depth of uncovered pixels [page units]; viser knows none beyond 167
 _RAYS = 256  # of a pixel, that an error is told against
 _DEPTH_PIXELS = 256**2  # of depths, which are sent without loss
 
@@ -40,15 +40,15 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a page is sent.
+    """A message to a page.
 
     Args:
         rgb: The picture, sRGB, uint8 of shape [height, width, 3].
         depth: Distance along the view [page units], float32 of shape [row, column], which may be fewer; None where
             nobody asked for it.
-        quality: What it was allowed to cost.
+        quality: The quality it was made with.
         seconds: How long it took.
-        cells: What it was made with, in words.
+        cells: Its cells, in words.
         error: Relative L2 error of the bodies' pixels against rays; None where nobody asked for it.
     """
 
@@ -61,7 +61,7 @@ class Frame:
 
 
 class Painter:
-    """Renders a scene as pages want it; what several pictures have in common is computed once.
+    """Render a scene for pages; values that several pictures share are computed once.
 
     Args:
         scene: The scene; a method "auto" has been replaced.
@@ -75,34 +75,36 @@ class Painter:
     """
 
     def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
-        self.scene = scene
+        self.scene = scene = scene.with_method()
         self._device, self._progress = device, progress
         low, high = bounds(scene)
         self.page_scale = page_scale(low, high)
-        self._renderers: Recent[Renderer] = Recent(_RENDERERS)
-        self._sized: Recent[Renderer] = Recent(_SIZES)
-        self._lights: Recent[EnvironmentMap | np.ndarray] = Recent(4)
-        self._geometries: Recent[Geometry] = Recent(_RENDERERS)
+        self._renderers: RecentCache[Renderer] = RecentCache(_RENDERERS)
+        self._sized: RecentCache[Renderer] = RecentCache(_SIZES)
+        self._lights: RecentCache[EnvironmentMap | np.ndarray] = RecentCache(4)
+        self._geometries: RecentCache[Geometry] = RecentCache(_RENDERERS)
         self.coarse_light = coarse(scene.light)
 
-    def paint(self, look: Look, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
-        """Paint what a page sees.
+    def paint(self, viewer_state: ViewerState, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
+        """Paint the image of a page.
 
         Args:
-            look: What is shown.
+            viewer_state: The viewer state.
             page: From where.
-            quality: What it may cost.
+            quality: Its quality.
             depth: Whether distances are asked for, too.
         """
         start = time.perf_counter()
-        renderer, view, camera, image = self._drawn(look, page, quality)
+        renderer, view, camera, image = self._drawn(viewer_state, page, quality)
         error = None
-        if look.shows == ERROR and not quality.is_moving:
-            truth = self.image(replace(look, method="ray-traced"), page, replace(quality, rays=_RAYS))
+        if viewer_state.shows == ERROR and not quality.is_moving:
+            truth = self.image(
+                replace(viewer_state, method="ray-traced", sampling="independent"), page, replace(quality, rays=_RAYS)
+            )
             error = relative_error(image, truth)
             rgb = error_picture(image, truth)
         else:
-            rgb = picture(image, look.stops, behind=self._behind(look, camera, quality))
+            rgb = picture(image, viewer_state.stops, behind=self._behind(viewer_state, camera, quality))
         depths = None
         if depth:
             depths = self.page_scale * distances(renderer, view)
@@ -111,61 +113,63 @@ class Painter:
         if settings.method == "directional":
             cells = f"{settings.directions} directions"
         else:
-            cells = f"{settings.samples} rays" if settings.method == "ray-traced" else settings.method
+            cells = f"{settings.ray_count} rays" if settings.method == "ray-traced" else str(settings.method)
         return Frame(rgb, depths, quality, time.perf_counter() - start, cells, error)
 
-    def image(self, look: Look, page: PageCamera, quality: Quality) -> np.ndarray:
-        """Linear RGB, premultiplied, and coverage of what a page sees, shape [height, width, 4]."""
-        return self._drawn(look, page, quality)[-1]
+    def image(self, viewer_state: ViewerState, page: PageCamera, quality: Quality) -> np.ndarray:
+        """Linear RGB, premultiplied, and coverage of a page's view, shape [height, width, 4]."""
+        return self._drawn(viewer_state, page, quality)[-1]
 
     @one_at_a_time
-    def spheres(self, look: Look) -> list[tuple[np.ndarray, np.ndarray]]:
+    def spheres(self, viewer_state: ViewerState) -> list[tuple[np.ndarray, np.ndarray]]:
         """Centers and radii of each body's spheres, in its own space; fitted where that was not done yet."""
         quality = Quality(1, cells=64, rays=16, supersampling=1, is_moving=True)
-        _, renderer = self._renderer(replace(look, method="directional"), quality)
-        rest, first = renderer.rest(), renderer.assembly.first_sphere
+        _, renderer = self._renderer(replace(viewer_state, method="directional"), quality)
+        rest, first = renderer.rest(), renderer.merged_scene.first_sphere
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         return [(centers[a:b], radii[a:b]) for a, b in zip(first[:-1], first[1:], strict=True)]
 
-    def natural_stops(self) -> float:
-        """Exposure [stops] of the scene's own picture, of few pixels."""
+    def natural_stops(self, viewer_state: ViewerState | None = None) -> float:
+        """Exposure [stops] of the picture of a look, by default the scene's own, of few pixels."""
+        viewer_state = viewer_state or ViewerState.of(self.scene)
         camera = self.scene.camera
         page = PageCamera((1, 0, 0, 0), (0, 0, 0), 60, camera.width, camera.height)
-        look = Look.of(self.scene)
         quality = Quality(128**2, cells=64, rays=16, supersampling=1, is_moving=True)
-        _, renderer = self._renderer(look, quality)
+        _, renderer = self._renderer(viewer_state, quality)
         sized = camera.stretched(*page.size(quality.pixels))
         matrix = wp.array([sized.clip_matrix()], dtype=wp.mat44, device=renderer.device)
         small = renderer.with_cameras([sized])
         return round(auto_exposure(small.draw(view=small.view(clip_matrices=matrix)).numpy()[0]), 1)
 
     @one_at_a_time
-    def _drawn(self, look: Look, page: PageCamera, quality: Quality) -> tuple[Renderer, View, Camera, np.ndarray]:
+    def _drawn(
+        self, viewer_state: ViewerState, page: PageCamera, quality: Quality
+    ) -> tuple[Renderer, View, Camera, np.ndarray]:
         size = page.size(quality.pixels)
         camera = page.camera(size, page_scale=self.page_scale, near=self.scene.camera.near)
-        key, renderer = self._renderer(look, quality)
+        key, renderer = self._renderer(viewer_state, quality)
         sized = self._sized.get((key, size), lambda: renderer.with_cameras([camera]))
         matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=renderer.device)
-        view = sized.view(self._geometry(key, renderer, look), matrix)
-        light = self._light_of(look, quality)
+        view = sized.view(self._geometry(key, renderer, viewer_state), matrix)
+        light = self._light_of(viewer_state, quality)
         return sized, view, camera, sized.draw(light, view=view).numpy()[0]
 
-    def _renderer(self, look: Look, quality: Quality) -> tuple[Hashable, Renderer]:
-        """The renderer of what is shown, and by what it is known."""
-        scene = look.settings(self.scene, quality)
+    def _renderer(self, viewer_state: ViewerState, quality: Quality) -> tuple[Hashable, Renderer]:
+        """The renderer of the current state, and its key."""
+        scene = viewer_state.settings(self.scene, quality)
         if not quality.is_moving:  # as the light is turned; it is given to each call
-            scene = replace(for_picture(replace(scene, light=self._light_of(look, quality))), light=scene.light)
-        choices = look.spheres, tuple(body.receivers for body in scene.bodies), quality.is_moving
+            scene = replace(for_picture(replace(scene, light=self._light_of(viewer_state, quality))), light=scene.light)
+        choices = viewer_state.spheres, tuple(body.receivers for body in scene.bodies), quality.is_moving
         settings = scene.visibility, scene.bounces, scene.supersampling, *choices
         key = (*vars(settings[0]).values(), *settings[1:])
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
-    def _geometry(self, key: Hashable, renderer: Renderer, look: Look) -> Geometry | None:
+    def _geometry(self, key: Hashable, renderer: Renderer, viewer_state: ViewerState) -> Geometry | None:
         """Where bodies are; None where the scene has them."""
-        if not look.has_moved(self.scene):
+        if not viewer_state.has_moved(self.scene):
             return None
-        turned = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in look.poses]
-        moved = [pose.translation for pose in look.poses]
+        turned = [Rotation.from_rotvec(pose.rotation, degrees=True).as_matrix() for pose in viewer_state.poses]
+        moved = [pose.translation for pose in viewer_state.poses]
         scales = [body.scale for body in self.scene.bodies]
 
         def placed() -> Geometry:
@@ -177,23 +181,25 @@ class Painter:
                 )
             )
 
-        return self._geometries.get((key, look.poses), placed)
+        return self._geometries.get((key, viewer_state.poses), placed)
 
-    def _light_of(self, look: Look, quality: Quality) -> EnvironmentMap | np.ndarray:
+    def _light_of(self, viewer_state: ViewerState, quality: Quality) -> EnvironmentMap | np.ndarray:
         light = self.coarse_light if quality.is_moving else self.scene.light
-        return self._lights.get((look.turn, look.scale, quality.is_moving), lambda: look.light(light))
+        return self._lights.get(
+            (viewer_state.turn, viewer_state.scale, quality.is_moving), lambda: viewer_state.light(light)
+        )
 
-    def _behind(self, look: Look, camera: Camera, quality: Quality) -> np.ndarray:
-        """What is behind the bodies: a gray, or the light itself."""
-        if not (look.shows_light and isinstance(self.scene.light, EnvironmentMap)):
+    def _behind(self, viewer_state: ViewerState, camera: Camera, quality: Quality) -> np.ndarray:
+        """Background behind the bodies: a gray, or the light itself."""
+        if not (viewer_state.shows_light and isinstance(self.scene.light, EnvironmentMap)):
             return np.full(3, _BACKGROUND, np.float32)
-        light = self._light_of(look, quality)
+        light = self._light_of(viewer_state, quality)
         assert isinstance(light, EnvironmentMap)
         return light.towards(camera.rays()[1]).astype(np.float32)
 
 
-class Recent(Generic[Value]):
-    """What was made last, by keys.
+class RecentCache(Generic[Value]):
+    """The last values, by key.
 
     Args:
         count: How many are kept.
@@ -201,28 +207,28 @@ class Recent(Generic[Value]):
 
     def __init__(self, count: int):
         self._count = count
-        self._kept: OrderedDict[Hashable, Value] = OrderedDict()
+        self._cached: OrderedDict[Hashable, Value] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """The value of a key, made if it is not kept."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        self._kept.move_to_end(key)
-        while len(self._kept) > self._count:
-            self._kept.popitem(last=False)
-        return self._kept[key]
+        if key not in self._cached:
+            self._cached[key] = make()
+        self._cached.move_to_end(key)
+        while len(self._cached) > self._count:
+            self._cached.popitem(last=False)
+        return self._cached[key]
 
 
 def bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box around all bodies but grounds that go to the horizon."""
     parts = [body.world_points() for body in scene.bodies]
-    most = _HORIZON * np.ptp(framed_points(scene), axis=0).max()
-    points = np.concatenate([part for part in parts if np.ptp(part, axis=0).max() <= most])
+    maximum = _HORIZON * np.ptp(framed_points(scene), axis=0).max()
+    points = np.concatenate([part for part in parts if np.ptp(part, axis=0).max() <= maximum])
     return points.min(axis=0), points.max(axis=0)
 
 
 def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
-    """Light of at most 64 rows, each pixel the mean of those that it covers, weighted by what they see of the sky."""
+    """Light of at most 64 rows, each pixel the mean of the pixels that it covers, weighted by solid angle."""
     if not isinstance(light, EnvironmentMap):
         return light
     step = len(light.radiance) // _COARSE_MAP
@@ -235,7 +241,7 @@ def coarse(light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
 
 
 def picture(image: np.ndarray, stops: float, behind: np.ndarray) -> np.ndarray:
-    """What a page shows of an image: a picture as :class:`warpshadow.Picture` makes it, in a tenth of the time.
+    """The picture of an image for a page: as :class:`warpshadow.Picture` makes it, in a tenth of the time.
 
     Args:
         image: Linear RGB, premultiplied, and coverage, shape [height, width, 4].
@@ -284,21 +290,21 @@ def error_picture(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def distances(renderer: Renderer, view: View) -> np.ndarray:
-    """Distance along the view of what the middle sample of each pixel sees, Inf where there is nothing.
+    """Distance along the view of the surface at the middle sample of each pixel, Inf where there is nothing.
 
     Args:
         renderer: Made the view.
-        view: What is seen.
+        view: The view.
 
     Returns:
         Scene units, shape [height, width].
     """
-    across = renderer.scene.supersampling
-    middle = slice(across // 2, None, across)
+    supersampling = renderer.scene.supersampling
+    middle = slice(supersampling // 2, None, supersampling)
     faces = view.fragments.face_ids.numpy()[0, middle, middle]
     weights = view.fragments.barycentrics.numpy()[0, middle, middle]
     depths = view.clip_positions.value(view.call).numpy()[0, :, 3]  # w of clip space is the distance
-    corners = depths[renderer.assembly.faces.numpy()[np.maximum(faces, 0)]]
+    corners = depths[renderer.merged_scene.faces.numpy()[np.maximum(faces, 0)]]
     return np.where(faces < 0, np.inf, (corners * weights).sum(axis=-1))
 
 
@@ -308,7 +314,7 @@ def _step(count: int) -> int:
 
 
 def own_page(scene: Scene, scale: float) -> PageCamera:
-    """The page that sees what the scene's camera sees, but for a lens that is off center."""
+    """The page with the view of the scene's camera, except for a lens that is off center."""
     camera = scene.camera
     check.instance("camera", camera, Camera, "a Camera")
     fov = np.degrees(2 * np.arctan(0.5 * camera.height / camera.intrinsics[1, 1]))

@@ -1,4 +1,4 @@
-"""The panel beside the picture, and what can be dragged in it. All pages share it."""
+"""The panel beside the picture, and the handles in it. All pages share it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.primitives import icosphere
 from warpshadow.scene.scene import METHODS, RECEIVERS
 from warpshadow.viewer import gizmo
-from warpshadow.viewer.look import AS_GIVEN, ERROR, PICTURE, Look, Pose
 from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion
 from warpshadow.viewer.painter import Painter, picture
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
+from warpshadow.viewer.state import AS_GIVEN, ERROR, PICTURE, BodyPose, ViewerState
 
 _NOTHING = "nothing"
 _CELLS = (16, 32, 64, 128, 256, 512)
@@ -30,7 +30,7 @@ _MAP_COLUMNS = 256
 
 
 class Panel:
-    """What a scene may be changed by.
+    """Controls that change a scene.
 
     Args:
         server: Shows it.
@@ -42,59 +42,69 @@ class Panel:
     def __init__(self, server: viser.ViserServer, loop: Loop, painter: Painter, path: Path | None = None):
         self._server, self._loop, self._painter, self._path = server, loop, painter, path
         self._scene, self._scale = painter.scene, painter.page_scale
-        self._inputs: list[tuple[Any, Callable[[Look], Any]]] = []
+        self._inputs: list[tuple[Any, Callable[[ViewerState], Any]]] = []
         self._handles: viser.TransformControlsHandle | None = None
         self._dragged: int | None = None
         self._spheres: dict[int, viser.BatchedMeshHandle] = {}
         self._showing = threading.Lock()  # spheres may have to be fitted, so they are shown in threads of their own
-        self._first = loop.look
+        self._first = loop.viewer_state
         self._add_light()
         self._add_shadows()
         self._add_bodies()
         save = server.gui.add_button("Save scene", hint="Download the scene as it is shown, and from where you look")
         save.on_click(self._save)
 
-    # ------------------------------------------------------------------------------------------ what it consists of
+    # ------------------------------------------------------------------------------------------ controls
 
     def _add_light(self) -> None:
-        gui, look = self._server.gui, self._loop.look
+        gui, viewer_state = self._server.gui, self._loop.viewer_state
         with gui.add_folder("Light"):
             self._map = None
             if isinstance(self._scene.light, EnvironmentMap):
-                self._map = gui.add_image(self._map_picture(look), label="middle: +z", format="jpeg")
-            turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, look.turn)
-            self._bind(turn, lambda look: look.turn, lambda value: {"turn": value})
+                self._map = gui.add_image(self._map_picture(viewer_state), label="middle: +z", format="jpeg")
+            turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, viewer_state.turn)
+            self._bind(turn, lambda viewer_state: viewer_state.turn, lambda value: {"turn": value})
             scale = gui.add_slider("Scale [stops]", -6.0, 6.0, 0.1, 0.0)
-            self._bind(scale, lambda look: float(np.log2(max(look.scale, 2**-6))), lambda value: {"scale": 2.0**value})
+            self._bind(
+                scale,
+                lambda viewer_state: float(np.log2(max(viewer_state.scale, 2**-6))),
+                lambda value: {"scale": 2.0**value},
+            )
             if self._map is not None:
-                behind = gui.add_checkbox("Behind the bodies", look.shows_light)
-                self._bind(behind, lambda look: look.shows_light, lambda value: {"shows_light": value})
-            stops = gui.add_slider("Exposure [stops]", look.stops - 6, look.stops + 6, 0.1, look.stops)
-            self._bind(stops, lambda look: look.stops, lambda value: {"stops": value})
+                behind = gui.add_checkbox("Behind the bodies", viewer_state.shows_light)
+                self._bind(behind, lambda viewer_state: viewer_state.shows_light, lambda value: {"shows_light": value})
+            stops = gui.add_slider(
+                "Exposure [stops]", viewer_state.stops - 6, viewer_state.stops + 6, 0.1, viewer_state.stops
+            )
+            self._bind(stops, lambda viewer_state: viewer_state.stops, lambda value: {"stops": value})
 
     def _add_shadows(self) -> None:
-        gui, look = self._server.gui, self._loop.look
-        cells, counts = sorted({*_CELLS, look.directions}), (AS_GIVEN, *map(str, _SPHERES))
+        gui, viewer_state = self._server.gui, self._loop.viewer_state
+        cells, counts = sorted({*_CELLS, viewer_state.directions}), (AS_GIVEN, *map(str, _SPHERES))
         with gui.add_folder("Shadows"):
-            method = gui.add_dropdown("Method", METHODS, initial_value=look.method)
-            self._bind(method, lambda look: look.method, lambda value: {"method": value})
-            directions = gui.add_dropdown("Directions", tuple(map(str, cells)), initial_value=str(look.directions))
-            self._bind(directions, lambda look: str(look.directions), lambda value: {"directions": int(value)})
-            softness = gui.add_slider("Softness", 0.05, 1.5, 0.05, look.softness)
-            self._bind(softness, lambda look: look.softness, lambda value: {"softness": value})
+            method = gui.add_dropdown("Method", METHODS, initial_value=viewer_state.method)
+            self._bind(method, lambda viewer_state: viewer_state.method, lambda value: {"method": value})
+            directions = gui.add_dropdown(
+                "Directions", tuple(map(str, cells)), initial_value=str(viewer_state.directions)
+            )
+            self._bind(
+                directions, lambda viewer_state: str(viewer_state.directions), lambda value: {"directions": int(value)}
+            )
+            softness = gui.add_slider("Softness", 0.05, 1.5, 0.05, viewer_state.softness)
+            self._bind(softness, lambda viewer_state: viewer_state.softness, lambda value: {"softness": value})
             spheres = gui.add_dropdown("Spheres", counts, hint="Other numbers are fitted once, some 20 s a body")
             self._bind(
                 spheres,
-                lambda look: AS_GIVEN if look.spheres is None else str(look.spheres),
+                lambda viewer_state: AS_GIVEN if viewer_state.spheres is None else str(viewer_state.spheres),
                 lambda value: {"spheres": None if value == AS_GIVEN else int(value)},
             )
-            receivers = gui.add_dropdown("Receivers", (AS_GIVEN, *RECEIVERS), initial_value=look.receivers)
-            self._bind(receivers, lambda look: look.receivers, lambda value: {"receivers": value})
-            if self._scene.bounces and look.bounces != "all":
-                bounces = gui.add_slider("Bounces", 0, max(4, look.bounces), 1, look.bounces)
-                self._bind(bounces, lambda look: look.bounces, lambda value: {"bounces": value})
+            receivers = gui.add_dropdown("Receivers", (AS_GIVEN, *RECEIVERS), initial_value=viewer_state.receivers)
+            self._bind(receivers, lambda viewer_state: viewer_state.receivers, lambda value: {"receivers": value})
+            if self._scene.bounces and viewer_state.bounces != "all":
+                bounces = gui.add_slider("Bounces", 0, max(4, viewer_state.bounces), 1, viewer_state.bounces)
+                self._bind(bounces, lambda viewer_state: viewer_state.bounces, lambda value: {"bounces": value})
             shows = gui.add_dropdown("Show", (PICTURE, ERROR), hint="Red: too bright, by 20% of the mean; blue: dark")
-            self._bind(shows, lambda look: look.shows, lambda value: {"shows": value})
+            self._bind(shows, lambda viewer_state: viewer_state.shows, lambda value: {"shows": value})
 
     def _add_bodies(self) -> None:
         gui = self._server.gui
@@ -118,9 +128,11 @@ class Panel:
             self._loop.update(lambda _: self._first)
             self._put_back()
 
-    # ------------------------------------------------------------------------------------------ what it does
+    # ------------------------------------------------------------------------------------------ actions
 
-    def _bind(self, handle: Any, value_of: Callable[[Look], Any], changes: Callable[[Any], dict[str, Any]]) -> None:
+    def _bind(
+        self, handle: Any, value_of: Callable[[ViewerState], Any], changes: Callable[[Any], dict[str, Any]]
+    ) -> None:
         """Change the look when a page changes an input; put the input back where that is refused."""
         self._inputs.append((handle, value_of))
 
@@ -130,7 +142,7 @@ class Panel:
                 self._guarded(event, lambda: self._changed(**changes(handle.value)))
 
     def _guarded(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
-        """Do what a page asks for; say why if that is refused."""
+        """Obey a page's request; report why if it is refused."""
         try:
             act()
         except (ValueError, OverflowError, TypeError) as error:
@@ -139,26 +151,26 @@ class Panel:
                 event.client.add_notification("Refused", str(error), color="red", auto_close_seconds=8)
 
     def _changed(self, **changes: Any) -> None:
-        before = self._loop.look
-        look = self._loop.change(**changes)
-        if self._map is not None and look.turn != before.turn:
-            self._map.image = self._map_picture(look)
-        if look.spheres != before.spheres and self._spheres:
+        before = self._loop.viewer_state
+        viewer_state = self._loop.change(**changes)
+        if self._map is not None and viewer_state.turn != before.turn:
+            self._map.image = self._map_picture(viewer_state)
+        if viewer_state.spheres != before.spheres and self._spheres:
             self._server.get_event_loop().run_in_executor(None, self._show_spheres)
 
     def _put_back(self) -> None:
-        """Let inputs and handles say what is shown."""
-        look = self._loop.look
+        """Update inputs and handles to the current state."""
+        viewer_state = self._loop.viewer_state
         for handle, value_of in self._inputs:
-            handle.value = value_of(look)
+            handle.value = value_of(viewer_state)
         if self._map is not None:
-            self._map.image = self._map_picture(look)
-        self._move_handles(look)
-        self._move_spheres(look)
+            self._map.image = self._map_picture(viewer_state)
+        self._move_handles(viewer_state)
+        self._move_spheres(viewer_state)
 
-    def _map_picture(self, look: Look) -> np.ndarray:
+    def _map_picture(self, viewer_state: ViewerState) -> np.ndarray:
         """The light as it is turned."""
-        light = look.light(self._painter.coarse_light)
+        light = viewer_state.light(self._painter.coarse_light)
         assert isinstance(light, EnvironmentMap)
         step = max(1, light.radiance.shape[1] // _MAP_COLUMNS)
         small = light.radiance[::step, ::step]
@@ -171,23 +183,23 @@ class Panel:
         page = None if client is None else self._loop.camera_of(client.client_id)
         if client is None or page is None:
             return
-        camera, look = saved_camera(self._scene, page, self._scale), self._loop.look
+        camera, viewer_state = saved_camera(self._scene, page, self._scale), self._loop.viewer_state
         if self._path is not None:
-            name, content = self._path.name, as_toml(self._path, self._scene, look, camera)
+            name, content = self._path.name, as_toml(self._path, self._scene, viewer_state, camera)
         else:
-            name, content = "scene.zip", as_archive(self._scene, look, camera)
+            name, content = "scene.zip", as_archive(self._scene, viewer_state, camera)
         client.send_file_download(name, content, save_immediately=True)
 
     # ------------------------------------------------------------------------------------------ in the picture
 
     def _drag(self, number: int | None) -> None:
-        """Put handles at a body, and take away those of another."""
+        """Put handles at a body, and remove another body's."""
         if self._handles is not None:
             self._handles.remove()
         self._handles, self._dragged = None, number
         if number is not None:
             body = self._scene.bodies[number]
-            wxyz, position = gizmo.handle_of(self._loop.look.poses[number], body, self._scale)
+            wxyz, position = gizmo.handle_of(self._loop.viewer_state.poses[number], body, self._scale)
             radius = min(self._scale * gizmo.radius(body), PAGE_RADIUS)  # a ground may go to the horizon
             self._handles = self._server.scene.add_transform_controls(
                 _HANDLES,
@@ -210,27 +222,27 @@ class Panel:
         try:
             pose = gizmo.pose_of(event.target.wxyz, event.target.position, body, self._scale)
         except ValueError:  # not finite
-            self._move_handles(self._loop.look)
+            self._move_handles(self._loop.viewer_state)
             return
 
-        def moved(look: Look) -> Look:
-            poses = [*look.poses]
+        def moved(viewer_state: ViewerState) -> ViewerState:
+            poses = [*viewer_state.poses]
             poses[number] = pose
-            return dataclasses.replace(look, poses=tuple(poses))
+            return dataclasses.replace(viewer_state, poses=tuple(poses))
 
         self._move_spheres(self._loop.update(moved))
 
-    def _move_handles(self, look: Look) -> None:
+    def _move_handles(self, viewer_state: ViewerState) -> None:
         if self._handles is not None and self._dragged is not None:
             body = self._scene.bodies[self._dragged]
-            wxyz, position = gizmo.handle_of(look.poses[self._dragged], body, self._scale)
+            wxyz, position = gizmo.handle_of(viewer_state.poses[self._dragged], body, self._scale)
             self._handles.wxyz, self._handles.position = wxyz, position
 
     def _show_spheres(self) -> None:
         """Show spheres or none, as the panel says by the time it is this thread's turn."""
         with self._showing:
             self._replace_spheres(bool(self._balls.value))
-        self._move_spheres(self._loop.look)
+        self._move_spheres(self._loop.viewer_state)
         self._loop.again(depth=self._needs_depth)
 
     def _replace_spheres(self, shows: bool) -> None:
@@ -238,7 +250,7 @@ class Panel:
             handle.remove()
         self._spheres = {}
         ball = icosphere(subdivisions=2)
-        for number, (centers, radii) in enumerate(self._painter.spheres(self._loop.look) if shows else ()):
+        for number, (centers, radii) in enumerate(self._painter.spheres(self._loop.viewer_state) if shows else ()):
             if len(radii):
                 factor = self._scale * self._scene.bodies[number].scale
                 self._spheres[number] = self._server.scene.add_batched_meshes_simple(
@@ -251,8 +263,8 @@ class Panel:
                     opacity=0.35,
                 )
 
-    def _move_spheres(self, look: Look) -> None:
+    def _move_spheres(self, viewer_state: ViewerState) -> None:
         for number, handle in list(self._spheres.items()):
-            pose: Pose = look.poses[number]
+            pose: BodyPose = viewer_state.poses[number]
             handle.wxyz = quaternion(Rotation.from_rotvec(pose.rotation, degrees=True))
             handle.position = self._scale * np.array(pose.translation)

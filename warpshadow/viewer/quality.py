@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 SECONDS = 1 / 24
-"""What an image may take while something moves; encoding and sending come on top."""
+"""Time budget of an image while something moves; encoding and sending come on top."""
 
 LONGEST = 1.0
-"""What an image may take while all rests [s]: so long a page waits when it moves again."""
+"""Time budget of an image while nothing moves [s]: a page waits at most so long when it moves again."""
 
 FEWEST, MOST = 160**2, 512**2
 """Pixels of an image while something moves."""
@@ -21,11 +21,11 @@ _STEP = 1.3  # of pixels, that is worth another image
 
 @dataclass(frozen=True)
 class Quality:
-    """What an image may cost.
+    """Cost of an image.
 
     Args:
         pixels: Of the image, about.
-        cells: At most so many direction cells.
+        cells: At most so many direction cells, or directions of rays that all pixels share.
         rays: At most so many of a pixel.
         supersampling: At most so many samples across a pixel.
         is_moving: Whether it is made while something moves.
@@ -38,8 +38,8 @@ class Quality:
     is_moving: bool
 
 
-class Pace:
-    """Chooses qualities by what images took: the next one of a motion, and the next better one of what rests."""
+class FrameRate:
+    """Choose qualities by the times of past images: the next one of a motion, and the next better one at rest."""
 
     def __init__(self) -> None:
         self.pixels = 256**2
@@ -49,7 +49,7 @@ class Pace:
         return Quality(self.pixels, cells=64, rays=16, supersampling=1, is_moving=True)
 
     def took(self, seconds: float) -> None:
-        """Learn what an image of a motion took; only what is far from what it may take changes anything."""
+        """Learn from the time of an image in a motion; only a time far from the budget changes anything."""
         if seconds > 1.6 * SECONDS:
             self.pixels = max(FEWEST, self.pixels // 2)
         elif seconds < 0.3 * SECONDS:
@@ -60,7 +60,7 @@ class Pace:
 
         Args:
             last: That of the last image.
-            seconds: What it took.
+            seconds: Its time.
             canvas: Pixels that the page has.
 
         Returns:

@@ -12,8 +12,8 @@ from warpshadow.assets.camera import Camera
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
 from warpshadow.scene.scene import READ_BY, Scene
-from warpshadow.viewer.look import AS_GIVEN, Look
 from warpshadow.viewer.page_camera import PageCamera
+from warpshadow.viewer.state import AS_GIVEN, ViewerState
 
 
 def saved_camera(scene: Scene, page: PageCamera, page_scale: float) -> Camera:
@@ -23,45 +23,46 @@ def saved_camera(scene: Scene, page: PageCamera, page_scale: float) -> Camera:
     return page.camera(size, page_scale=page_scale, near=scene.camera.near)
 
 
-def as_toml(path: Path, scene: Scene, look: Look, camera: Camera) -> bytes:
-    """A scene file with what was changed in it; what it names is named as before.
+def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera) -> bytes:
+    """A scene file with the changes in it; it names the same files as before.
 
     Args:
         path: The file as it was.
         scene: The scene in it.
-        look: How it is shown.
+        viewer_state: How it is shown.
         camera: From where.
     """
     tables = toml_tables.read(path, "scene file")
     tables["camera"] = camera_table(camera) | {"supersampling": scene.supersampling}
     light = tables["light"]
-    light["rotation"] = light.get("rotation", 0.0) + look.turn
-    light["scale"] = light.get("scale", 1.0) * look.scale
-    settings = look.settings(scene)
+    light["rotation"] = light.get("rotation", 0.0) + viewer_state.turn
+    light["scale"] = light.get("scale", 1.0) * viewer_state.scale
+    settings = viewer_state.settings(scene)
     light["bounces"] = settings.bounces
-    visibility = tables.setdefault("visibility", {})
+    visibility, arguments = tables.setdefault("visibility", {}), scene.visibility.with_method()
     for name in ("method", *READ_BY):
         value = getattr(settings.visibility, name)
-        if value != getattr(scene.visibility, name):
+        if value != getattr(arguments, name):
             visibility[name] = value
-    visibility["method"] = settings.visibility.method
-    start = Look.of(scene)
-    for table, body, pose, old in zip(tables["body"], settings.bodies, look.poses, start.poses, strict=True):
+    if "method" in visibility:  # "auto" was replaced
+        visibility["method"] = settings.visibility.method
+    start = ViewerState.of(scene)
+    for table, body, pose, old in zip(tables["body"], settings.bodies, viewer_state.poses, start.poses, strict=True):
         if pose != old:
             table["rotation"], table["translation"] = list(pose.rotation), list(pose.translation)
             if table.pop("on_ground", False):  # which may have scaled it
                 table["scale"] = float(body.scale)
-        if look.receivers != AS_GIVEN:
-            table["receivers"] = look.receivers
-        if look.spheres is not None and body.casts_shadow:
+        if viewer_state.receivers != AS_GIVEN:
+            table["receivers"] = viewer_state.receivers
+        if viewer_state.spheres is not None and body.casts_shadow:
             table.pop("spheres", None)
-            table["blockers"] = look.spheres
+            table["blockers"] = viewer_state.spheres
     return toml_tables.text(tables).encode()
 
 
-def as_archive(scene: Scene, look: Look, camera: Camera) -> bytes:
+def as_archive(scene: Scene, viewer_state: ViewerState, camera: Camera) -> bytes:
     """A ZIP archive of the scene file and all that it names."""
-    shown = dataclasses.replace(look.scene(scene), camera=camera)
+    shown = dataclasses.replace(viewer_state.scene(scene), camera=camera)
     packed = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in write_scene(shown, folder):

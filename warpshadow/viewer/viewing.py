@@ -1,4 +1,4 @@
-"""What Python and the command line know of viewers; viser is imported once one is asked for."""
+"""Interface of viewers for Python and the command line; viser is imported at first use."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class FitViewer(Viewer):
 
 @contextlib.contextmanager
 def _viser() -> Iterator[None]:
-    """Say what to install where an import fails."""
+    """Tell how to install a missing package."""
     try:
         yield
     except ImportError as cause:
@@ -107,7 +107,7 @@ def view(
     Args:
         scene: The scene.
         host: Address to serve at. The default is for this machine alone; at others everybody who can reach them sees
-            the scene, and can change what is shown.
+            the scene, and can change it.
         port: Port, or the next one that is free.
         browser: Whether to open a browser; None for yes, unless this is a notebook, which shows the page itself.
         device: Warp device.
@@ -138,9 +138,9 @@ def serve(
 
     Args:
         scene, host, port, device, progress: As there.
-        path: The scene's file, which is saved with what was changed in it; None where it has none.
+        path: The scene's file, which is saved with the changes in it; None where it has none.
     """
     with _viser():
-        from warpshadow.viewer.site import Site
-    site = Site(scene, host=host, port=port, device=device, progress=progress, path=path)
+        from warpshadow.viewer.app import ViewerApp
+    site = ViewerApp(scene, host=host, port=port, device=device, progress=progress, path=path)
     return Viewer(site.url, site.close)

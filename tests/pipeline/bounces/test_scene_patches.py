@@ -6,17 +6,17 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.device.tape import recorded
-from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.bounces.patches import ScenePatches
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Clock
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.stages.bounces.exitance import sphere_exitance
+from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 
 RANDOM = np.random.default_rng(0)
 
 
 @pytest.fixture
-def assembly():
+def merged_scene():
     ball = ws.icosphere(1.0, 2)
     ground = ws.plane(6.0, 8)
     bodies = (
@@ -25,27 +25,27 @@ def assembly():
         ws.Body(ball, (0.0, 0.0, 0.0), blockers=1, translation=(3, 1, 0), name="black"),
     )
     light = ws.EnvironmentMap.constant(1.0, height=8)
-    return Assembly(ws.Scene(bodies, light, ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))))
+    return MergedScene(ws.Scene(bodies, light, ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))))
 
 
-def test_black_bodies_send_nothing(assembly):
-    materials = Materials.of_scene(assembly)
-    assert ScenePatches(assembly).senders(materials).bodies == (0, 1)
+def test_black_bodies_send_nothing(merged_scene):
+    materials = Materials.of_scene(merged_scene)
+    assert ScenePatches(merged_scene).senders(materials).bodies == (0, 1)
     given = [None, None, wp.zeros((1, 1), dtype=wp.vec3)]
-    assert ScenePatches(assembly).senders(materials.replaced(given, None)).bodies == (0, 1, 2)
+    assert ScenePatches(merged_scene).senders(materials.replaced(given, None)).bodies == (0, 1, 2)
 
 
-def test_flat_bodies_have_a_grid_whose_back_nobody_sees(assembly):
-    patches = ScenePatches(assembly)
-    assert patches.flats == (1,)
+def test_flat_bodies_have_a_grid_whose_back_nobody_sees(merged_scene):
+    patches = ScenePatches(merged_scene)
+    assert patches.planes == (1,)
     assert patches.of_body(1).grid.sides == 1
     assert patches.of_body(0).grid is None
 
 
-def test_sources_lie_on_the_bodies_and_face_outwards(assembly):
-    senders = ScenePatches(assembly).senders(Materials.of_scene(assembly))
-    positions = assembly.scene_geometry.positions
-    normals = wp.array(_normals(assembly)[None], dtype=wp.vec3)
+def test_sources_lie_on_the_bodies_and_face_outwards(merged_scene):
+    senders = ScenePatches(merged_scene).senders(Materials.of_scene(merged_scene))
+    positions = merged_scene.scene_geometry.positions
+    normals = wp.array(_normals(merged_scene)[None], dtype=wp.vec3)
     found = senders.sources(positions, normals)
     assert [span.body for span in found.spans] == [0, 1]
     _, first, end = found.spans[0]
@@ -57,17 +57,17 @@ def test_sources_lie_on_the_bodies_and_face_outwards(assembly):
     np.testing.assert_allclose(found.normals.numpy()[0, first:end], [(0, 1, 0)] * (end - first), atol=1e-6)
 
 
-def _normals(assembly):
-    normals = [body.world_mesh().positions - body.translation for body in assembly.scene.bodies]
+def _normals(merged_scene):
+    normals = [body.world_mesh().positions - body.translation for body in merged_scene.scene.bodies]
     normals[1] = np.tile([0.0, 1.0, 0.0], (len(normals[1]), 1))
     return np.concatenate(normals)
 
 
-def test_albedo_of_patches_has_gradients_to_colors_and_textures(assembly):
+def test_albedo_of_patches_has_gradients_to_colors_and_textures(merged_scene):
     color = wp.array(RANDOM.uniform(size=(1, 162, 3)), dtype=wp.vec3, requires_grad=True)
     image = wp.array(RANDOM.uniform(size=(1, 16, 16, 3)), dtype=wp.vec3, requires_grad=True)
-    materials = Materials.of_scene(assembly).replaced([color, None, None], [None, image, None])
-    patches = ScenePatches(assembly)
+    materials = Materials.of_scene(merged_scene).replaced([color, None, None], [None, image, None])
+    patches = ScenePatches(merged_scene)
     senders = patches.senders(materials)
     with recorded() as tape:
         albedo = patches.albedo(materials, senders.bodies).value(Call(Clock()))
@@ -83,9 +83,9 @@ def test_albedo_of_patches_has_gradients_to_colors_and_textures(assembly):
     assert image.grad.numpy().min() > 0
 
 
-def test_one_color_is_that_of_all_patches(assembly):
-    patches = ScenePatches(assembly)
-    materials = Materials.of_scene(assembly)
+def test_one_color_is_that_of_all_patches(merged_scene):
+    patches = ScenePatches(merged_scene)
+    materials = Materials.of_scene(merged_scene)
     given = wp.array([[(0.2, 0.3, 0.4)]], dtype=wp.vec3)
     albedo = patches.albedo(materials.replaced([given, given, None], None), (0, 1)).value(Call(Clock()))
     np.testing.assert_allclose(albedo.numpy()[0], np.tile([0.2, 0.3, 0.4], (albedo.shape[1], 1)), rtol=1e-6)
@@ -98,11 +98,11 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     flat = ws.Body(ws.plane(2.0, 4), scale=2.5, translation=(0, -9, 0), name="ground")
     light = ws.EnvironmentMap.constant(1.0, height=8)
     camera = ws.Camera.look_at((0, 3, 8), (0, 1, 0), size=(8, 8))
-    assembly = Assembly(ws.Scene((*bodies, flat), light, camera))
-    senders = ScenePatches(assembly).senders(Materials.of_scene(assembly))
+    merged_scene = MergedScene(ws.Scene((*bodies, flat), light, camera))
+    senders = ScenePatches(merged_scene).senders(Materials.of_scene(merged_scene))
     areas = [senders.areas[first:end].sum() for first, end in zip(senders.first[:-1], senders.first[1:], strict=True)]
     expected = []
-    for body in assembly.scene.bodies:
+    for body in merged_scene.scene.bodies:
         a, b, c = np.moveaxis(body.world_mesh().positions[body.mesh.faces].astype(np.float64), 1, 0)
         expected.append(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     np.testing.assert_allclose(areas, expected, rtol=1e-5)
@@ -111,17 +111,17 @@ def test_patches_of_bodies_of_different_scale_count_by_their_areas_in_the_scene(
     starts, numbers = np.int32([0, senders.first[2]]), np.arange(senders.first[2], dtype=np.int32)
     radiosity = np.repeat([1.0, 0.0, 0.0], np.diff(senders.first))[None, :, None].repeat(3, axis=2)
     shown = wp.full((1, len(senders.areas), 4), 0.25, wp.float32)
-    sent = sphere_exitance(wp.array(radiosity, dtype=wp.vec3), shown, senders.areas, starts, numbers).numpy()[0, 0]
+    sent = find_proxy_radiance(wp.array(radiosity, dtype=wp.vec3), shown, senders.areas, starts, numbers).numpy()[0, 0]
     np.testing.assert_allclose(sent[:, 0] / sent[:, 3], expected[0] / (expected[0] + expected[1]), rtol=1e-5)
 
 
 def test_many_bodies_share_a_scenes_patches_by_their_areas():
     ball, light = ws.icosphere(1.0, 4), ws.EnvironmentMap.constant(1.0, height=8)
     camera = ws.Camera.look_at((0, 3, 8), (0, 1, 0))
-    scales = [1.0] * 39 + [0.1]
+    scales = [1.0] * 19 + [0.1]
     bodies = [ws.Body(ball, blockers=1, scale=scale, name=f"{number}") for number, scale in enumerate(scales)]
-    few, many = (ScenePatches(Assembly(ws.Scene(tuple(some), light, camera))) for some in (bodies[:2], bodies))
+    few, many = (ScenePatches(MergedScene(ws.Scene(tuple(some), light, camera))) for some in (bodies[:2], bodies))
     assert few.of_body(0).count == 256
     assert len(few.of_body(0).sources.patches) > 3 * 256
-    assert [many.of_body(number).count for number in (0, 39)] == [64, 32]
-    assert len(many.of_body(0).sources.patches) == 64
+    assert [many.of_body(number).count for number in (0, 19)] == [64, 32]
+    assert len(many.of_body(0).sources.patches) == 3 * 64

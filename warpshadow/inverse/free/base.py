@@ -1,4 +1,4 @@
-"""What a free parameter does, and a free parameter of one body."""
+"""Base classes: a free parameter, and a free parameter of one body."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from warpshadow import check
-from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import BodyLike, Scene
 
 Values = dict[str, torch.Tensor]
@@ -21,14 +21,14 @@ class Free(abc.ABC):
     """A free parameter of a scene."""
 
     key: ClassVar[str]
-    """What fit files call it."""
+    """Its name in fit files."""
 
     moves: ClassVar[bool] = False
     """Whether geometry or cameras change with it."""
 
     @property
     def name(self) -> str:
-        """What values and messages call it."""
+        """Its name in values and messages."""
         return self.key
 
     def numbered(self, scene: Scene) -> Free:
@@ -36,7 +36,7 @@ class Free(abc.ABC):
         return self
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError where what a scene has of it cannot be free; the message names the argument."""
+        """Raise ValueError if the scene's value cannot be free; the message names the argument."""
         return
 
     @abc.abstractmethod
@@ -44,7 +44,7 @@ class Free(abc.ABC):
         """Values where the scene has them."""
 
     @abc.abstractmethod
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Put values into the world. Differentiable: values."""
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
@@ -58,14 +58,14 @@ class Free(abc.ABC):
         return {key: tensor.detach().clone() for key, tensor in values.items()}
 
     @abc.abstractmethod
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
-        """Put final values into what is found."""
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Write final values into the fitted scene."""
 
-    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
-        """What was found, as scene files call it, where that is a few numbers."""
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """The fitted numbers by their keys in scene files, if they are few."""
         return {}
 
-    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Regularizer, to be added to the loss; None for none. Differentiable: values."""
         return None
 
@@ -97,12 +97,12 @@ class FreeOfBody(Free):
 
     @property
     def name(self) -> str:
-        """What values and messages call it."""
+        """Its name in values and messages."""
         return f"{self.key}[{self.body}]"
 
-    def called(self, found: Found) -> str:
-        """What its body is called, or where others are called that, its number."""
-        names = [body.called for body in found.scene.bodies]
+    def called(self, fitted: FittedScene) -> str:
+        """The name of its body, or its number if the name is not unique."""
+        names = [body.called for body in fitted.scene.bodies]
         own = names[self.number]
         return own if names.count(own) == 1 else f"body_{self.number}"
 

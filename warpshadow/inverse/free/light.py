@@ -11,11 +11,10 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import check_count, fibonacci
-from warpshadow.maths.sh import check_order, equirectangular_directions
+from warpshadow.maths.sh import check_order
 
 _DARKEST = 1e-3  # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
 
@@ -28,7 +27,7 @@ class Light(Free):
         order: Number of SH bands; None with ``directions``.
         directions: In place of ``order`` the number of cells, whose radiance is the exponential of a value and so never
             negative: sharper light, and a longer way to it.
-        nonnegativity: Weight of the mean square of what is negative in spherical harmonics [targets' radiance].
+        nonnegativity: Weight of the mean square of negative radiance in spherical harmonics [targets' radiance].
         smoothness: Weight of the mean square of differences between neighboring cells [targets' radiance].
     """
 
@@ -54,7 +53,7 @@ class Light(Free):
 
     @functools.cached_property
     def basis(self) -> Basis:
-        """What the light is expressed in."""
+        """The basis of the light."""
         return CellBasis(fibonacci(self.directions)) if self.order is None else HarmonicBasis(self.order)
 
     def start(self, setting: Setting) -> Values:
@@ -70,12 +69,12 @@ class Light(Free):
             return values["log_radiance"].exp() * setting.unit
         return values["coefficients"] * (setting.unit * np.sqrt(4 * np.pi))
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Light the world with it."""
         world.light = self.coefficients(values, setting)
 
-    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """What is negative, and how neighboring cells differ."""
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Penalize negative radiance, and differences between neighboring cells."""
         if isinstance(self.basis, CellBasis):
             first, second = _neighbors(self.basis.size)
             radiance = values["log_radiance"].exp()
@@ -86,14 +85,11 @@ class Light(Free):
         radiance = setting.tensor(towards) @ values["coefficients"]
         return self.nonnegativity * torch.relu(-radiance).square().mean()
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
-        """Spherical harmonics stay what they are; cells become a map."""
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Spherical harmonics stay; cells become a map."""
         coefficients = self.coefficients(values, setting).cpu().numpy()
-        light: EnvironmentMap | np.ndarray = coefficients
-        if isinstance(self.basis, CellBasis):
-            towards = equirectangular_directions(64)
-            light = EnvironmentMap((self.basis.functions(towards.reshape(-1, 3)) @ coefficients).reshape(64, 128, 3))
-        found.scene = replace(found.scene, light=light)
+        light = self.basis.to_map(coefficients) if isinstance(self.basis, CellBasis) else coefficients
+        fitted.scene = replace(fitted.scene, light=light)
 
 
 @functools.cache

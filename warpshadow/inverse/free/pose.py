@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.torch import rotation_matrices
 
 _NO_TURN = {
@@ -34,8 +34,8 @@ class Pose(FreeOfBody):
         body: The body, its number or name.
         rotation: Parameters: "axis-angle" [radians], "quaternion" or "6d" (two columns).
         scale: Whether the size is free, too.
-        spread: By what angle candidates are turned [radians]: about each axis, either way, then about the eight
-            directions in their midst, then about any.
+        spread: Angle by which candidates are turned [radians]: about each axis, either way, then about the eight
+            directions between, then about any.
     """
 
     key: ClassVar[str] = "pose"
@@ -84,7 +84,7 @@ class Pose(FreeOfBody):
         moved = moved + body.scale * setting.extent(self.number) * values["shift"]
         return rotation, moved - scale * rotation @ middle, scale
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Move the body."""
         rotation, translation, scale = self._posed(values, setting)
         world.rotations[self.number] = rotation
@@ -92,16 +92,16 @@ class Pose(FreeOfBody):
         world.scales[self.number] = scale
         world.moving.add(self.number)
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Move the body."""
         from scipy.spatial.transform import Rotation
 
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
         vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
-        found.change_body(self.number, rotation=vector, translation=translation, scale=float(scale))
+        fitted.change_body(self.number, rotation=vector, translation=translation, scale=float(scale))
 
-    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """The pose."""
-        body = found.scene.bodies[self.number]
+        body = fitted.scene.bodies[self.number]
         names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
-        return {f"{self.called(found)}.{name}": getattr(body, name) for name in names}
+        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in names}

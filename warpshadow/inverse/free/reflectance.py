@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.world import Found, Setting, World
-from warpshadow.pipeline.renderer import Renderer
+from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.stages.textures.seen import fill_unseen
 
@@ -57,7 +57,7 @@ class Albedo(FreeOfBody):
             return {"color": setting.tensor(np.broadcast_to(body.albedo, (body.mesh.vertex_count, 3)))}
         return {"color": setting.tensor(_one_color(body)[None])}
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Color the body."""
         world.albedo[self.number] = values["color"]
 
@@ -65,26 +65,26 @@ class Albedo(FreeOfBody):
         """Reflectances are in [0, 1]."""
         values["color"].clamp_(0, 1)
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Color the body."""
         color = values["color"].cpu().numpy()
-        found.change_body(self.number, albedo=color if self.per_vertex else color[0])
+        fitted.change_body(self.number, albedo=color if self.per_vertex else color[0])
 
-    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """The color, of a body that has one."""
-        body = found.scene.bodies[self.number]
-        return {} if self.per_vertex else {f"{self.called(found)}.albedo": body.albedo}
+        body = fitted.scene.bodies[self.number]
+        return {} if self.per_vertex else {f"{self.called(fitted)}.albedo": body.albedo}
 
 
 @dataclass(frozen=True)
 class Texture(FreeOfBody):
     """The reflectance of a body as an image, which needs uvs.
 
-    A texture that may be anything explains every shadow. What it is likely to be is said by three weights:
+    A texture that may be anything explains every shadow. Three weights make likely textures cheap:
 
     Args:
         body: The body, its number or name.
-        size: Height and width [texels]; by default those of the body's texture, or 256 × 256.
+        size: Height and width [texels]; by default the size of the body's texture, or 256 × 256.
         smoothness: Weight of the mean square of differences between neighboring texels: no edges.
         total_variation: Weight of the mean length of these differences [Rudin et al. 1992]: few edges, and sharp ones.
         palette: Weight of the mean square distance of texels to the nearest of a few colors, which are free, too.
@@ -108,7 +108,7 @@ class Texture(FreeOfBody):
             object.__setattr__(self, "size", tuple(self.size))
         for name in ("smoothness", "total_variation", "palette"):
             check.nonnegative(name, getattr(self, name))
-        check.whole("colors", self.colors, least=2)
+        check.whole("colors", self.colors, minimum=2)
 
     def check_scene(self, scene: Scene) -> None:
         """Raise ValueError for a body that cannot have a texture."""
@@ -129,7 +129,7 @@ class Texture(FreeOfBody):
         return {"texels": texels} | ({"palette": self._first_colors(texels)} if self.palette else {})
 
     def _first_colors(self, texels: torch.Tensor) -> torch.Tensor:
-        """Colors of a palette, [color, 3]: quantiles of the texels by brightness; grays where those are one."""
+        """Colors of a palette, [color, 3]: quantiles of the texels by brightness; grays if all texels are alike."""
         flat = texels.reshape(-1, 3)
         shares = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
         if flat.std(dim=0).max() < _PLAIN:
@@ -137,12 +137,12 @@ class Texture(FreeOfBody):
         ranked = flat[flat.sum(dim=1).argsort()]
         return ranked[(shares * len(flat)).long()]
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Cover the body."""
         world.textures[self.number] = values["texels"]
 
-    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """What is unlikely of a texture."""
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Penalty of unlikely textures."""
         texels = values["texels"]
         energies = []
         if self.smoothness or self.total_variation:
@@ -162,10 +162,10 @@ class Texture(FreeOfBody):
         for colors in values.values():
             colors.clamp_(0, 1)
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
         texels = values["texels"].cpu().numpy()
-        found.change_body(self.number, texture=texels)
-        unshadowed = replace(found.scene, visibility=Visibility(method="none"), bounces=0)
-        renderer = Renderer(unshadowed, cameras=found.cameras, device=str(setting.device))
-        found.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))
+        fitted.change_body(self.number, texture=texels)
+        unshadowed = replace(fitted.scene, visibility=Visibility(method="none"), bounces=0)
+        renderer = SceneRenderer(unshadowed, cameras=fitted.cameras, device=str(setting.device))
+        fitted.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))

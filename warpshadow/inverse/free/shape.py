@@ -11,7 +11,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import SPHERE_METHODS, Body, Scene
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.torch import apply, rotation_matrices
@@ -30,8 +30,8 @@ def _sphere_count(body: Body) -> int:
 class Deformation(FreeOfBody):
     """The shape of a body, by embedded deformation (Sumner et al. 2007); its spheres are the nodes (the paper, sec. 4).
 
-    A node's matrix is a rotation times a symmetric stretch. Values are those of the nodes before they are smoothed over
-    the graph, T = (I + λ L)⁻¹ u, L the graph's Laplacian over the mean number of neighbors: so that a step of the
+    A node's matrix is a rotation times a symmetric stretch. The parameters are node values before they are smoothed
+    over the graph, T = (I + λ L)⁻¹ u, L the graph's Laplacian over the mean number of neighbors: so that a step of the
     descent moves parts of the body, and not nodes one by one (Nicolet et al. 2021, section 3.2).
 
     Args:
@@ -84,14 +84,14 @@ class Deformation(FreeOfBody):
         points = apply(graph.points, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))
         return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Bend the body."""
         points, centers = self._deformed(values, setting)
         has_spheres = len(setting.spheres(self.number)) > 0  # without shadows there are nodes, but no spheres
         world.rest = world.renderer.deformed(self.number, points, centers if has_spheres else None, rest=world.rest)
         world.moving.add(self.number)
 
-    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Differences between where neighboring nodes take each other, and stretches."""
         graph = setting.graph(self.number, self.count)
         matrices, shifts, stretches = self._moved_nodes(values, setting)
@@ -99,14 +99,14 @@ class Deformation(FreeOfBody):
         gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.number) ** 2)
         return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Bend the body, mesh and spheres."""
         points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
-        mesh = replace(found.scene.bodies[self.number].mesh, positions=points)
-        found.change_body(self.number, mesh=mesh, self_shadows="spheres")  # as in the images of the fit
-        spheres = found.spheres(self.number)
+        mesh = replace(fitted.scene.bodies[self.number].mesh, positions=points)
+        fitted.change_body(self.number, mesh=mesh, self_shadows="spheres")  # as in the images of the fit
+        spheres = fitted.spheres(self.number)
         if len(spheres):
-            found.change_body(self.number, blockers=Spheres(centers, spheres.radii))
+            fitted.change_body(self.number, blockers=Spheres(centers, spheres.radii))
 
 
 @dataclass(frozen=True)
@@ -136,18 +136,18 @@ class Radii(FreeOfBody):
         """The radii as they are."""
         return {"log": setting.tensor(np.zeros(len(setting.spheres(self.number))))}
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Swell and shrink the spheres."""
         radii = setting.tensor(setting.spheres(self.number).radii) * values["log"].exp()
         world.rest = world.renderer.deformed(self.number, radii=radii, rest=world.rest)
         world.moving.add(self.number)
 
-    def energy(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Logarithms of the factors."""
         return self.persistence * values["log"].square().mean() if self.persistence else None
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Swell and shrink the spheres."""
-        spheres = found.spheres(self.number)
+        spheres = fitted.spheres(self.number)
         radii = spheres.radii * values["log"].exp().cpu().numpy()
-        found.change_body(self.number, blockers=Spheres(spheres.centers, radii), self_shadows="spheres")
+        fitted.change_body(self.number, blockers=Spheres(spheres.centers, radii), self_shadows="spheres")

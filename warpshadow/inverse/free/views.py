@@ -1,4 +1,4 @@
-"""What is free of each view: its exposure and its camera."""
+"""Free parameters of each view: its exposure and its camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import Found, Setting, World
+from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.torch import rotation_matrices
 
 
@@ -27,17 +27,17 @@ class Exposure(Free):
         """A factor of 1."""
         return {"log": setting.tensor(np.zeros(len(setting.cameras)))}
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Expose the world's images."""
         world.exposures = values["log"].exp()
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Factors of the views."""
-        found.exposures = values["log"].exp().tolist()
+        fitted.exposures = values["log"].exp().tolist()
 
-    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """A factor of each view."""
-        return {"exposure": found.exposures}
+        return {"exposure": fitted.exposures}
 
 
 @dataclass(frozen=True)
@@ -76,27 +76,27 @@ class CameraPose(Free):
             intrinsics = intrinsics * zoom
         return rotations, -(rotations @ moved[..., None])[..., 0], intrinsics
 
-    def place(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Move the cameras."""
         rotations, translations, intrinsics = self._posed(values, setting, world.cameras)
         world.clip_matrices = world.renderer.clip_matrices(rotations, translations, intrinsics)
 
-    def settle(self, values: Values, setting: Setting, found: Found) -> None:
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Move the cameras."""
         rotations, translations, intrinsics = (
             part.cpu().numpy().astype(np.float64) for part in self._posed(values, setting, setting.cameras)
         )
-        found.cameras = [
+        fitted.cameras = [
             replace(camera, rotation=rotations[view], translation=translations[view], intrinsics=intrinsics[view])
-            for view, camera in enumerate(found.cameras)
+            for view, camera in enumerate(fitted.cameras)
         ]
-        found.scene = replace(found.scene, camera=found.cameras[0])
+        fitted.scene = replace(fitted.scene, camera=fitted.cameras[0])
 
-    def figures(self, found: Found) -> Mapping[str, ArrayLike]:
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """World to camera of each view, and its focal length [pixels]."""
-        figures = {
-            "camera.rotation": [camera.rotation for camera in found.cameras],
-            "camera.translation": [camera.translation for camera in found.cameras],
+        summary = {
+            "camera.rotation": [camera.rotation for camera in fitted.cameras],
+            "camera.translation": [camera.translation for camera in fitted.cameras],
         }
-        focal = {"camera.focal": [camera.intrinsics[0, 0] for camera in found.cameras]} if self.focal else {}
-        return figures | focal
+        focal = {"camera.focal": [camera.intrinsics[0, 0] for camera in fitted.cameras]} if self.focal else {}
+        return summary | focal

@@ -1,1 +1,1 @@
-"""How light bounces: which bodies send it, how often, and what receivers get of it. Imported where a scene asks."""
+"""Bounced light: which bodies send it, how often, and how receivers gather it. Imported where a scene asks."""

@@ -1,4 +1,4 @@
-"""Gathering: what receivers get of the light that patches send, given what stands in for the bodies that send it.
+"""Gathering: bounced light at receivers, given the proxies of the bodies that send it.
 
 A body's patches send to the body itself by form factors, a flat body's by its grid, and others' by the spheres that
 stand in for them. Where the light of a cell is blocked, one of these takes its place.
@@ -16,25 +16,25 @@ import warp as wp
 from warpshadow.device.batch import common_batch, concatenate, cut, expand, expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.bounces.own_factors import OwnFactors
 from warpshadow.pipeline.bounces.patches import Senders
+from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.directional import Cells
-from warpshadow.pipeline.groups import Group, Seen, solid_bodies
+from warpshadow.pipeline.directional import ProjectedCells
+from warpshadow.pipeline.groups import Group, Transmittance, solid_bodies
 from warpshadow.pipeline.lighting import joined
-from warpshadow.pipeline.node import Call, Node, Source
+from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.scene.scene import Visibility
-from warpshadow.stages.bounces.exitance import patches_of_nodes, sphere_exitance
-from warpshadow.stages.bounces.flat_light import flat_light
-from warpshadow.stages.bounces.openness import shown_areas, turn_from_flats
-from warpshadow.stages.bounces.own_light import own_light
+from warpshadow.stages.bounces.plane_light import plane_light
+from warpshadow.stages.bounces.projected_areas import find_projected_areas, turn_from_planes
+from warpshadow.stages.bounces.proxies import place_proxies
+from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance, patches_of_clusters
+from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
-from warpshadow.stages.bounces.stand_ins import place_stand_ins
-from warpshadow.stages.flats.fronts import NearestBlockers, find_fronts
-from warpshadow.stages.flats.prepared import FlatBody, Flats
+from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
-from warpshadow.stages.visibility.walk import Clusters, find_clusters
+from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
 CELLS = fibonacci(64)
 """Where receivers look for bounced light if direct light is found in harmonics."""
@@ -43,69 +43,75 @@ ALL_FLAT = "all that reflects is flat"
 """Why no body sends light to itself, in words."""
 
 
-class SeenCells(NamedTuple):
-    """What a part of receivers sees in cells of directions."""
+class CellTransmittance(NamedTuple):
+    """Transmittance of a part of the receivers in cells of directions."""
 
-    past_own: wp.array | None  # [batch, receiver, cell], transmittance past its own body; None where that is 1
-    past_solid: wp.array  # [batch, receiver, cell], past all bodies but flats, its own included
+    transmittance_self: (
+        wp.array | None
+    )  # [batch, receiver, cell], transmittance past its own body; None where that is 1
+    transmittance_spheres: wp.array  # [batch, receiver, cell], past all bodies but planes, its own included
     directions: np.ndarray  # [cell, 3]
 
 
 def see_cells(
-    method: SphereMethod, group: Group, seen: Seen, taken: Any, spheres: tuple[wp.array, wp.array]
-) -> SeenCells:
-    """What a group sees in cells of directions.
+    method: SphereMethod, group: Group, seen: Transmittance, projected_light: Any, spheres: tuple[wp.array, wp.array]
+) -> CellTransmittance:
+    """Transmittance of a group in cells of directions.
 
     Args:
         method: How light is blocked.
         group: The receivers.
-        seen: What they see of direct light.
-        taken: What the method takes of that.
+        seen: Visibility of direct light.
+        projected_light: Projected direct light.
         spheres: Centers and radii of all spheres.
     """
-    assembly = method.assembly
-    if isinstance(taken, Cells):
-        directions, past_own = taken.directions, seen.past_own
-        past_solid = seen.past_all if seen.past_solid is None else seen.past_solid
+    merged_scene = method.merged_scene
+    if isinstance(projected_light, ProjectedCells):
+        directions, transmittance_self = projected_light.directions, seen.transmittance_self
+        transmittance_spheres = (
+            seen.transmittance_total if seen.transmittance_spheres is None else seen.transmittance_spheres
+        )
     else:
-        directions, past_own = CELLS, None
-        past_solid = _transmittance(method, group, solid_bodies(assembly), spheres, directions)
-    if past_own is None and group.body is not None and not assembly.is_flat[group.body]:
-        past_own = _transmittance(method, group, [group.body], spheres, directions)
-    if past_solid is None:
-        past_solid = wp.full((*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device)
-    return SeenCells(past_own, past_solid, directions)
+        directions, transmittance_self = CELLS, None
+        transmittance_spheres = _transmittance(method, group, solid_bodies(merged_scene), spheres, directions)
+    if transmittance_self is None and group.body is not None and not merged_scene.is_flat[group.body]:
+        transmittance_self = _transmittance(method, group, [group.body], spheres, directions)
+    if transmittance_spheres is None:
+        transmittance_spheres = wp.full(
+            (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device
+        )
+    return CellTransmittance(transmittance_self, transmittance_spheres, directions)
 
 
 def _transmittance(
     method: SphereMethod, group: Group, bodies: list[int], spheres: tuple[wp.array, wp.array], directions: np.ndarray
 ) -> wp.array | None:
     """Transmittance of the spheres of some bodies, [batch, receiver, cell]; None without any."""
-    blocking = method.assembly.spheres_of(bodies, spheres)
+    blocking = method.merged_scene.spheres_of(bodies, spheres)
     if not (blocking[1].shape[1] and group.points.size):
         return None
     softness, merging = method.visibility.softness, method.visibility.merging
     return transmittance(group.points, group.normals, *blocking, directions, softness=softness, merging=merging)
 
 
-class PlacedFlats(NamedTuple):
+class SenderPlanes(NamedTuple):
     """Flat bodies."""
 
-    all: Flats
+    all: PlaneBlockers
     number: dict[int | None, int]  # of each among them, by the number of the body
 
 
-class ShownPatches(NamedTuple):
-    """Patches as receivers see them, by the spheres that stand in for those of bodies that are not flat."""
+class ProjectedPatches(NamedTuple):
+    """Patches of bodies that are not flat, as their proxy spheres send them."""
 
     areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]
     centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
     radii: wp.array  # likewise, 0 for patches of flat bodies
-    clusters: Clusters
+    clusters: ClusterTree
 
 
-class StandIns:
-    """What stands in for bodies that send light: flats for those in a plane, spheres for all others.
+class Proxies:
+    """Proxies of sending bodies: plane bodies for themselves, spheres for all others.
 
     Args:
         senders: The bodies.
@@ -113,30 +119,30 @@ class StandIns:
     """
 
     def __init__(self, senders: Senders, merging: float):
-        self.senders, self.assembly, self.merging = senders, senders.assembly, merging
+        self.senders, self.merged_scene, self.merging = senders, senders.merged_scene, merging
 
     @functools.cached_property
-    def flats(self) -> PlacedFlats | None:
+    def planes(self) -> SenderPlanes | None:
         """The flat bodies among them; None without any."""
-        assembly, senders = self.assembly, self.senders
-        numbers = [number for number in senders.bodies if assembly.is_flat[number]]
+        merged_scene, senders = self.merged_scene, self.senders
+        numbers = [number for number in senders.bodies if merged_scene.is_flat[number]]
         if not numbers:
             return None
         bodies = []
         for number in numbers:
-            place, body = senders.bodies.index(number), assembly.scene.bodies[number]
+            place, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
             grid = senders.patches[place].grid
             assert grid is not None
-            starts = int(assembly.first_vertex[number]), int(senders.first[place])
-            bodies.append(FlatBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
-        counts = len(senders.areas), int(assembly.first_vertex[-1])
-        found = Flats.of(bodies, *counts, device=assembly.device)
-        return PlacedFlats(found, {number: k for k, number in enumerate(numbers)})
+            starts = int(merged_scene.first_vertex[number]), int(senders.first[place])
+            bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
+        counts = len(senders.areas), int(merged_scene.first_vertex[-1])
+        form_factors = PlaneBlockers.of(bodies, *counts, device=merged_scene.device)
+        return SenderPlanes(form_factors, {number: k for k, number in enumerate(numbers)})
 
     @functools.cached_property
     def solid(self) -> list[int]:
         """The bodies for which spheres stand in."""
-        return solid_bodies(self.assembly)
+        return solid_bodies(self.merged_scene)
 
     @functools.cached_property
     def dark(self) -> list[int]:
@@ -144,25 +150,25 @@ class StandIns:
         return [body for body in self.solid if body not in self.senders.bodies]
 
     def span_of(self, body: int | None) -> tuple[int, int]:
-        """Where the stand-ins of a body begin and end."""
+        """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
             place = self.senders.bodies.index(body)
             return int(first[place]), int(first[place + 1])
-        begin, end = self.assembly.spheres_among(self.dark, body)
+        begin, end = self.merged_scene.spheres_among(self.dark, body)
         return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
     @functools.cached_property
-    def patches_of_nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The patches of each stand-in, and of those that they merge into: where they begin, and numbers."""
-        count = int(self.assembly.sphere_counts[self.dark].sum())
+    def patches_of_clusters(self) -> tuple[np.ndarray, np.ndarray]:
+        """The patches of each proxy, and of the clusters that they merge into: where they begin, and numbers."""
+        count = int(self.merged_scene.sphere_counts[self.dark].sum())
         numbers = np.arange(len(self.senders.areas))
-        return patches_of_nodes(numbers, np.full(len(numbers) + count, -1), merging=self.merging)
+        return patches_of_clusters(numbers, np.full(len(numbers) + count, -1), merging=self.merging)
 
     @functools.cached_property
     def _blockers(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sphere of its body beside each patch, −1 for none, and the radius of its stand-in in that sphere's."""
-        rest, first_sphere, senders = self.assembly.rest, self.assembly.first_sphere, self.senders
+        """The sphere of its body beside each patch, −1 for none, and the radius of its proxy in that sphere's."""
+        rest, first_sphere, senders = self.merged_scene.rest, self.merged_scene.first_sphere, self.senders
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)
         start = 0
@@ -185,59 +191,61 @@ class StandIns:
     def shown(
         self,
         sources: Receivers,
-        cells: list[SeenCells],
+        cells: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
-    ) -> ShownPatches:
+    ) -> ProjectedPatches:
         """Patches as receivers see them.
 
         Args:
             sources: Where they are lit.
-            cells: What the sources see, in parts.
+            cells: Transmittance of the sources, in parts.
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
-        normals, flats, senders = sources.normals, self.flats, self.senders
-        centers, radii = self.assembly.spheres_of(self.solid, spheres)
-        if flats is not None:
+        normals, planes, senders = sources.normals, self.planes, self.senders
+        centers, radii = self.merged_scene.spheres_of(self.solid, spheres)
+        if planes is not None:
             numbers, points, device = self.blocker_of_source, sources.points, normals.device
             of_sources = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_sources, frames, flats.all)
-            normals = turn_from_flats(points, normals, radii, numbers, fronts, frames, flats.all)
+            fronts = find_fronts(points, normals, None, of_sources, frames, planes.all)
+            normals = turn_from_planes(points, normals, radii, numbers, fronts, frames, planes.all)
         rows = [
-            wp.full_like(part.past_solid, 1.0, requires_grad=False) if part.past_own is None else part.past_own
+            wp.full_like(part.transmittance_spheres, 1.0, requires_grad=False)
+            if part.transmittance_self is None
+            else part.transmittance_self
             for part in cells
         ]
-        passing = joined([row.reshape((len(row), -1)) for row in rows])
+        transmittance = joined([row.reshape((len(row), -1)) for row in rows])
         directions = cells[0].directions
-        passing = passing.reshape((len(passing), len(senders.sides), len(directions)))
-        placed = place_stand_ins(sources, senders.mean, radii, *self._blockers)
+        transmittance = transmittance.reshape((len(transmittance), len(senders.sides), len(directions)))
+        placed = place_proxies(sources, senders.mean, radii, *self._blockers)
         if self.dark:
-            others = self.assembly.spheres_of(self.dark, spheres)
+            others = self.merged_scene.spheres_of(self.dark, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
             placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
-        areas = shown_areas(normals, passing, senders.mean, directions)
-        return ShownPatches(areas, *placed, find_clusters(*placed, self.merging))
+        areas = find_projected_areas(normals, transmittance, senders.mean, directions)
+        return ProjectedPatches(areas, *placed, find_clusters(*placed, self.merging))
 
 
-class Outgoing:
-    """What patches send, in the forms in which receivers take it; each is found when it is first asked for.
+class OutgoingRadiance:
+    """Radiosity of the patches in the forms that receivers gather; each is computed when first asked for.
 
     Args:
-        stand_ins: What stands in for the bodies whose patches they are.
+        proxies: Proxies of the bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
         shown: The patches as receivers see them.
-        frames: Where flat bodies are, vec3 of shape [batch, 3 · flat].
+        frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
     """
 
     def __init__(
         self,
-        stand_ins: StandIns,
+        proxies: Proxies,
         radiosity: wp.array,
-        shown: ShownPatches,
+        shown: ProjectedPatches,
         frames: wp.array,
     ):
-        self.stand_ins, self.senders, self.radiosity = stand_ins, stand_ins.senders, radiosity
+        self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
         self.shown, self.frames = shown, frames
 
     def of_body(self, body: int) -> wp.array:
@@ -246,24 +254,24 @@ class Outgoing:
         return cut(self.radiosity, *self.senders.first[place : place + 2].tolist())
 
     @functools.cached_property
-    def exitance(self) -> wp.array:
-        """Light that stand-ins of patches send towards cells, vec4 of shape [batch, node, cell]."""
-        stand_ins = self.stand_ins
-        return sphere_exitance(self.radiosity, self.shown.areas, self.senders.areas, *stand_ins.patches_of_nodes)
+    def proxy_radiance(self) -> wp.array:
+        """Light that proxies of patches send towards cells, vec4 of shape [batch, node, cell]."""
+        proxies = self.proxies
+        return find_proxy_radiance(self.radiosity, self.shown.areas, self.senders.areas, *proxies.patches_of_clusters)
 
 
 class Gathering:
-    """What receivers get of the light that patches send: G.
+    """Gather at receivers the light that patches send: G.
 
     Args:
         visibility: How spheres block light.
         senders: The bodies whose patches send light.
-        own_factors: Form factors of bodies for themselves.
+        self_form_factors: Form factors of bodies for themselves.
         given: Nodes that radiosity, receivers and spheres depend on.
         words: Number of receivers, in words.
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
-        only_others: Leave out what bodies send to themselves.
+        only_others: Leave out light from a body to itself.
 
     Attributes:
         stages: Nodes of its parts.
@@ -273,53 +281,53 @@ class Gathering:
         self,
         visibility: Visibility,
         senders: Senders,
-        own_factors: OwnFactors,
-        given: tuple[Node | Source, ...],
+        self_form_factors: SelfFormFactors,
+        arguments: tuple[Node | Input, ...],
         words: str | Callable[[], str],
         where: str = "",
         why_not: str = "",
         only_others: bool = False,
     ):
-        self._visibility, self._own_factors = visibility, own_factors
-        self._is_flat, sphere_counts = senders.assembly.is_flat, senders.assembly.sphere_counts
+        self._visibility, self._self_form_factors = visibility, self_form_factors
+        self._is_flat, sphere_counts = senders.merged_scene.is_flat, senders.merged_scene.sphere_counts
         solid = [body for body in senders.bodies if not self._is_flat[body]]
         idle = (
             "" if solid else ALL_FLAT,
             "" if len(solid) < len(senders.bodies) else "nothing flat reflects",
             "" if any(sphere_counts[body] for body in solid) else "nothing that reflects has spheres",
         )
-        functions = self._from_itself, self._from_flats, self._from_spheres
-        names = "own light", "flat light", "sphere light"
+        functions = self._from_itself, self._from_planes, self._from_spheres
+        names = "self light", "plane light", "sphere light"
         stages = tuple(
-            Node(f"{name}{where}", function, *given, items=words, idle=why_not or why, keeps=False)
+            Node(f"{name}{where}", function, *arguments, items=words, idle=why_not or why, caches=False)
             for name, function, why in zip(names, functions, idle, strict=True)
         )
         self.stages = stages[1:] if only_others else stages
 
-    def run(self, call: Call, group: Group, cells: SeenCells, outgoing: Outgoing) -> list[wp.array]:
-        """What a group gets in each way in which it gets some, vec3 of shape [batch, receiver]."""
-        found = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
-        return [light for light in found if light is not None]
+    def run(self, call: Call, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> list[wp.array]:
+        """Bounced light of a group by each path: planes, spheres, its own body; vec3 of shape [batch, receiver]."""
+        form_factors = [node.run(call, group, cells, outgoing) for node in self.stages if not node.idle]
+        return [light for light in form_factors if light is not None]
 
-    def _from_itself(self, group: Group, _: SeenCells, outgoing: Outgoing) -> wp.array | None:
+    def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:
             return None
         assert group.body is not None and group.places is not None
-        return own_light(self._own_factors.of(group.body), outgoing.of_body(group.body), *group.places)
+        return self_light(self._self_form_factors.of(group.body), outgoing.of_body(group.body), *group.places)
 
-    def _from_flats(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array:
-        flats = outgoing.stand_ins.flats
-        assert flats is not None
-        skip = flats.number.get(group.body)
-        points, fronts = group.among(outgoing.frames, flats.all, skip)
-        given = points, group.normals, cells.past_solid, outgoing.frames, outgoing.radiosity, flats.all
-        return flat_light(*given, cells.directions, fronts=fronts, skip=skip)
+    def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
+        planes = outgoing.proxies.planes
+        assert planes is not None
+        skip = planes.number.get(group.body)
+        points, fronts = group.among(outgoing.frames, planes.all, skip)
+        arguments = points, group.normals, cells.transmittance_spheres, outgoing.frames, outgoing.radiosity, planes.all
+        return plane_light(*arguments, cells.directions, fronts=fronts, skip=skip)
 
-    def _from_spheres(self, group: Group, cells: SeenCells, outgoing: Outgoing) -> wp.array | None:
+    def _from_spheres(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        shown, exitance = outgoing.shown, outgoing.exitance
-        count = common_batch({"geometry": group.points, "light": exitance, "stand-ins": shown.radii})
+        shown, proxy_radiance = outgoing.shown, outgoing.proxy_radiance
+        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": shown.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
         centers, radii = expand(shown.centers, count), expand(shown.radii, count)
         return sphere_light(
@@ -327,12 +335,12 @@ class Gathering:
             normals,
             centers,
             radii,
-            exitance,
-            expand_rows(cells.past_solid, count),
-            cells.past_own,
+            proxy_radiance,
+            expand_rows(cells.transmittance_spheres, count),
+            cells.transmittance_self,
             cells.directions,
             softness=self._visibility.softness,
             merging=self._visibility.merging,
-            skip=outgoing.stand_ins.span_of(group.body),
+            skip=outgoing.proxies.span_of(group.body),
             clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,
         )

@@ -1,4 +1,4 @@
-"""Patches of a scene: the bodies that send bounced light, where they are lit, and what they reflect."""
+"""Patches of a scene: the bodies that send bounced light, their sources, and their reflectance."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import warp as wp
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import rows
 from warpshadow.maths.plane import plane_normal
-from warpshadow.pipeline.assembly import Assembly
-from warpshadow.pipeline.flats import SceneFlats
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.patches import (
@@ -22,15 +22,18 @@ from warpshadow.stages.bounces.patches import (
     PIECES,
     SOURCES,
     Patches,
-    find_flat_patches,
     find_patches,
+    find_plane_patches,
 )
 from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_SCENE_PATCHES = 4096
-"""Patches of a scene of more than 16 bodies, but no fewer than LEAST_PATCHES of each."""
+_SCENE_PATCHES = 2048
+"""Patches of a scene of more than 8 bodies, but no fewer than _FEWEST of each."""
+
+_FEWEST = 32
+"""Patches of each of many bodies, at least: a side of a box has some."""
 
 _SCENE_SOURCES = 4096
 """Sources of the patches of a scene, but at least one of each."""
@@ -46,38 +49,41 @@ class ScenePatches:
     """The patches of a scene's bodies; each body's are found when they are first asked for.
 
     Args:
-        assembly: The bodies.
+        merged_scene: The bodies.
 
     Attributes:
-        flats: Those that lie in a plane.
+        planes: The flat bodies among them.
     """
 
-    def __init__(self, assembly: Assembly):
-        self.assembly = assembly
-        self._scene_flats = SceneFlats(assembly)
-        self.flats = self._scene_flats.numbers
+    def __init__(self, merged_scene: MergedScene):
+        self.merged_scene = merged_scene
+        self._scene_planes = ScenePlanes(merged_scene)
+        self.planes = self._scene_planes.numbers
         self._of_body: dict[int, Patches] = {}
         self._means: dict[tuple, SparseMatrix] = {}
         self._senders: dict[tuple[int, ...], Senders] = {}
 
     def of_body(self, number: int) -> Patches:
-        """Patches of a body in its own frame; those of a flat one are a grid."""
+        """Patches of a body in its own frame; a flat body has a grid of them."""
         if number not in self._of_body:
-            mesh, is_two_sided = self.assembly.scene.bodies[number].mesh, bool(self.assembly.is_two_sided[number])
+            mesh, is_two_sided = (
+                self.merged_scene.scene.bodies[number].mesh,
+                bool(self.merged_scene.is_two_sided[number]),
+            )
             corners = mesh.positions, mesh.surface.faces
-            if self.assembly.is_flat[number]:
-                others = self._scene_flats.others(number)
+            if self.merged_scene.is_flat[number]:
+                others = self._scene_planes.others(number)
                 normal = plane_normal(mesh.positions[mesh.surface.faces].astype(np.float64))
                 heights = [(points - mesh.positions[mesh.surface.faces[0, 0]]) @ normal for points in others]
                 # nobody sees the back of a ground
                 is_two_sided = is_two_sided and (not others or bool(min(map(np.mean, heights)) < 0))
                 points = np.concatenate(others) if others else None
-                self._of_body[number] = find_flat_patches(*corners, is_two_sided=is_two_sided, others=points)
+                self._of_body[number] = find_plane_patches(*corners, is_two_sided=is_two_sided, others=points)
             else:
                 counts = self._counts
                 sources = max(1, min(SOURCES, _SCENE_SOURCES // sum(counts.values())))
-                find = functools.partial(find_patches, is_two_sided=is_two_sided, sources=sources)
-                self._of_body[number] = find(*corners, count=counts[number])
+                options = {"count": counts[number], "sources": sources, "device": self.merged_scene.device}
+                self._of_body[number] = find_patches(*corners, is_two_sided=is_two_sided, **options)
         return self._of_body[number]
 
     @functools.cached_property
@@ -86,28 +92,28 @@ class ScenePatches:
 
         So bodies of one shape that differ little in size have the same.
         """
-        bodies = self.assembly.scene.bodies
-        areas = {n: body.scale**2 * _area(body.mesh) for n, body in enumerate(bodies) if n not in self.flats}
+        bodies = self.merged_scene.scene.bodies
+        areas = {n: body.scale**2 * _area(body.mesh) for n, body in enumerate(bodies) if n not in self.planes}
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
-            share = _SCENE_PATCHES * area / total if total > 0 else LEAST_PATCHES
-            least = max(LEAST_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
-            most = MOST_PATCHES
+            share = _SCENE_PATCHES * area / total if total > 0 else _FEWEST
+            minimum = max(LEAST_PATCHES, len(bodies[number].mesh.surface.faces) // PIECES)
+            maximum = MOST_PATCHES
             if len(areas) * MOST_PATCHES > _SCENE_PATCHES:
-                most = min(most, int(2 ** np.floor(np.log2(max(share, LEAST_PATCHES)))))
-            counts[number] = min(least, most)
+                maximum = min(maximum, int(2 ** np.floor(np.log2(max(share, _FEWEST)))))
+            counts[number] = min(minimum, maximum)
         return counts
 
     def senders(self, materials: Materials) -> Senders:
         """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""
-        casting = [number for number in self.flats if self.assembly.scene.bodies[number].casts_shadow]
+        casting = [number for number in self.planes if self.merged_scene.scene.bodies[number].casts_shadow]
         bodies = tuple(
             number
-            for number in range(len(self.assembly.scene.bodies))
+            for number in range(len(self.merged_scene.scene.bodies))
             if number in casting or not materials.is_black(number)
         )
         if bodies not in self._senders:
-            self._senders[bodies] = Senders(self.assembly, bodies, [self.of_body(n) for n in bodies])
+            self._senders[bodies] = Senders(self.merged_scene, bodies, [self.of_body(n) for n in bodies])
         return self._senders[bodies]
 
     # ------------------------------------------------------------------------------------------ albedo
@@ -117,23 +123,26 @@ class ScenePatches:
         counts = [self.of_body(number).count for number in bodies]
 
         def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:
-            given = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
+            arguments = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
             total = None
-            for number in sorted(bodies, key=lambda n: given[n].requires_grad):  # so only what varies has an adjoint
+            # so only varying inputs have an adjoint
+            for number in sorted(bodies, key=lambda n: arguments[n].requires_grad):
                 image = images[number]
-                mean = self._mean(number, bodies, given[number].shape[1], None if image is None else image.shape[1:])
-                total = multiply(mean, given[number], plus=total)
+                mean = self._mean(
+                    number, bodies, arguments[number].shape[1], None if image is None else image.shape[1:]
+                )
+                total = multiply(mean, arguments[number], plus=total)
             return total
 
         return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
 
     def _mean(self, number: int, bodies: Sequence[int], color_count: int, size: tuple[int, int] | None) -> SparseMatrix:
-        """What patches of some bodies take of the colors of one, [patch, color]; of its texels if it has a size."""
+        """Weights of a body's colors in the patches of some bodies, [patch, color]; of its texels if it has a size."""
         key = number, tuple(bodies), color_count, size
         if key not in self._means:
             from scipy.sparse import csr_matrix, vstack
 
-            mesh, patches = self.assembly.scene.bodies[number].mesh, self.of_body(number)
+            mesh, patches = self.merged_scene.scene.bodies[number].mesh, self.of_body(number)
             shape = mesh.positions, mesh.surface.faces
             if size is not None:
                 assert mesh.uvs is not None and mesh.surface.uv_faces is not None
@@ -144,7 +153,7 @@ class ScenePatches:
                 means = mean_over_vertices(patches, *shape)
             others = {other: csr_matrix((self.of_body(other).count, color_count)) for other in bodies}
             matrix = vstack([*(others | {number: means}).values()])
-            self._means[key] = SparseMatrix.of(matrix, device=self.assembly.device)
+            self._means[key] = SparseMatrix.of(matrix, device=self.merged_scene.device)
         return self._means[key]
 
 
@@ -152,12 +161,12 @@ class Senders:
     """Bodies that send light, and their patches one after another.
 
     Args:
-        assembly: All bodies.
-        bodies: Those that reflect.
+        merged_scene: All bodies.
+        bodies: The bodies that reflect.
         patches: Of each of them.
 
     Attributes:
-        assembly, bodies, patches: As given.
+        merged_scene, bodies, patches: As given.
         first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].
         areas: Of all patches where the scene has their bodies [scene units²], float32 of shape [patch].
         sides: Side of a face that each source lies on, int32 of shape [source].
@@ -167,29 +176,31 @@ class Senders:
         mean: The matrix of means over sources, [patch, source].
     """
 
-    def __init__(self, assembly: Assembly, bodies: tuple[int, ...], patches: list[Patches]):
-        self.assembly, self.bodies, self.patches = assembly, bodies, patches
-        self.first = np.cumsum([0, *(each.count for each in patches)])
-        face_count = int(assembly.first_face[-1])
+    def __init__(self, merged_scene: MergedScene, bodies: tuple[int, ...], patches: list[Patches]):
+        self.merged_scene, self.bodies, self.patches = merged_scene, bodies, patches
+        self.first = np.cumsum([0, *(item.count for item in patches)])
+        face_count = int(merged_scene.first_face[-1])
         sides = [
-            each.sources.faces + int(assembly.first_face[number]) + face_count * each.sources.is_back
-            for number, each in zip(bodies, patches, strict=True)
+            item.sources.faces + int(merged_scene.first_face[number]) + face_count * item.sources.is_back
+            for number, item in zip(bodies, patches, strict=True)
         ]
-        owners = [each.sources.patches + first for each, first in zip(patches, self.first[:-1], strict=True)]
+        owners = [item.sources.patches + first for item, first in zip(patches, self.first[:-1], strict=True)]
         self.sides = _joined(sides, np.int32)
-        self.barycentrics = _joined([each.sources.barycentrics for each in patches], np.float32).reshape(-1, 3)
-        scales = [assembly.scene.bodies[number].scale for number in bodies]
-        areas = [scale**2 * each.areas for scale, each in zip(scales, patches, strict=True)]
+        self.barycentrics = _joined([item.sources.barycentrics for item in patches], np.float32).reshape(-1, 3)
+        scales = [merged_scene.scene.bodies[number].scale for number in bodies]
+        areas = [scale**2 * item.areas for scale, item in zip(scales, patches, strict=True)]
         self.areas = _joined(areas, np.float32)
         self.patch_of_source = _joined(owners, np.int32)
-        weights = _joined([each.sources.weights for each in patches], np.float32)
+        weights = _joined([item.sources.weights for item in patches], np.float32)
         self.body_of_patch = np.repeat(bodies, np.diff(self.first))
-        self._bodies = np.repeat(bodies, [len(each) for each in sides])
-        self.mean = mean_over_sources(self.patch_of_source, weights, int(self.first[-1]), device=assembly.device)
+        self._bodies = np.repeat(bodies, [len(item) for item in sides])
+        self.mean = mean_over_sources(self.patch_of_source, weights, int(self.first[-1]), device=merged_scene.device)
 
     def sources(self, positions: wp.array, normals: wp.array) -> Receivers:
         """The sources as receivers. Differentiable: positions and normals of all vertices, vec3 [batch, vertex]."""
-        return receivers_on_faces(positions, normals, self.assembly.faces, self.sides, self.barycentrics, self._bodies)
+        return receivers_on_faces(
+            positions, normals, self.merged_scene.faces, self.sides, self.barycentrics, self._bodies
+        )
 
 
 def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import common_batch
-from warpshadow.pipeline.assembly import Assembly
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_words
-from warpshadow.pipeline.node import Node, Source
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.light_samples import sample_map
-from warpshadow.stages.path_tracing import Surfaces, trace_bounces
+from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.textures.pyramid import Textures
 
@@ -26,22 +26,22 @@ _RAYS_OF_PATH = 2
 
 
 def path_traced(
-    direct: Node, meshes: Node, points: LitPoints, light: Source, materials: Materials, *, samples: int, progress: bool
+    direct: Node, meshes: Node, points: LitPoints, light: Input, materials: Materials, *, samples: int, progress: bool
 ) -> Node:
-    """Shading with bounces: what direct light makes, and what paths bring.
+    """Shading with bounces: direct light, and light along paths.
 
     Args:
         direct: Node of the shading by direct light.
         meshes: Node of the meshes that block direct light, one for each instance.
-        points: What is lit.
+        points: The receivers.
         light: Known light.
-        materials: What the bodies reflect.
+        materials: Reflectance of the bodies.
         samples: Rays of direct light for each receiver.
         progress: Show progress where it takes longer than a second.
     """
-    assembly = points.assembly
-    most, paths = assembly.scene.bounces, -(-samples // _RAYS_OF_PATH)
-    bounces = _ALL if most == "all" else most
+    merged_scene = points.merged_scene
+    maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)
+    bounces = _ALL if maximum == "all" else maximum
 
     def trace(
         shading: wp.array,
@@ -62,16 +62,16 @@ def path_traced(
             return array[min(instance, len(array) - 1)]
 
         for instance in range(count):
-            surfaces = Surfaces(
-                _whole_mesh(assembly, of_instance(casting), of_instance(positions)),
+            surfaces = PathSurfaces(
+                _whole_mesh(merged_scene, of_instance(casting), of_instance(positions)),
                 of_instance(casting),
-                assembly.faces,
+                merged_scene.faces,
                 of_instance(normals),
                 of_instance(vertex_albedo),
                 None if textures is None else replace(textures, texels=of_instance(texels).reshape((1, -1))),
                 materials.texture_of_face,
-                assembly.uvs[0],
-                assembly.uv_faces,
+                merged_scene.uvs[0],
+                merged_scene.uv_faces,
             )
             places = of_instance(receivers.points), of_instance(receivers.normals)
             light = trace_bounces(surfaces, *places, drawn, bounces=bounces, paths=paths, progress=progress)
@@ -89,12 +89,12 @@ def path_traced(
         light,
         materials.vertex_albedo,
         materials.pyramids if materials.images else None,
-        items=lambda: f"{receiver_words(points)} × {paths:,} paths of {most} bounces",
+        items=lambda: f"{receiver_words(points)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 
 
-def _whole_mesh(assembly: Assembly, casting: wp.Mesh | None, positions: wp.array) -> wp.Mesh:
-    """The mesh of all bodies: that of those that cast shadows, where all do."""
-    is_whole = casting is not None and len(assembly.casting) == len(assembly.scene.bodies)
-    return casting if is_whole else assembly.mesh(positions)
+def _whole_mesh(merged_scene: MergedScene, casting: wp.Mesh | None, positions: wp.array) -> wp.Mesh:
+    """The mesh of all bodies: the mesh of shadow casters if that is all of them."""
+    is_whole = casting is not None and len(merged_scene.casting) == len(merged_scene.scene.bodies)
+    return casting if is_whole else merged_scene.mesh(positions)

@@ -8,16 +8,10 @@ import numpy as np
 import warp as wp
 
 from warpshadow.scene.scene import Bounces
-from warpshadow.stages.bounces.tail import with_tail
+from warpshadow.stages.bounces.tail import TERM_COUNT, with_tail
 
-OWN_BOUNCES = 8
+SELF_BOUNCES = 8
 """How often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then."""
-
-_COUNTED = 6
-"""Terms of the sum over bounces among patches, direct light being the first, before the tail; receivers find one bounce
-more. In a white room that is open in front the energy among patches is then 0.1% too low, with four terms 2.0%, and at
-an albedo of 0.9 0.01% and 0.9%. In a white room with a window it is 0.7% and 13% too low; with two bodies in it 13% and
-37%, for light stays between them and the floor."""
 
 
 def after_bounces(
@@ -26,32 +20,31 @@ def after_bounces(
     reflect: Callable[[wp.array, wp.array | None], wp.array],
     areas: np.ndarray,
     *,
-    own_bounces: int,
+    self_bounces: int,
 ) -> wp.array:
     """Radiosity of patches after all bounces but the last, which receivers find.
 
     Args:
         bounces: How often light bounces.
         light: Of the radiosity of patches, or of the sky alone for None: light on patches from the sky and from other
-            bodies, in whatever form ``reflect`` takes it.
+            bodies, in the form that ``reflect`` takes.
         reflect: Of that and of the radiosity, None for none: the radiosity with their own body's light for it.
         areas: Of patches, shape [patch].
-        own_bounces: How often a body's light for itself goes on: after the last of a number of bounces, and
+        self_bounces: How often a body's light for itself goes on: after the last of a number of bounces, and
             after each of "all"; 0 where there is none.
     """
-    past = light(None)
-    radiosity = reflect(past, None)
+    bounced_light = light(None)
+    radiosity = reflect(bounced_light, None)
     if bounces == "all":
         terms: list[wp.array] = []
-        for bounce in range(_COUNTED):
-            past = light(radiosity) if bounce else past
-            for _ in range(max(own_bounces, 1 if bounce else 0)):
-                radiosity = reflect(past, radiosity)
+        for bounce in range(TERM_COUNT):
+            bounced_light = light(radiosity) if bounce else bounced_light
+            for _ in range(max(self_bounces, 1 if bounce else 0)):
+                radiosity = reflect(bounced_light, radiosity)
             terms.append(radiosity)
-        before, last, now = terms[-3:]
-        return with_tail(before, last, now, areas)
-    for bounce in range(1, bounces + own_bounces):
+        return with_tail(terms, areas)
+    for bounce in range(1, bounces + self_bounces):
         if bounce < bounces:
-            past = light(radiosity)
-        radiosity = reflect(past, radiosity)
+            bounced_light = light(radiosity)
+        radiosity = reflect(bounced_light, radiosity)
     return radiosity

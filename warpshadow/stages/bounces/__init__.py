@@ -1,1 +1,1 @@
-"""Light that bounces: patches of bodies, and what they send to receivers."""
+"""Bounced light: patches of bodies, and their light at receivers."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # it is imported where a matrix is made
 
 
 def mean_over_vertices(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """The matrix of means over patches of what is interpolated between vertices.
+    """The matrix of means over patches of an attribute that is interpolated between vertices.
 
     Args:
         patches: Of a body.
@@ -23,7 +23,7 @@ def mean_over_vertices(patches: Patches, positions: np.ndarray, faces: np.ndarra
         faces: Its faces, shape [face, 3].
 
     Returns:
-        Shape [patch, vertex]; rows sum to 1, those of patches without an area are empty.
+        Shape [patch, vertex]; rows sum to 1, rows of patches without an area are empty.
     """
     weights = patches.pieces.corners.mean(axis=1)
     columns = faces[patches.pieces.faces]
@@ -51,11 +51,11 @@ def mean_over_texels(
         size: Height and width of the texture.
 
     Returns:
-        Shape [patch, texel]; rows sum to 1, those of patches without an area are empty.
+        Shape [patch, texel]; rows sum to 1, rows of patches without an area are empty.
     """
     corners = patches.pieces.corners.astype(np.float64) @ uvs.astype(np.float64)[uv_faces[patches.pieces.faces]]
-    along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    texels = np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2 * size[0] * size[1]
+    edge_u, edge_v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    texels = np.abs(edge_u[:, 0] * edge_v[:, 1] - edge_u[:, 1] * edge_v[:, 0]) / 2 * size[0] * size[1]
     sizes = np.array(level_sizes(*size))
     firsts = np.cumsum([0, *sizes.prod(axis=1)])
     level = np.minimum(np.rint(np.log2(np.maximum(texels, 1)) / 2).astype(int), len(sizes) - 1)
@@ -65,9 +65,9 @@ def mean_over_texels(
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     columns, weights = [], []
     for down, below in ((0, 1 - (y - top)), (1, y - top)):
-        for right, beside in ((0, 1 - (x - left)), (1, x - left)):
+        for right, column_weight in ((0, 1 - (x - left)), (1, x - left)):
             columns.append(first + (top + down) % height * width + (left + right) % width)
-            weights.append(below * beside)
+            weights.append(below * column_weight)
     areas = _piece_areas(patches, positions, faces)
     means = _mean(patches, areas, np.stack(columns, axis=1), np.stack(weights, axis=1), firsts[-1])
     parts = (means[:, start:end] for start, end in itertools.pairwise(firsts))
@@ -82,7 +82,7 @@ def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> 
 def _mean(
     patches: Patches, areas: np.ndarray, columns: np.ndarray, weights: np.ndarray, column_count: int
 ) -> csr_matrix:
-    """Means by area of what pieces [piece] take from some columns [piece, n]."""
+    """Means by area over pieces [piece] of their weights of columns [piece, n]."""
     from scipy.sparse import csr_matrix
 
     entries = areas[:, None] * weights
@@ -91,6 +91,6 @@ def _mean(
         counts = of_pieces >= 0
         rows = np.repeat(of_pieces[counts], columns.shape[1])
         parts.append((rows, columns[counts].ravel(), entries[counts].ravel()))
-    rows, chosen, values = (np.concatenate(each) for each in zip(*parts, strict=True))
+    rows, chosen, values = (np.concatenate(item) for item in zip(*parts, strict=True))
     totals = np.bincount(rows, values, patches.count)
     return csr_matrix((values / totals[rows], (rows, chosen)), shape=(patches.count, column_count))

@@ -1,4 +1,4 @@
-"""Colored transfer: what receivers get of free light once it has bounced, by a matrix for each color.
+"""Colored transfer: free light at receivers after bounces, by a matrix for each color.
 
     I_x = Σ_k T_xk ∘ L_k      for red, green and blue
 
@@ -44,7 +44,7 @@ Quad = wp.types.vector(length=12, dtype=wp.float32)
 
 
 def _as_quads(colors: wp.array) -> wp.array:
-    """View vec3 of shape [row, column] as rows of whole quads; what is left over is not in it."""
+    """View vec3 of shape [row, column] as rows of whole quads; the remainder is left out."""
     rows, columns = colors.shape
     shape, strides = (rows, columns // 4), (colors.strides[0], 4 * colors.strides[1])
     quads = wp.array(ptr=colors.ptr, dtype=Quad, shape=shape, strides=strides, device=colors.device)
@@ -65,7 +65,7 @@ def _multiply(
     # out
     products: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a row of an instance: its product, and what is added to that, which may be what it was."""
+    """A thread owns a row of an instance: its product, added to a term, which may be the previous value."""
     batch, row = split_row(first_row + wp.tid(), matrix.shape[0])
     quads = Quad(0.0)
     for quad in range(matrix_quads.shape[1]):

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 _COUNTED = 1 << 22
-"""Counts that are held at once [sites × patches]."""
+"""Counts that are held at once [receivers × patches]."""
 
 GOLDEN = (5**0.5 - 1) / 2
 """Turn from ray to ray, as a part of a full turn."""
 
 
 UNLIT = ("black surfaces", "insides of closed bodies")
-"""What rays meet that sends nothing, where it is told apart: in places of their own after all patches."""
+"""Places for rays that meet surfaces which send nothing, told apart from the sky: after all patches."""
 
 _BURIED = 0.5
 """Part of its hemisphere from which a point that sees insides of closed bodies counts as inside one itself."""
@@ -38,15 +38,15 @@ def _count_hits(
     of_faces: wp.array2d(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
-    first_site: int,
+    first_receiver: int,
     ray_count: int,
     # out
     counts: wp.array2d(dtype=wp.int32),
 ):
-    """A thread owns a site, whose counts are zero before."""
-    site = first_row + wp.tid()
-    point = points[site]
-    normal = normals[site]
+    """A thread owns a receiver, whose counts are zero before."""
+    receiver = first_row + wp.tid()
+    point = points[receiver]
+    normal = normals[receiver]
     if wp.length_sq(normal) == 0.0:
         return
     sign = wp.where(normal[2] < 0.0, -1.0, 1.0)  # [Duff et al. 2017]
@@ -54,7 +54,7 @@ def _count_hits(
     q = normal[0] * normal[1] * p
     tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * p, sign * q, -sign * normal[0])
     bitangent = wp.vec3(q, sign + normal[1] * normal[1] * p, -normal[1])
-    turn = wp.randf(wp.rand_init(29, first_site + site))
+    turn = wp.randf(wp.rand_init(29, first_receiver + receiver))
     for ray in range(ray_count):
         # a Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large
         square = (float(ray) + 0.5) / float(ray_count)
@@ -65,7 +65,7 @@ def _count_hits(
         if hit.face >= 0:
             patch = of_faces[wp.where(hit.is_back, 1, 0), hit.face]
             if patch >= 0:
-                counts[site, patch] = counts[site, patch] + 1
+                counts[receiver, patch] = counts[receiver, patch] + 1
 
 
 def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
@@ -97,75 +97,75 @@ def trace_factors(
 ) -> csr_matrix:
     """Trace which patches receivers see.
 
-        F_xp = 1/π ∫ [p is what x sees towards ω] max(n·ω, 0) dω
+        F_xp = 1/π ∫ [x sees p towards ω] max(n·ω, 0) dω
 
-    so that Σ_p F_xp B_p is what x reflects of the radiosity B of patches if it is white. Rays are as dense as the
+    so that Σ_p F_xp B_p is the light that x, if white, reflects of the radiosity B of patches. Rays are as dense as the
     cosine, on a lattice that is turned at random for each receiver; an F has a standard error of at most
     √(F (1 − F) / rays), and less, since a lattice is even.
 
     Args:
-        mesh: What rays meet; :func:`patch_mesh` makes it of a body.
+        mesh: The mesh for rays; :func:`patch_mesh` makes it of a body.
         of_faces: Patch of the front and the back of each of its faces, −1 for black, shape [2, face].
         count: Number of patches.
-        points: Receivers, which may lie on the mesh, shape [site, 3].
-        normals: Unit normals, shape [site, 3]. Where one is zero nothing is seen.
+        points: Receivers, which may lie on the mesh, shape [receiver, 3].
+        normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver.
         progress: Show a progress bar where it takes longer than a second.
 
     Returns:
-        F, float32 of shape [site, patch].
+        F, float32 of shape [receiver, patch].
 
     Differentiable: no.
     """
     from scipy.sparse import csr_matrix, vstack
 
     check.shape("of_faces", of_faces.shape, (2, "face"))
-    check.shape("points", points.shape, ("site", 3))
+    check.shape("points", points.shape, ("receiver", 3))
     check.shape("normals", normals.shape, points.shape)
     device = mesh.device
     owners = wp.array(of_faces, dtype=wp.int32, device=device)
-    found = []
+    factors = []
     for part in parts(len(points), _COUNTED // max(count, 1), progress):
         counts = wp.zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
         at = [wp.array(values[part], dtype=wp.vec3, device=device) for values in (points, normals)]
         inputs = [mesh.id, owners, *at, part.start, rays]
         launch(_count_hits, len(at[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)
-        found.append(csr_matrix(counts.numpy()))
-    if not found:
+        factors.append(csr_matrix(counts.numpy()))
+    if not factors:
         return csr_matrix((0, count), dtype=np.float32)
-    return (vstack(found, format="csr") / rays).astype(np.float32)
+    return (vstack(factors, format="csr") / rays).astype(np.float32)
 
 
 # ---------------------------------------------------------------------------------------------------- with direct light
 
 
-class SeenPatches(NamedTuple):
-    """What points see of patches."""
+class PatchFormFactors(NamedTuple):
+    """Form factors of points to patches."""
 
     factors: csr_matrix  # [point, patch]
     is_buried: np.ndarray  # whether they lie inside another body, bool of shape [point]
 
 
-def scaled_to_sky(found: csr_matrix, casts: np.ndarray, sky: np.ndarray | None) -> SeenPatches:
+def scaled_to_sky(factors: csr_matrix, casts: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
     """Scale form factors so that they and the sky of direct light fill the hemisphere: by (1 − s) / f.
 
     Args:
-        found: f by rays, of patches and of UNLIT, shape [point, patch + 2].
+        factors: f by rays, of patches and of UNLIT, shape [point, patch + 2].
         casts: Which of these cast shadows, bool of shape [patch + 2]; the others take nothing of the sky.
         sky: s, part of the hemisphere that is open where direct light is found, shape [point]; None for rays, too.
     """
     from scipy.sparse import diags
 
-    is_buried = found[:, [-1]].toarray().ravel() > _BURIED
+    is_buried = factors[:, [-1]].toarray().ravel() > _BURIED
     if sky is not None:
-        blocking = found @ diags(casts.astype(np.float32))
-        found = (found + scaled(blocking, ratios(1 - sky, np.asarray(blocking.sum(axis=1)).ravel()) - 1)).tocsr()
-    return SeenPatches(found[:, : -len(UNLIT)], is_buried)
+        blocking = factors @ diags(casts.astype(np.float32))
+        factors = (factors + scaled(blocking, ratios(1 - sky, np.asarray(blocking.sum(axis=1)).ravel()) - 1)).tocsr()
+    return PatchFormFactors(factors[:, : -len(UNLIT)], is_buried)
 
 
-def ratios(wanted: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Factors that take values to those wanted, 0 where these are negative; 1 where there is nothing."""
-    return np.where(given > 0, np.maximum(wanted, 0) / np.where(given > 0, given, 1), 1)
+def ratios(target: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Factors from values to the wanted ones, 0 where these are negative; 1 where there is nothing."""
+    return np.where(current > 0, np.maximum(target, 0) / np.where(current > 0, current, 1), 1)
 
 
 def scaled(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
@@ -178,5 +178,5 @@ def scaled(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
 def mean_outside(means: csr_matrix, is_buried: np.ndarray) -> csr_matrix:
     """Means over items that are not buried, [row, item]; as they were where all are."""
     left = scaled(means.T, (~is_buried).astype(np.float32)).T.tocsr()
-    wanted, sums = (np.asarray(each.sum(axis=1)).ravel() for each in (means, left))
-    return scaled(left, ratios(wanted, sums)) + scaled(means, (sums == 0).astype(np.float32))
+    target, sums = (np.asarray(item.sum(axis=1)).ravel() for item in (means, left))
+    return scaled(left, ratios(target, sums)) + scaled(means, (sums == 0).astype(np.float32))

@@ -1,4 +1,4 @@
-"""Radiosity of patches: what they send of the light that their sources get."""
+"""Radiosity of patches: the light that they reflect of the light at their sources."""
 
 import numpy as np
 import warp as wp
@@ -47,7 +47,7 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp
 
     Args:
         albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
-        light: What each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
+        light: Light that each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
         mean: The weights w, from :func:`mean_over_sources`.
 
     Returns:

@@ -1,18 +1,18 @@
-"""Light from spheres: what the bodies that block a receiver's cells send to it in place of what they block.
+"""Light from spheres: bodies that block a receiver's cells send light in place of the light they block.
 
 The spheres that block cell q in part are blended without sorting [McGuire and Bavoil 2013, weighted blended
-order-independent transparency], each by what it blocks, a_jq, and by nearness:
+order-independent transparency], each by its share a_jq of the blocked light, and by nearness:
 
     I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
     R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq,   w_j = 1 / (d_j² + (r_j/4)²)²
 
 T_q is the transmittance past the spheres, F_q that without them, so the light is all that a cell lacks; a_jq are the
 very shares of the transmittance, T_q = F_q Π_j (1 − a_jq); L and S are the light and the area that patches of a sphere
-show (:mod:`warpshadow.stages.bounces.exitance`); d is the distance to a sphere's center, r its radius. R is smooth in
-everything, stays within the radiosities of the patches, and does not depend on the scene's units. With the root of w a
-white ball behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
+show (:mod:`warpshadow.stages.bounces.proxy_radiance`); d is the distance to a sphere's center, r its radius. R is
+smooth in everything, stays within the radiosities of the patches, and does not depend on the scene's units. With the
+root of w a white ball behind a black one sent a tenth of its light past it, and patches behind a contact outshone it.
 
-The walk is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
+The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
 something is blocked; they are kept from the forward launch: 16 bytes a receiver and cell, touched only in bundles of
 cells that are blocked in part (a fifth of them on a ground around a body). N bounces keep N times that.
 """
@@ -26,7 +26,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.lanes import (
-    group_count,
+    block_count,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -37,18 +37,25 @@ from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
-from warpshadow.stages.visibility.culling import Cells, make_cells, make_cull, make_reaches, make_rises, make_widen
+from warpshadow.stages.visibility.culling import (
+    DirectionCells,
+    make_cells,
+    make_cull,
+    make_reaches,
+    make_rises,
+    make_widen,
+)
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
-from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres, merged_count
-from warpshadow.stages.visibility.walk import (
-    Clusters,
+from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters, merged_count
+from warpshadow.stages.visibility.traversal import (
+    ClusterTree,
     make_load_receivers,
     make_spheres,
-    make_walk,
-    pull_type,
-    receivers_type,
-    seen_type,
+    make_traversal,
+    receiver_lanes_type,
+    sphere_adjoint_type,
+    sphere_view_type,
 )
 
 _CORE = 0.25
@@ -66,35 +73,35 @@ _SUMS = 4
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of what a thread works on: a span of bundles of directions."""
+    """Struct of a thread's work: a span of bundles of directions."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
-    class Task:
-        cells: Cells
+    class LightTask:
+        cells: DirectionCells
         first_bundle: int
-        ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the walk's end
-        found: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
+        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
         blocked: wp.array(dtype=Lane)  # [direction] F − T; for the adjoint its product with the factor of R
         sums: wp.array(dtype=Lane)  # [direction · sum] of R
         pulls: wp.array(dtype=Lane)  # [direction] the adjoint of the light · R
         adj_light: Vectors
-        exitance: wp.array2d(dtype=wp.vec4)  # [node, direction]
-        adj_exitance: wp.array2d(dtype=wp.vec4)
+        proxy_radiance: wp.array2d(dtype=wp.vec4)  # [node, direction]
+        adj_radiance: wp.array2d(dtype=wp.vec4)
         inverse_size: float  # of 1/radius of the largest run of spheres
 
-    return Task
+    return LightTask
 
 
 @functools.cache
 def _make_begin(lanes: int) -> wp.Function:
     """Make the kernel function that finds out which receivers and directions a thread works on."""
-    Lane, Task = lane_type(lanes), _task_type(lanes)
+    Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    find_group, is_any_above, along = fn.find_group, fn.is_any_above, fn.along
+    find_block, is_any_above, dot_direction = fn.find_block, fn.is_any_above, fn.dot_direction
     load_receivers = make_load_receivers(True, lanes)
 
-    @wp.func(inline=False)
+    @wp.func(inline=lanes == 1)
     def begin(
         row: int,
         span: int,
@@ -102,29 +109,29 @@ def _make_begin(lanes: int) -> wp.Function:
         worker: int,
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
-        cells: Cells,
-        exitance: wp.array3d(dtype=wp.vec4),
+        spheres: SphereClusters,
+        cells: DirectionCells,
+        proxy_radiance: wp.array3d(dtype=wp.vec4),
         transmittance: wp.array3d(dtype=wp.float32),
         unblocked: wp.array3d(dtype=wp.float32),
-        is_kept: bool,
+        stores_sums: bool,
         scratch: wp.array3d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
         sums: wp.array2d(dtype=Lane),
     ):
-        batch, group = find_group(row, points.shape[1])
+        batch, group = find_block(row, points.shape[1])
         receivers = load_receivers(points, normals, batch, group)
         item = row * span_count + span
         place = scratch_place(worker, item)
-        task = Task()
+        task = LightTask()
         task.cells = cells
         task.first_bundle = span * (scratch.shape[2] // BUNDLE)
-        task.found = found[place]
-        task.ends = found[place, 2]
+        task.reached_bundles = reached_bundles[place]
+        task.ends = reached_bundles[place, 2]
         task.blocked = scratch[place, 0]
         task.pulls = scratch[place, 1]
-        task.sums = sums[wp.where(is_kept, item, place)]
-        task.exitance = exitance[instance_in(batch, exitance.shape[0])]
+        task.sums = sums[wp.where(stores_sums, item, place)]
+        task.proxy_radiance = proxy_radiance[instance_in(batch, proxy_radiance.shape[0])]
         size = float(TINY_RADIUS)
         for run in range(spheres.bounds_of_runs.shape[1]):
             size = wp.max(size, spheres.bounds_of_runs[batch, run][3])
@@ -132,15 +139,15 @@ def _make_begin(lanes: int) -> wp.Function:
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
             at = task.first_bundle + bundle
-            if is_any_above(along(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+            if is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
                 for i in range(BUNDLE):
                     blocked = Lane()
                     for lane in range(wp.min(lanes, points.shape[1] - group * lanes)):
                         vertex = group * lanes + lane
-                        most = float(1.0)
+                        maximum = float(1.0)
                         if unblocked:
-                            most = unblocked[instance_in(batch, unblocked.shape[0]), vertex, at * BUNDLE + i]
-                        blocked[lane] = most - transmittance[batch, vertex, at * BUNDLE + i]
+                            maximum = unblocked[instance_in(batch, unblocked.shape[0]), vertex, at * BUNDLE + i]
+                        blocked[lane] = maximum - transmittance[batch, vertex, at * BUNDLE + i]
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
                         task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
@@ -170,16 +177,16 @@ def _make_weight(lanes: int) -> wp.Function:
 @functools.cache
 def _make_light(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    Receivers, Seen, Task = receivers_type(lanes), seen_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, LightTask = receiver_lanes_type(lanes), sphere_view_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, is_any_above, along, add_vectors = fn.sqrt, fn.is_any_above, fn.along, fn.add_vectors
+    sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
     begin, weigh, falloff = _make_begin(lanes), _make_weight(lanes), make_falloff(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LightTask):
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -189,21 +196,21 @@ def _make_light(lanes: int) -> wp.Kernel:
             near = weigh(seen.offset, seen.curvature, task.inverse_size)
             opacity = wp.cw_mul(opacity, wp.cw_mul(near, near))
             for k in range(count):
-                bundle = task.found[1, k]
+                bundle = task.reached_bundles[1, k]
                 at = task.first_bundle + bundle
                 if reaches(cap, cells.axes[at], cells.half_angles[at]):
                     for i in range(BUNDLE):
-                        t = wp.cw_mul(along(cells.directions[at * BUNDLE + i], cap.axis) - cap.cosine, slope)
+                        t = wp.cw_mul(dot_direction(cells.directions[at * BUNDLE + i], cap.axis) - cap.cosine, slope)
                         if is_any_above(t, 0.0):
                             t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
                             step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                             share = wp.cw_mul(opacity, step)
-                            sent = task.exitance[seen.node, at * BUNDLE + i]
+                            sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
                             place = (bundle * BUNDLE + i) * SUMS
                             for c in range(SUMS):
                                 task.sums[place + c] = task.sums[place + c] + sent[c] * share
 
-    walk = make_walk(make_cull(True, Task, lanes), visit, Task, False, lanes)
+    traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def add_light(
@@ -212,17 +219,17 @@ def _make_light(lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
-        cells: Cells,
-        exitance: wp.array3d(dtype=wp.vec4),
+        spheres: SphereClusters,
+        cells: DirectionCells,
+        proxy_radiance: wp.array3d(dtype=wp.vec4),
         transmittance: wp.array3d(dtype=wp.float32),
         unblocked: wp.array3d(dtype=wp.float32),
         factor: float,
         span_count: int,
-        is_kept: bool,
+        stores_sums: bool,
         # scratch
         scratch: wp.array3d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
         # scratch, or out where they are kept
         sums: wp.array2d(dtype=Lane),
         # out
@@ -239,26 +246,26 @@ def _make_light(lanes: int) -> wp.Kernel:
             normals,
             spheres,
             cells,
-            exitance,
+            proxy_radiance,
             transmittance,
             unblocked,
-            is_kept,
+            stores_sums,
             scratch,
-            found,
+            reached_bundles,
             sums,
         )
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
-        walk(receivers, batch, spheres, Gradients(), task)
+        traverse(receivers, batch, spheres, Gradients(), task)
         total = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
                     place = bundle * BUNDLE + i
                     omega = cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
-                    cosine = factor * wp.max(along(omega, receivers.normals), Lane(0.0))
+                    cosine = factor * wp.max(dot_direction(omega, receivers.normals), Lane(0.0))
                     part = wp.cw_mul(cosine, task.blocked[place])
                     part = wp.cw_div(part, wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
                     total.x += wp.cw_mul(part, task.sums[place * SUMS])
@@ -272,26 +279,31 @@ def _make_light(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_light_adjoint(lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, SphereAdjoint, LightTask = (
+        receiver_lanes_type(lanes),
+        sphere_view_type(lanes),
+        sphere_adjoint_type(lanes),
+        _task_type(lanes),
+    )
     fn = make_lane_functions(lanes)
-    sqrt, is_any_above, along, dot, scale = fn.sqrt, fn.is_any_above, fn.along, fn.dot, fn.scale
+    sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
     begin, weigh = _make_begin(lanes), _make_weight(lanes)
-    falloff, falloff_pull = make_falloff(lanes), make_falloff_pull(lanes)
+    falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
     CORE2 = wp.constant(_CORE**2)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LightTask):
         """The adjoint of the sphere's cone and weight.
 
-        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and the pull of a unit of w a, v = f (Ī·L − S Ī·R):
-        ā = w v,  w̄ = Σ a v,  L̄ = f w a Ī,  S̄ = −f w a Ī·R
-        and with y = d / size:  w̄ → d̄ = −4 w̄ w √w y / size,  r̄ = −4 w̄ w √w r / (4 size)²;  ā as for the transmittance.
+        With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S, and the pull of a unit of w a, v = f (Ī·L − S Ī·R): ā = w v,  w̄ = Σ
+        a v,  L̄ = f w a Ī,  S̄ = −f w a Ī·R and with y = d / size:  w̄ → d̄ = −4 w̄ w √w y / size,  r̄ = −4 w̄ w √w r /
+        (4 size)²;  ā as for the transmittance.
         """
-        pull = Pull()
+        pull = SphereAdjoint()
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -308,20 +320,20 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             sum_z = Lane(0.0)
             adj_opacity = Lane(0.0)
             for k in range(count):
-                bundle = task.found[1, k]
+                bundle = task.reached_bundles[1, k]
                 at = task.first_bundle + bundle
                 if reaches(cap, cells.axes[at], cells.half_angles[at]):
                     for i in range(BUNDLE):
                         omega = cells.directions[at * BUNDLE + i]
-                        t = wp.cw_mul(along(omega, cap.axis) - cap.cosine, slope)
+                        t = wp.cw_mul(dot_direction(omega, cap.axis) - cap.cosine, slope)
                         if is_any_above(t, 0.0):
                             is_any_met = True
                             t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
                             step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                             weighted = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
                             pulled = task.pulls[bundle * BUNDLE + i]
-                            sent = task.exitance[seen.node, at * BUNDLE + i]
-                            light = along(wp.vec3(sent[0], sent[1], sent[2]), task.adj_light)
+                            sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
+                            light = dot_direction(wp.vec3(sent[0], sent[1], sent[2]), task.adj_light)
                             adj_blocked = wp.cw_mul(weighted, light - sent[3] * pulled)
                             adj_opacity += wp.cw_mul(adj_blocked, step)
                             rise = wp.cw_mul(t, Lane(1.0) - t)
@@ -331,7 +343,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                             sum_x += omega[0] * adj_t
                             sum_y += omega[1] * adj_t
                             sum_z += omega[2] * adj_t
-                            if task.adj_exitance:
+                            if task.adj_radiance:
                                 share = wp.cw_mul(weighted, wp.cw_mul(opacity, step))
                                 adj_sent = wp.vec4(
                                     total(wp.cw_mul(share, task.adj_light.x)),
@@ -339,9 +351,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                     total(wp.cw_mul(share, task.adj_light.z)),
                                     -total(wp.cw_mul(share, pulled)),
                                 )
-                                wp.atomic_add(task.adj_exitance, seen.node, at * BUNDLE + i, adj_sent)
+                                wp.atomic_add(task.adj_radiance, seen.node, at * BUNDLE + i, adj_sent)
             if is_any_met:
-                adj_offset, adj_radius, adj_weight = falloff_pull(
+                adj_offset, adj_radius, adj_weight = sphere_adjoint(
                     seen,
                     sine,
                     cap.cosine,
@@ -361,7 +373,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                 pull.radius = adj_radius + (CORE2 * task.inverse_size / seen.curvature) * nearer
         return pull
 
-    walk = make_walk(make_cull(True, Task, lanes), visit, Task, True, lanes)
+    traverse = make_traversal(make_cull(True, LightTask, lanes), visit, LightTask, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def add_light_adjoint(
@@ -370,19 +382,19 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
-        cells: Cells,
-        exitance: wp.array3d(dtype=wp.vec4),
+        spheres: SphereClusters,
+        cells: DirectionCells,
+        proxy_radiance: wp.array3d(dtype=wp.vec4),
         transmittance: wp.array3d(dtype=wp.float32),
         unblocked: wp.array3d(dtype=wp.float32),
         factor: float,
         span_count: int,
-        is_kept: bool,
+        stores_sums: bool,
         sums: wp.array2d(dtype=Lane),
         adj_light: wp.array2d(dtype=wp.vec3),
         # scratch
         scratch: wp.array3d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_normals: wp.array2d(dtype=wp.vec3),
@@ -390,7 +402,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         # out, or a sum where one instance serves all
         adj_unblocked: wp.array3d(dtype=wp.float32),
         # sums
-        adj_exitance: wp.array3d(dtype=wp.vec4),
+        adj_radiance: wp.array3d(dtype=wp.vec4),
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
@@ -409,17 +421,17 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             normals,
             spheres,
             cells,
-            exitance,
+            proxy_radiance,
             transmittance,
             unblocked,
-            is_kept,
+            stores_sums,
             scratch,
-            found,
+            reached_bundles,
             sums,
         )
         task.adj_light = load(adj_light[batch], group)
-        if adj_exitance:
-            task.adj_exitance = adj_exitance[instance_in(batch, exitance.shape[0])]
+        if adj_radiance:
+            task.adj_radiance = adj_radiance[instance_in(batch, proxy_radiance.shape[0])]
         turned = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
@@ -430,7 +442,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
                     mean = Vectors(task.sums[place * SUMS], task.sums[place * SUMS + 1], task.sums[place * SUMS + 2])
                     pulled = wp.cw_mul(inverse, dot(task.adj_light, mean))
-                    cosine = along(omega, receivers.normals)
+                    cosine = dot_direction(omega, receivers.normals)
                     is_up = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
                     adj_cosine = factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], pulled))
                     turned.x += omega[0] * adj_cosine
@@ -455,7 +467,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         gradients.centers = adj_centers
         gradients.radii = adj_radii
         gradients.extents = adj_extents
-        adj = walk(receivers, batch, spheres, gradients, task)
+        adj = traverse(receivers, batch, spheres, gradients, task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
@@ -469,7 +481,7 @@ def sphere_light(
     normals: wp.array,
     centers: wp.array,
     radii: wp.array,
-    exitance: wp.array,
+    proxy_radiance: wp.array,
     transmittance: wp.array,
     unblocked: wp.array | None,
     directions: np.ndarray,
@@ -477,7 +489,7 @@ def sphere_light(
     softness: float = SOFTNESS,
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
-    clusters: Clusters | None = None,
+    clusters: ClusterTree | None = None,
 ) -> wp.array:
     """Light that spheres send to receivers, through the cells that they block.
 
@@ -486,34 +498,35 @@ def sphere_light(
         normals: Unit normals, vec3 of shape [batch, receiver].
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere].
-        exitance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of shape
-            [batch, node, direction], from :func:`.exitance.sphere_exitance`. A batch of 1 serves every instance.
+        proxy_radiance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of
+            shape [batch, node, direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every
+            instance.
         transmittance: T past these spheres, float32 of shape [batch, receiver, direction], made with the same
             directions, softness, merging and skip.
-        unblocked: F, what T would be without these spheres, a factor of T, of the same shape; a batch of 1 serves every
-            instance. None for 1.
+        unblocked: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every instance. None
+            for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
-        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
+        clusters: Of these spheres, from :func:`.traverse.find_clusters`, where they are found already.
 
     Returns:
-        What a white receiver reflects of that light, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
+        Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
 
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
 
-    Differentiable: points, normals, centers, radii, exitance, transmittance, unblocked. (The derivative in T is that at
-    a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
+    Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, unblocked. (The derivative in T is
+    that at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
-    common_batch({"points": points, "exitance": exitance, "unblocked": unblocked})
+    common_batch({"points": points, "proxy_radiance": proxy_radiance, "unblocked": unblocked})
     batch_count, vertex_count = points.shape
     node_count = radii.shape[1] + merged_count(radii.shape[1], merging)
-    check.shape("exitance", exitance.shape, (exitance.shape[0], node_count, len(directions)))
+    check.shape("proxy_radiance", proxy_radiance.shape, (proxy_radiance.shape[0], node_count, len(directions)))
     check.shape("transmittance", transmittance.shape, (*points.shape, len(directions)))
     if unblocked is not None:
         check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
@@ -524,17 +537,17 @@ def sphere_light(
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     own_count = len(directions) // span_count
     nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
-    dim = batch_count * group_count(vertex_count, lanes), span_count
-    variables = [points, normals, *nodes, exitance, transmittance, unblocked]
-    is_kept = varies(variables)
+    dim = batch_count * block_count(vertex_count, lanes), span_count
+    variables = [points, normals, *nodes, proxy_radiance, transmittance, unblocked]
+    stores_sums = varies(variables)
     scratch = [
         Scratch((2, own_count), lane_type(lanes)),
         Scratch((3, own_count // BUNDLE), wp.int32),
     ]
     sums = (own_count * _SUMS,), lane_type(lanes)
-    kept = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if is_kept else []
-    inputs = [points, normals, spheres, cells, exitance, transmittance, unblocked]
-    inputs += [4 / len(directions), span_count, is_kept]
+    cached = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
+    inputs = [points, normals, spheres, cells, proxy_radiance, transmittance, unblocked]
+    inputs += [4 / len(directions), span_count, stores_sums]
     cost = PAIR_COST * lanes * radii.shape[1] * own_count
     is_shared = unblocked is not None and len(unblocked) < batch_count
 
@@ -544,10 +557,10 @@ def sphere_light(
             _make_light_adjoint(lanes),
             dim,
             cost=2 * cost,
-            inputs=[*inputs, *kept, adj_light],
+            inputs=[*inputs, *cached, adj_light],
             scratch=scratch,
             outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_unblocked)],
-            sums=[*(adj_unblocked if is_shared else []), exitance.grad, *(array.grad for array in nodes)],
+            sums=[*(adj_unblocked if is_shared else []), proxy_radiance.grad, *(array.grad for array in nodes)],
         )
 
     return differentiable(
@@ -556,8 +569,8 @@ def sphere_light(
             dim,
             cost=cost,
             inputs=inputs,
-            scratch=scratch if is_kept else [*scratch, Scratch(*sums)],
-            outputs=[*kept, light],
+            scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],
+            outputs=[*cached, light],
         ),
         adjoint,
         result=wp.zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),

@@ -1,16 +1,27 @@
-"""Tail: the light of all further bounces, from those that were found.
+"""Tail: the light of all further bounces, extrapolated from the computed ones.
 
-Radiosities B_k after k bounces are sums of terms D_k = B_k − B_(k−1), of which each is a linear map of the one before.
-After a few bounces terms hardly change but in size: the next are ρ D_k, ρ² D_k, … Their sum is
+Radiosities B_k after k bounces are sums of B_0 and terms D_k = B_k − B_(k−1), of which each is the same linear map T of
+the one before. All light past B_0, R = D_1 + T R, is sought among the sums Σ_j c_j D_j, 1 ≤ j ≤ 3: that one is taken
+whose error D_1 + T R − R is orthogonal to these terms, in each color and with areas A as weights [Galerkin; Saad 2003,
+chapter 5]:
 
-    Σ = ρ / (1 − ρ) D_k,   ρ = Σ_p A_p D_k D_(k−1) / Σ_p A_p D_(k−1)²
+    Σ_j M_ij c_j = <D_i, D_1>,   M_ij = <D_i, D_j − D_(j+1)>,   <u, v> = Σ_p A_p u_p v_p
 
-in each color, with areas A: the solution among the multiples of D_(k−1) [Galerkin; Kaniel 1966: it errs by the square
-of what D still lacks]. Where light does not die away, as in a closed room of white walls, there is no sum: ρ counts as
-0.98 at most, so what is added is at most 49 terms.
+and T is applied to it once more: B_1 + Σ_j c_j D_(j+1). A geometric series, which light becomes after a few bounces, is
+exact; so are sums of three of them, such as of light that a room, a bowl and a gap keep for different times. Where
+terms are nearly multiples of each other the smallest c count: 1e-7 is added to the diagonal of M, with D of length 1.
+
+Where light does not die away, as in a closed room of white walls, there is no sum. So R that is, along D_1, not 0 to 50
+times as long as that counts as a geometric series with a ratio of 0.98.
+
+Measured by energy among patches, of white in an even sky: with two bodies in a room of albedo 0.8 with a window it is
+0.3% too low, in one that is open in front 0.2%; with one term in place of three 0.9 and 0.6%. At an albedo of 1 it is
+8% and 2% too low, with one term 20 and 6%.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -20,80 +31,149 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 
-_MOST = wp.constant(0.98)
-"""The largest ρ."""
+TERM_COUNT = 5
+"""Radiosities from which the tail is found."""
 
-_LEAST = wp.constant(1.0e-30)
-"""The least Σ A D²: less is darkness."""
+_MOST = wp.constant(wp.float64(50.0))
+"""Length of R in that of D_1, at most."""
+
+_SMALL = wp.constant(wp.float64(1.0e-7))
+"""Added to the diagonal of M."""
+
+_LEAST = wp.constant(wp.float64(1.0e-60))
+"""The least <D, D>: less is darkness."""
+
+
+@wp.func
+def _terms(
+    batch: int,
+    patch: int,
+    color: int,
+    zeroth: wp.array2d(dtype=wp.vec3),
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
+    third: wp.array2d(dtype=wp.vec3),
+    fourth: wp.array2d(dtype=wp.vec3),
+):
+    """D_1 to D_4 of a patch in a color."""
+    b0 = wp.float64(zeroth[instance_in(batch, zeroth.shape[0]), patch][color])
+    b1 = wp.float64(first[instance_in(batch, first.shape[0]), patch][color])
+    b2 = wp.float64(second[instance_in(batch, second.shape[0]), patch][color])
+    b3 = wp.float64(third[instance_in(batch, third.shape[0]), patch][color])
+    b4 = wp.float64(fourth[instance_in(batch, fourth.shape[0]), patch][color])
+    return wp.vec4d(b1 - b0, b2 - b1, b3 - b2, b4 - b3)
 
 
 @wp.kernel
 def _sum_up(
     # in
-    before: wp.array2d(dtype=wp.vec3),
-    last: wp.array2d(dtype=wp.vec3),
-    now: wp.array2d(dtype=wp.vec3),
+    zeroth: wp.array2d(dtype=wp.vec3),
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
+    third: wp.array2d(dtype=wp.vec3),
+    fourth: wp.array2d(dtype=wp.vec3),
     areas: wp.array(dtype=wp.float32),
     # out
-    sums: wp.array3d(dtype=wp.vec3),
+    sums: wp.array3d(dtype=wp.vec4d),
 ):
-    """A thread owns a patch of an instance, and adds to Σ A D_k D_(k−1) and Σ A D_(k−1)²."""
-    batch, patch = wp.tid()
-    middle = last[instance_in(batch, last.shape[0]), patch]
-    old = middle - before[instance_in(batch, before.shape[0]), patch]
-    new = now[instance_in(batch, now.shape[0]), patch] - middle
-    wp.atomic_add(sums, batch, 0, 0, areas[patch] * wp.cw_mul(new, old))
-    wp.atomic_add(sums, batch, 1, 0, areas[patch] * wp.cw_mul(old, old))
+    """A thread owns a patch of an instance in a color, and adds to <D_i, D_j>, i ≤ 3."""
+    batch, patch, color = wp.tid()
+    terms = _terms(batch, patch, color, zeroth, first, second, third, fourth)
+    weighted = wp.float64(areas[patch]) * terms
+    wp.atomic_add(sums, batch, color, 0, weighted[0] * terms)
+    wp.atomic_add(sums, batch, color, 1, weighted[1] * terms)
+    wp.atomic_add(sums, batch, color, 2, weighted[2] * terms)
+
+
+@wp.kernel
+def _solve(
+    # in
+    sums: wp.array3d(dtype=wp.vec4d),
+    # out
+    coefficients: wp.array2d(dtype=wp.vec3d),
+):
+    """A thread owns a color of an instance."""
+    batch, color = wp.tid()
+    s0 = sums[batch, color, 0]
+    s1 = sums[batch, color, 1]
+    s2 = sums[batch, color, 2]
+    one = wp.float64(1.0)
+    n0 = one / wp.sqrt(wp.max(s0[0], _LEAST))
+    n1 = one / wp.sqrt(wp.max(s1[1], _LEAST))
+    n2 = one / wp.sqrt(wp.max(s2[2], _LEAST))
+    matrix = wp.mat33d(
+        n0 * n0 * (s0[0] - s0[1]) + _SMALL,
+        n0 * n1 * (s0[1] - s0[2]),
+        n0 * n2 * (s0[2] - s0[3]),
+        n1 * n0 * (s1[0] - s1[1]),
+        n1 * n1 * (s1[1] - s1[2]) + _SMALL,
+        n1 * n2 * (s1[2] - s1[3]),
+        n2 * n0 * (s2[0] - s2[1]),
+        n2 * n1 * (s2[1] - s2[2]),
+        n2 * n2 * (s2[2] - s2[3]) + _SMALL,
+    )
+    result = wp.inverse(matrix) * wp.vec3d(n0 * s0[0], n1 * s1[0], n2 * s2[0])
+    result = wp.vec3d(n0 * result[0], n1 * result[1], n2 * result[2])
+    row_dot = result[0] * s0[0] + result[1] * s0[1] + result[2] * s0[2]
+    if row_dot >= wp.float64(0.0) and row_dot <= _MOST * s0[0]:
+        coefficients[batch, color] = result
+    else:
+        coefficients[batch, color] = wp.vec3d(one, one, _MOST)
 
 
 @wp.func
-def _factor(product: float, square: float):
-    """ρ / (1 − ρ)."""
-    ratio = wp.clamp(product / wp.max(square, _LEAST), 0.0, _MOST)
-    return ratio / (1.0 - ratio)
+def _tail(terms: wp.vec4d, coefficients: wp.vec3d):
+    """Σ c_j D_(j+1)."""
+    return wp.float32(coefficients[0] * terms[1] + coefficients[1] * terms[2] + coefficients[2] * terms[3])
 
 
 @wp.kernel
 def _add_tail(
     # in
-    last: wp.array2d(dtype=wp.vec3),
-    now: wp.array2d(dtype=wp.vec3),
-    sums: wp.array3d(dtype=wp.vec3),
+    zeroth: wp.array2d(dtype=wp.vec3),
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
+    third: wp.array2d(dtype=wp.vec3),
+    fourth: wp.array2d(dtype=wp.vec3),
+    coefficients: wp.array2d(dtype=wp.vec3d),
     # out
     total: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a patch of an instance."""
     batch, patch = wp.tid()
-    radiosity = now[instance_in(batch, now.shape[0]), patch]
-    product = sums[batch, 0, 0]
-    square = sums[batch, 1, 0]
-    factor = wp.vec3(_factor(product[0], square[0]), _factor(product[1], square[1]), _factor(product[2], square[2]))
-    term = radiosity - last[instance_in(batch, last.shape[0]), patch]
-    total[batch, patch] = radiosity + wp.cw_mul(factor, term)
+    r = _tail(_terms(batch, patch, 0, zeroth, first, second, third, fourth), coefficients[batch, 0])
+    g = _tail(_terms(batch, patch, 1, zeroth, first, second, third, fourth), coefficients[batch, 1])
+    b = _tail(_terms(batch, patch, 2, zeroth, first, second, third, fourth), coefficients[batch, 2])
+    total[batch, patch] = first[instance_in(batch, first.shape[0]), patch] + wp.vec3(r, g, b)
 
 
-def with_tail(before: wp.array, last: wp.array, now: wp.array, areas: np.ndarray) -> wp.array:
-    """Radiosity of patches after all bounces, from that after three numbers of bounces that follow each other.
+def with_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
+    """Radiosity of patches after all bounces, from those after the first ones.
 
     Args:
-        before, last, now: After k − 2, k − 1 and k bounces, vec3 of shape [batch, patch]; a batch of 1 serves every
-            instance.
+        radiosities: By direct light, and after one to four bounces, vec3 of shape [batch, patch]; a batch of 1
+            serves every instance.
         areas: Of patches [scene units²], not negative, shape [patch].
 
     Returns:
         vec3 of shape [batch, patch].
 
-    Differentiable: before, last, now.
+    Differentiable: radiosities.
     """
-    check.shape("last", last.shape, ("batch", before.shape[1]))
-    check.shape("now", now.shape, ("batch", before.shape[1]))
-    check.shape("areas", areas.shape, (before.shape[1],))
-    check.finite("areas", np.asarray(areas), least=0.0)
-    count = common_batch({"before": before, "last": last, "now": now})
-    # of one, so that sums of squares neither overflow nor vanish, whatever the scene's units
-    parts = constant(np.asarray(areas / max(areas.sum(), 1e-30), np.float32), wp.float32, now.device)
-    sums = wp.zeros((count, 2, 1), dtype=wp.vec3, device=now.device)
-    total = wp.empty((count, now.shape[1]), dtype=wp.vec3, device=now.device)
-    launch(_sum_up, total.shape, inputs=[before, last, now, parts], outputs=[sums])
-    launch(_add_tail, total.shape, inputs=[last, now, sums], outputs=[total])
+    if len(radiosities) != TERM_COUNT:
+        raise ValueError(f"radiosities: got {len(radiosities)}, expected {TERM_COUNT}")
+    patch_count = radiosities[0].shape[1]
+    for array in radiosities:
+        check.shape("radiosities", array.shape, ("batch", patch_count))
+    check.shape("areas", areas.shape, (patch_count,))
+    check.finite("areas", np.asarray(areas), minimum=0.0)
+    count = common_batch({f"radiosity after {number} bounces": array for number, array in enumerate(radiosities)})
+    device = radiosities[0].device
+    parts = constant(np.asarray(areas / max(areas.sum(), 1e-30), np.float32), wp.float32, device)
+    sums = wp.zeros((count, 3, 3), dtype=wp.vec4d, device=device)
+    coefficients = wp.empty((count, 3), dtype=wp.vec3d, device=device)
+    total = wp.empty((count, patch_count), dtype=wp.vec3, device=device)
+    launch(_sum_up, (count, patch_count, 3), inputs=[*radiosities, parts], outputs=[sums])
+    launch(_solve, (count, 3), inputs=[sums], outputs=[coefficients])
+    launch(_add_tail, total.shape, inputs=[*radiosities, coefficients], outputs=[total])
     return total

@@ -11,10 +11,10 @@ The line of an edge with ends a, b is ℓ = a × b, and that where two faces int
 planes. In a row, where ℓ·(x, y, 1) = 0, lines move by
 
     dx = (α ℓ·da + β ℓ·db) / ℓ_x                            α, β: the point on the edge is α a + β b, with w = 1
-    dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of what the samples see, u: its 1/w
+    dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of the fragments, u: its 1/w
 
-How m changes is left out: it hardly matters to what two samples take of each other on balance (1e-4 of the gradient by
-a rigid motion), and at edges far below a sample it would outweigh the rest, pulling their ends opposite ways.
+The change of m is left out: on balance it hardly matters to the exchange between two samples (1e-4 of the gradient by a
+rigid motion), and at edges far below a sample it would outweigh the rest, pulling their ends opposite ways.
 """
 
 import warp as wp
@@ -32,7 +32,7 @@ from warpshadow.stages.screen import (
     sample_center,
     sense,
 )
-from warpshadow.stages.silhouettes.lines import NOTHING, Seen, image_of, line_between
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_of, line_between
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
@@ -43,11 +43,11 @@ def _measure(
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
-    seen: Seen,
+    seen: FragmentArrays,
     # out
     shares: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a way of an entry: the area e beyond the line there, how much it counts, ω, and what ends there."""
+    """A thread owns a way of an entry: the area e beyond the line there, its weight ω, and the kind of its end."""
     entry, way = wp.tid()
     edge = edges[entry, way]
     share = wp.vec3()
@@ -76,7 +76,7 @@ def _measure_adjoint(
     # in
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    seen: Seen,
+    seen: FragmentArrays,
     adj_areas: wp.array2d(dtype=wp.float32),
     # out
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
@@ -123,14 +123,14 @@ def _measure_adjoint(
                     wp.atomic_add(adj_clip_positions, batch, corners[k], seen.barycentrics[at][k] * pull)
 
 
-def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: Seen) -> wp.array:
-    """Measure what lies beyond the lines beside samples.
+def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: FragmentArrays) -> wp.array:
+    """Measure the areas beyond the lines beside samples.
 
     Args:
         samples: Of each entry, int32 of shape [entry].
         edges: Vertices of the line on each way, vec2i of shape [entry, 4].
         entries: Of each sample, int32 of shape [sample].
-        seen: What the samples see.
+        seen: The fragments.
 
     Returns:
         The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
@@ -141,7 +141,7 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: S
     return shares
 
 
-def add_to_vertices(samples: wp.array, edges: wp.array, seen: Seen, adj_areas: wp.array) -> None:
+def add_to_vertices(samples: wp.array, edges: wp.array, seen: FragmentArrays, adj_areas: wp.array) -> None:
     """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
     adj_clip_positions = seen.clip_positions.grad
     launch(_measure_adjoint, edges.shape, inputs=[samples, edges, seen, adj_areas], outputs=[adj_clip_positions])

@@ -16,7 +16,7 @@ from warpshadow.stages.screen import (
 )
 from warpshadow.stages.sides import join_side, split_side
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import NOTHING, Seen, image_of, line_between, make_seen
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_of, line_between, make_fragment_arrays
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
@@ -27,7 +27,7 @@ def _find_edge_colors(
     image: wp.array2d(dtype=wp.vec4),
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    seen: Seen,
+    seen: FragmentArrays,
     sides: wp.array(dtype=wp.int32),
     shading: wp.array2d(dtype=wp.vec3),
     receivers: wp.array(dtype=wp.int32),
@@ -90,15 +90,15 @@ def find_edge_colors(
     Args:
         image: Color and coverage before smoothing, vec4 of shape [batch, height, width].
         silhouettes: Of :func:`find_silhouettes`.
-        clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex].
+        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         shading: Of the receivers, vec3 of shape [batch, receiver].
         receivers: Receiver of each vertex, −1 for none, int32 of shape [vertex]; where the silhouettes' fragments have
-            sides, those of their backs follow.
+            sides, the backs' receivers follow.
         albedo: Of the samples, vec3 of shape [batch, height, width].
 
     Returns:
-        For each way of each entry the color at the edge of what the entry's sample sees, vec4 of shape
-        [instance, entry, 4], for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.
+        For each way of each entry, the color of its sample's surface at the edge, vec4 of shape [instance, entry, 4],
+        for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.
 
     Not differentiable.
     """
@@ -111,7 +111,7 @@ def find_edge_colors(
             image.reshape(shape),
             silhouettes.samples,
             silhouettes.edges,
-            make_seen(fragments, silhouettes.faces, clip_positions),
+            make_fragment_arrays(fragments, silhouettes.faces, clip_positions),
             None if fragments.sides is None else fragments.sides.flatten(),
             shading,
             receivers,

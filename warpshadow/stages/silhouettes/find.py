@@ -2,7 +2,7 @@
 
 The line between two samples is the edge where the surface of the nearer one ends before the center of the other, or
 that where two surfaces intersect. Where both see one surface it is a crease between them, an edge across which normals
-jump, and so does color. Lines that cut a row of samples are found between neighbors in the row, those that cut a column
+jump, and so does color. Lines that cut a row of samples are found between neighbors in the row, lines that cut a column
 between neighbors in the column, and a line that leans may do both. It counts ω = 1 / (1 + m⁴) where it leans by m
 samples from one row (or column) to the next.
 """
@@ -28,7 +28,14 @@ from warpshadow.stages.screen import (
     sense,
 )
 from warpshadow.stages.silhouettes.areas import measure_areas
-from warpshadow.stages.silhouettes.lines import INTERSECTION, NOTHING, Seen, image_of, line_between, make_seen
+from warpshadow.stages.silhouettes.lines import (
+    INTERSECTION,
+    NOTHING,
+    FragmentArrays,
+    image_of,
+    line_between,
+    make_fragment_arrays,
+)
 
 wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 s, and runs as fast
 
@@ -61,7 +68,7 @@ class Silhouettes:
         shares: The area e of the sample that lies beyond each, how much it counts, ω, and whether a surface ends
             there, 1, or has a crease, 0; vec3 of shape [entry, 4].
         entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
-        fragments: What each sample sees.
+        fragments: The fragments of the samples.
         faces: The rasterized faces, vec3i of shape [face].
     """
 
@@ -73,7 +80,7 @@ class Silhouettes:
     faces: wp.array
 
     def flat_shape(self, images: wp.array) -> tuple[int, int]:
-        """Shape of images as those that the silhouettes serve, one after another: [images of each, sample of all]."""
+        """Shape of the images that the silhouettes serve, one after another: [images of each, sample of all]."""
         batch_count, height, width = self.fragments.face_ids.shape
         return images.shape[0] // batch_count, batch_count * height * width
 
@@ -83,7 +90,7 @@ _Crossing = wp.types.vector(length=6, dtype=wp.int32)
 
 @wp.struct
 class _Crossings:
-    """What lies between neighboring samples, a list for each image, in no order: threads share images, not lists."""
+    """Crossings between neighboring samples, a list for each image, in no order: threads share images, not lists."""
 
     counts: wp.array(dtype=wp.int32)  # of each image
     room: int  # for each image
@@ -95,7 +102,7 @@ class _Crossings:
 
 
 @wp.func
-def _depth(seen: Seen, sample: int):
+def _depth(seen: FragmentArrays, sample: int):
     """Distance of a sample's point along the view, infinite for the background."""
     depth = float(wp.inf)
     face = seen.face_ids[sample]
@@ -108,16 +115,16 @@ def _depth(seen: Seen, sample: int):
 
 
 @wp.func
-def _corner_before(face: int, across: int, neighbors: wp.array(dtype=wp.vec3i)):
+def _corner_before(face: int, neighbor_face: int, neighbors: wp.array(dtype=wp.vec3i)):
     """Corner of a face that is opposite to the edge which it shares with another."""
-    around = neighbors[across]
-    return wp.where(around[0] == face, 0, wp.where(around[1] == face, 1, 2))
+    surrounding = neighbors[neighbor_face]
+    return wp.where(surrounding[0] == face, 0, wp.where(surrounding[1] == face, 1, 2))
 
 
 @wp.func
 def _is_silhouette(
     face: int,
-    across: int,
+    neighbor_face: int,
     a: wp.vec4,
     b: wp.vec4,
     volume: float,
@@ -126,9 +133,9 @@ def _is_silhouette(
     clip_positions: wp.array(dtype=wp.vec4),
 ):
     """Whether the faces on both sides of edge ab lie on one side of it on screen, however they wind."""
-    if across < 0:
+    if neighbor_face < 0:
         return True
-    corner = faces[across][_corner_before(face, across, neighbors)]
+    corner = faces[neighbor_face][_corner_before(face, neighbor_face, neighbors)]
     return volume * orientation(a, b, clip_positions[corner]) >= 0.0
 
 
@@ -156,13 +163,13 @@ def _end_of_surface(
     Returns 3 face + corner of the silhouette edge at which the surface ends before, −1 if it does not; and that of the
     first crease on the way to the goal, −1 if there is none or the goal is not reached.
     """
-    found = int(-1)
+    edge_found = int(-1)
     crease = int(-1)
     face = start
     step = int(0)
     while face >= 0 and face != goal and step < MOST_STEPS:
         corners = faces[face]
-        around = neighbors[face]
+        surrounding = neighbors[face]
         volume = orientation(clip_positions[corners[0]], clip_positions[corners[1]], clip_positions[corners[2]])
         onward = int(-1)
         for k in range(3):
@@ -176,20 +183,20 @@ def _end_of_surface(
                 line = wp.cross(a, b)
                 is_before_eye = wp.where(axis == 0, -line[0], line[1]) * (across_b - across_a) > 0.0
                 if line[2] * volume < 0.0 and is_before_eye:
-                    if _is_silhouette(face, around[k], p, q, volume, faces, neighbors, clip_positions):
-                        found = 3 * face + k
+                    if _is_silhouette(face, surrounding[k], p, q, volume, faces, neighbors, clip_positions):
+                        edge_found = 3 * face + k
                     else:
-                        onward = around[k]
+                        onward = surrounding[k]
                         if crease < 0 and _is_crease(face, k, creases):
                             crease = 3 * face + k
-        face = wp.where(found >= 0, -1, onward)
+        face = wp.where(edge_found >= 0, -1, onward)
         step += 1
-    return found, wp.where(face == goal, crease, -1)
+    return edge_found, wp.where(face == goal, crease, -1)
 
 
 @wp.func
 def _edge_between(
-    seen: Seen, neighbors: wp.array(dtype=wp.vec3i), creases: wp.array(dtype=wp.int32), sample: int, way: int
+    seen: FragmentArrays, neighbors: wp.array(dtype=wp.vec3i), creases: wp.array(dtype=wp.int32), sample: int, way: int
 ):
     """The one edge between a sample and its neighbor on a way, as 3 face + corner, or −1.
 
@@ -204,16 +211,16 @@ def _edge_between(
     last = sample_center(other, seen.width, seen.height)
     margin = _SNAP * (last - first)
     clip = seen.clip_positions[image_of(seen, sample)]
-    found = int(-1)
+    edge_found = int(-1)
     crease = int(-1)
     for attempt in range(2):
-        if found < 0 and crease < 0:
+        if edge_found < 0 and crease < 0:
             from_here = is_nearer == (attempt == 0)
             start = wp.where(from_here, here, there)
             goal = wp.where(from_here, there, here)
             end = wp.where(from_here, last + margin, first - margin)
-            found, crease = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, creases, clip)
-    return wp.where(found >= 0, found, crease)
+            edge_found, crease = _end_of_surface(start, goal, end, way / 2, seen.faces, neighbors, creases, clip)
+    return wp.where(edge_found >= 0, edge_found, crease)
 
 
 @wp.func
@@ -233,8 +240,10 @@ def _edge_of(
 
 
 @wp.func
-def _add_crossing(seen: Seen, sample: int, way: int, edge: wp.vec2i, its_edge: wp.vec2i, crossings: _Crossings):
-    """Add what lies between a sample and its neighbor, which may have an edge of its own.
+def _add_crossing(
+    seen: FragmentArrays, sample: int, way: int, edge: wp.vec2i, its_edge: wp.vec2i, crossings: _Crossings
+):
+    """Add the crossing between a sample and its neighbor, which may have an edge of its own.
 
     Of the crossings beside a sample one claims it, any.
     """
@@ -266,7 +275,7 @@ def _find_edges(
     first_row: int,
     worker: int,
     # in
-    seen: Seen,
+    seen: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     creases: wp.array(dtype=wp.int32),
     strips: int,
@@ -283,7 +292,7 @@ def _find_edges(
     batch = first_row + image
     clip = seen.clip_positions[batch]
     corners = seen.faces[face]
-    around = neighbors[face]
+    surrounding = neighbors[face]
     half = half_size(seen.width, seen.height)
     volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
     for k in range(3):
@@ -291,7 +300,7 @@ def _find_edges(
         b = clip[corners[(k + 2) % 3]]
         is_crease = bool(False)
         is_line = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
-        if is_line and not _is_silhouette(face, around[k], a, b, volume, seen.faces, neighbors, clip):
+        if is_line and not _is_silhouette(face, surrounding[k], a, b, volume, seen.faces, neighbors, clip):
             is_crease = _is_crease(face, k, creases)
             is_line = is_crease
         if is_line:
@@ -316,19 +325,19 @@ def _find_edges(
                         sample = batch * seen.width * seen.height
                         sample += wp.where(axis == 0, row * seen.width + column, column * seen.width + row)
                         if seen.face_ids[sample] != seen.face_ids[neighbor(sample, 2 * axis, seen.width)]:
-                            found = between[axis, sample]
-                            if found == _UNKNOWN:
-                                found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
-                                between[axis, sample] = found
-                            if found == 3 * face + k:
+                            edge_found = between[axis, sample]
+                            if edge_found == _UNKNOWN:
+                                edge_found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
+                                between[axis, sample] = edge_found
+                            if edge_found == 3 * face + k:
                                 here = edge
                                 there = edge
                                 if is_crease:
-                                    across = _corner_before(face, around[k], neighbors)
+                                    opposite_corner = _corner_before(face, surrounding[k], neighbors)
                                     if ends_before(line_between(seen, sample, 2 * axis, edge), 2 * axis):
-                                        there = _edge_of(around[k], across, seen.faces, clip)
+                                        there = _edge_of(surrounding[k], opposite_corner, seen.faces, clip)
                                     else:
-                                        here = _edge_of(around[k], across, seen.faces, clip)
+                                        here = _edge_of(surrounding[k], opposite_corner, seen.faces, clip)
                                 _add_crossing(seen, sample, 2 * axis, here, there, crossings)
                         column += 1
                     row += strips
@@ -338,7 +347,7 @@ def _find_edges(
 
 
 @wp.func
-def _approach(seen: Seen, sample: int, way: int):
+def _approach(seen: FragmentArrays, sample: int, way: int):
     """Whether the face of a sample's neighbor gets clearly nearer than the sample's from one to the other."""
     axis = way / 2
     clip = seen.clip_positions[image_of(seen, sample)]
@@ -352,7 +361,7 @@ def _approach(seen: Seen, sample: int, way: int):
 @wp.kernel(enable_backward=False)
 def _find_intersections(
     # in
-    seen: Seen,
+    seen: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
     bodies: wp.array(dtype=wp.int32),
     creases: wp.array(dtype=wp.int32),
@@ -360,7 +369,7 @@ def _find_intersections(
     # out
     crossings: _Crossings,
 ):
-    """A thread owns ``run`` samples after one another: what is between each and its right and its lower neighbor."""
+    """A thread owns ``run`` samples after one another: the crossings to their right and their lower neighbors."""
     first = wp.tid() * run
     count = seen.face_ids.shape[0]
     for sample in range(first, wp.min(first + run, count)):
@@ -377,8 +386,8 @@ def _find_intersections(
                     if differs and has_neighbor(sample, way, seen.width, seen.height):
                         is_face = seen.face_ids[neighbor(sample, way, seen.width)] >= 0
                         if is_face and _approach(seen, sample, way):
-                            found = _edge_between(seen, neighbors, creases, sample, way)
-                            if found < 0:
+                            edge_found = _edge_between(seen, neighbors, creases, sample, way)
+                            if edge_found < 0:
                                 edge = wp.vec2i(INTERSECTION, INTERSECTION)
                                 _add_crossing(seen, sample, way, edge, edge, crossings)
 
@@ -400,7 +409,7 @@ def _make_entries(
 ):
     """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
 
-    Gaps are what room the lists of the images before an image have left. If there is an entry for all samples, it is
+    Gaps are room that the lists of the images before an image have left. If there is an entry for all samples, it is
     the sample's own.
     """
     image, number = wp.tid()
@@ -427,7 +436,7 @@ def find_silhouettes(
     """Find the edges at which the surfaces in an image end, the lines where they intersect, and creases.
 
     Args:
-        fragments: What each sample sees.
+        fragments: The fragments of the samples.
         faces: The rasterized faces, vec3i of shape [face].
         neighbors: :func:`warpshadow.assets.topology.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].
@@ -445,7 +454,7 @@ def find_silhouettes(
     check.shape("neighbors", neighbors.shape, faces.shape)
     check.shape("clip_positions", clip_positions.shape, (fragments.face_ids.shape[0], "vertex"))
     device, sample_count = faces.device, fragments.face_ids.size
-    seen, crossings, strips = make_seen(fragments, faces, clip_positions), _Crossings(), strip_count(device)
+    seen, crossings, strips = make_fragment_arrays(fragments, faces, clip_positions), _Crossings(), strip_count(device)
     image_count = len(clip_positions)
     crossings.counts = wp.zeros(image_count, dtype=wp.int32, device=device)
     crossings.room = 2 * sample_count // image_count
@@ -468,15 +477,15 @@ def find_silhouettes(
         launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, creases, run], outputs=[crossings])
     has_all = bool(device.is_capturing)
     if has_all:
-        most, entry_count, gaps = crossings.room, sample_count, crossings.counts  # gaps do not matter
+        maximum, entry_count, gaps = crossings.room, sample_count, crossings.counts  # gaps do not matter
     else:
         counts = crossings.counts.numpy()
-        most, entry_count = int(counts.max()), 2 * int(counts.sum())
+        maximum, entry_count = int(counts.max()), 2 * int(counts.sum())
         ends = np.cumsum(crossings.room - counts)
         gaps = wp.array(np.concatenate([[0], ends[:-1]]), dtype=wp.int32, device=device)
     samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
     entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
     inputs = [crossings, gaps, seen.width, has_all]
-    launch(_make_entries, (image_count, most), inputs=inputs, outputs=[samples, edges, entries])
+    launch(_make_entries, (image_count, maximum), inputs=inputs, outputs=[samples, edges, entries])
     return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)

@@ -1,4 +1,4 @@
-"""Lines: what separates neighboring samples: the edge of a surface, a crease, or where two faces intersect."""
+"""Lines between neighboring samples: the edge of a surface, a crease, or where two faces intersect."""
 
 import warp as wp
 
@@ -11,8 +11,8 @@ INTERSECTION = -2
 
 
 @wp.struct
-class Seen:
-    """What samples see, as kernels take it: arrays of flat images, in which those of a batch follow each other."""
+class FragmentArrays:
+    """Fragments as kernels take them: arrays of flat images, batch after batch."""
 
     face_ids: wp.array(dtype=wp.int32)
     barycentrics: wp.array(dtype=wp.vec3)
@@ -22,9 +22,9 @@ class Seen:
     height: int
 
 
-def make_seen(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -> Seen:
-    """What samples see, of rasterized faces of vertices in clip space."""
-    seen = Seen()
+def make_fragment_arrays(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -> FragmentArrays:
+    """Fragments of rasterized faces of vertices in clip space."""
+    seen = FragmentArrays()
     seen.face_ids, seen.barycentrics = fragments.flat
     seen.faces, seen.clip_positions = faces, clip_positions
     _, seen.height, seen.width = fragments.face_ids.shape
@@ -32,7 +32,7 @@ def make_seen(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -
 
 
 @wp.func
-def image_of(seen: Seen, sample: int):
+def image_of(seen: FragmentArrays, sample: int):
     """Number of the image that has a sample of flat images."""
     return sample / (seen.width * seen.height)
 
@@ -44,7 +44,7 @@ def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=
 
 
 @wp.func
-def line_between(seen: Seen, sample: int, way: int, edge: wp.vec2i):
+def line_between(seen: FragmentArrays, sample: int, way: int, edge: wp.vec2i):
     """The line ℓ between a sample and its neighbor on a way, relative to the sample's center."""
     position = sample_center(sample, seen.width, seen.height)
     clip = seen.clip_positions[image_of(seen, sample)]

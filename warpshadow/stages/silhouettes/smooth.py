@@ -1,15 +1,15 @@
 """Smoothing: samples at a silhouette blend, so that an image changes smoothly as it moves.
 
 A rasterized image jumps at a silhouette, and does not change while the line between two samples moves. So each takes of
-the other's color what of itself lies beyond the line (:mod:`warpshadow.stages.silhouettes.areas`; after Laine et al.
-2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond the
-lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
+the other's color as much as its own area beyond the line (:mod:`warpshadow.stages.silhouettes.areas`; after Laine et
+al. 2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond
+the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
 
     c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two ways across k
 
-which is a mean: the weights are positive, and at most 1 in all. The inner sum is what two areas have in common: nothing
-if they lie beyond one line, their product if they lie beyond two upright ones. Of that each loses half, π = ½; but
-where one is beyond the end of a surface and the other beyond a crease of it, the latter loses all, π = 0 and 1.
+which is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
+they lie beyond one line, their product if they lie beyond two upright ones. Of that each loses half, π = ½; but where
+one is beyond the end of a surface and the other beyond a crease of it, the latter loses all, π = 0 and 1.
 """
 
 import functools
@@ -24,22 +24,22 @@ from warpshadow.stages.interpolate import inner
 from warpshadow.stages.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import add_to_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import make_seen
+from warpshadow.stages.silhouettes.lines import make_fragment_arrays
 
 
 @wp.func
-def _loss(share: wp.vec3, across: wp.vec3):
-    """What an area loses to one beyond a neighboring line, as a fraction of their product."""
-    part = 0.5 * (1.0 + across[2] - share[2])
-    return part * wp.max(share[1] + across[1] - 1.0, 0.0)
+def _loss(share: wp.vec3, neighbor_share: wp.vec3):
+    """Loss of an area to one beyond a neighboring line, as a fraction of their product."""
+    part = 0.5 * (1.0 + neighbor_share[2] - share[2])
+    return part * wp.max(share[1] + neighbor_share[1] - 1.0, 0.0)
 
 
 @wp.func
 def _counts(shares: wp.array(dtype=wp.vec3), way: int):
-    """How much the area on a way counts: ω, less what it loses to those on both ways across."""
-    across = wp.where(way < 2, 2, 0)
-    counts = shares[way][1] - _loss(shares[way], shares[across]) * shares[across][0]
-    return counts - _loss(shares[way], shares[across + 1]) * shares[across + 1][0]
+    """Weight of the area on a way: ω, less its loss to the areas on both ways across."""
+    perpendicular = wp.where(way < 2, 2, 0)
+    counts = shares[way][1] - _loss(shares[way], shares[perpendicular]) * shares[perpendicular][0]
+    return counts - _loss(shares[way], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
 
 
 @functools.cache
@@ -111,14 +111,14 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                     if adj_areas:
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
-                            beyond = edge_colors[instance, entries[other], opposite(way)]
-                            contrast = beyond - edge_colors[instance, entry, way]
+                            upper_bound = edge_colors[instance, entries[other], opposite(way)]
+                            contrast = upper_bound - edge_colors[instance, entry, way]
                         change = inner(adj, contrast)
                         wp.atomic_add(adj_areas, entry, way, counts * change)
-                        across = wp.where(way < 2, 2, 0)
+                        perpendicular = wp.where(way < 2, 2, 0)
                         for k in range(2):
-                            loss = _loss(share, own_shares[across + k]) * share[0]
-                            wp.atomic_sub(adj_areas, entry, across + k, loss * change)
+                            loss = _loss(share, own_shares[perpendicular + k]) * share[0]
+                            wp.atomic_sub(adj_areas, entry, perpendicular + k, loss * change)
 
     return blend_adjoint
 
@@ -135,16 +135,16 @@ def smooth_silhouettes(
             elsewhere it becomes the coverage.
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`; if their batch is 1 they serve
             every image.
-        clip_positions: Those that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
+        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
         edge_colors: Of :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`, by which edges pull at
-            vertices; by default those of samples.
+            vertices; by default the colors of samples.
 
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
 
-    Differentiable: image, clip_positions. Without edge colors an edge has those of the samples beside it: where shading
-    changes by δ over a sample there, its gradient is δ/2 off. None have intersections within one surface, cuts
-    by the near plane, and what leaves the image: there is no neighbor to take from.
+    Differentiable: image, clip_positions. Without edge colors an edge has the colors of the samples beside it: where
+    shading changes by δ over a sample there, its gradient is δ/2 off. Excluded are intersections within one surface,
+    cuts by the near plane, and surfaces that leave the image: there is no neighbor to take from.
     """
     fragments = silhouettes.fragments
     batch_count, height, width = fragments.face_ids.shape
@@ -172,7 +172,7 @@ def smooth_silhouettes(
             outputs=[adj_image, adj_areas],
         )
         if adj_areas is not None:
-            seen = make_seen(fragments, silhouettes.faces, clip_positions)
+            seen = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
             add_to_vertices(samples, silhouettes.edges, seen, adj_areas)
 
     return differentiable(blend, adjoint, wp.clone(image, requires_grad=False), [image, clip_positions])

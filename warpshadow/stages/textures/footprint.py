@@ -1,4 +1,4 @@
-"""Footprints: what part of a texture a sample covers.
+"""Footprints: the part of a texture that a sample covers.
 
 A sample does not see a point of the texture but its *footprint*: to first order an ellipse, the image of the sample
 under the derivative of uv by its position. It is covered by *probes* on a line along its major axis. So a ground seen
@@ -33,7 +33,7 @@ _MAX_DERIVATIVE = 1.0e6
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Where each sample lies in its texture, and what it covers there.
+    """Place of each sample in its texture, and its footprint there.
 
     Args:
         texture_ids: Texture that the sample sees, -1 where none, int32 of shape [batch, height, width].
@@ -75,12 +75,12 @@ def _uv_derivatives(
     total = spanned[0] + spanned[1] + spanned[2]
     by_x = wp.vec3(at_b[1] * c[3] - b[3] * at_c[1], at_c[1] * a[3] - c[3] * at_a[1], at_a[1] * b[3] - a[3] * at_b[1])
     by_y = wp.vec3(b[3] * at_c[0] - at_b[0] * c[3], c[3] * at_a[0] - at_c[0] * a[3], a[3] * at_b[0] - at_a[0] * b[3])
-    # seen edge-on the total vanishes: no less, then, than a millionth of what the volumes change within a sample
-    least = 1.0e-6 * (
+    # seen edge-on the total vanishes: no less, then, than a millionth of the change of the volumes within a sample
+    minimum = 1.0e-6 * (
         step[0] * (wp.abs(by_x[0]) + wp.abs(by_x[1]) + wp.abs(by_x[2]))
         + step[1] * (wp.abs(by_y[0]) + wp.abs(by_y[1]) + wp.abs(by_y[2]))
     )
-    scale = wp.where(wp.abs(total) > least, total, least + 1.0e-30)
+    scale = wp.where(wp.abs(total) > minimum, total, minimum + 1.0e-30)
     x = (step[0] / scale) * (by_x[0] * to_a + by_x[1] * to_b + by_x[2] * to_c)
     y = (step[1] / scale) * (by_y[0] * to_a + by_y[1] * to_b + by_y[2] * to_c)
     return wp.mat22(x[0], y[0], x[1], y[1])
@@ -176,18 +176,18 @@ def find_footprints(
     texture_of_face: wp.array,
     textures: Textures,
 ) -> Footprints:
-    """Find where each sample lies in its texture, and what it covers there.
+    """Find the place of each sample in its texture, and its footprint there.
 
-    Footprints depend on the sizes of the textures, not on what is in them: where geometry and camera do not move,
-    they are found once. A footprint is that of the sample's face, continued beyond its edges, so neither seams of
-    the uvs nor occlusions disturb it.
+    Footprints depend on the sizes of the textures, not on their texels: where geometry and camera do not move, they are
+    found once. A footprint is that of the sample's face, continued beyond its edges, so neither seams of the uvs nor
+    occlusions disturb it.
 
     Args:
-        fragments: What each sample sees.
+        fragments: The fragments of the samples.
         faces: Vertex indices, vec3i of shape [face].
         clip_positions: The rasterized vertices in clip space, vec4 of shape [batch, vertex].
         uvs: Texture coordinates, vec2 of shape [batch, uv].
-        uv_faces: Indices of uvs, vec3i of shape [face]; those of a face without a texture are not read.
+        uv_faces: Indices of uvs, vec3i of shape [face]; faces without a texture are not read.
             Any batch may be 1 and then serves every instance.
         texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
         textures: The textures.

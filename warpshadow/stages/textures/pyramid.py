@@ -1,8 +1,8 @@
 """Mip pyramids: textures of any sizes with their levels, in one array.
 
 A texture is an image of linear RGB reflectance with row 0 at v = 1; it repeats outside of [0, 1], and its texels have
-their centers at +0.5. Each mip level is half as large as the one before, and a texel there is the mean of those that
-it covers.
+their centers at +0.5. Each mip level is half as large as the one before, and a texel there is the mean of the texels
+that it covers.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
 
 
 def level_matrices(height: int, width: int) -> Iterator[csr_matrix]:
-    """The matrices that take the texels of an image to those of each level, [texel of the level, texel], one by one."""
+    """The matrices from the texels of an image to the texels of each level, [texel of the level, texel], one by one."""
     from scipy.sparse import identity, kron
 
-    down, across = identity(height, format="csr"), identity(width, format="csr")
-    yield kron(down, across, format="csr")
+    down, columns = identity(height, format="csr"), identity(width, format="csr")
+    yield kron(down, columns, format="csr")
     for rows_left, columns_left in level_sizes(height, width)[1:]:
         down = _halving(down.shape[0], rows_left) @ down
-        across = _halving(across.shape[0], columns_left) @ across
-        yield kron(down, across, format="csr")
+        columns = _halving(columns.shape[0], columns_left) @ columns
+        yield kron(down, columns, format="csr")
 
 
 def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
-    """What part of each coarse texel the fine ones along a side are: :func:`_shares`."""
+    """Shares of the fine texels along a side in each coarse one: :func:`_shares`."""
     from scipy.sparse import csr_matrix
 
     coarse = np.arange(coarse_count)
@@ -112,7 +112,7 @@ def _layout(sizes: Sizes, device: str) -> _Layout:
 
 @wp.func
 def _shares(coarse: int, fine_count: int, coarse_count: int):
-    """What part of a coarse texel each of the three fine ones from number 2 ``coarse`` on is.
+    """Shares of the three fine texels from number 2 ``coarse`` on in a coarse one.
 
     An odd number of fine texels is not twice that of coarse ones, which cover 2 + 1/coarse_count each: the outer two
     of the three are shared with their neighbors.
@@ -126,7 +126,7 @@ def _shares(coarse: int, fine_count: int, coarse_count: int):
 
 @wp.func
 def _covered(texel: int, fine: wp.vec3i, coarse: wp.vec3i):
-    """First of the 3 × 3 fine texels around a coarse one, and what part of it their columns and rows are."""
+    """First of the 3 × 3 fine texels around a coarse one, and the shares of their columns and rows."""
     row = texel // coarse[1]
     column = texel - row * coarse[1]
     start = fine[0] + 2 * row * fine[1] + 2 * column
@@ -142,17 +142,17 @@ def _halve(
     # out
     texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a run of texels of the coarse level: the means of what they cover of the fine one."""
+    """A thread owns a run of texels of the coarse level: means over the fine texels that they cover."""
     batch, thread = wp.tid()
     of_instance = texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, across, down = _covered(texel, fine, coarse)
+        start, columns, down = _covered(texel, fine, coarse)
         mean = wp.vec3()
         for i in range(3):
             if down[i] > 0.0:
                 for j in range(3):
-                    if across[j] > 0.0:
-                        mean += (down[i] * across[j]) * of_instance[start + i * fine[1] + j]
+                    if columns[j] > 0.0:
+                        mean += (down[i] * columns[j]) * of_instance[start + i * fine[1] + j]
         of_instance[coarse[0] + texel] = mean
 
 
@@ -169,13 +169,13 @@ def _halve_adjoint(
     batch, thread = wp.tid()
     of_instance = adj_texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, across, down = _covered(texel, fine, coarse)
+        start, columns, down = _covered(texel, fine, coarse)
         adj_mean = of_instance[coarse[0] + texel]
         for i in range(3):
             if down[i] > 0.0:
                 for j in range(3):
-                    if across[j] > 0.0:
-                        wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * across[j]) * adj_mean)
+                    if columns[j] > 0.0:
+                        wp.atomic_add(of_instance, start + i * fine[1] + j, (down[i] * columns[j]) * adj_mean)
 
 
 def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> Textures:
@@ -191,7 +191,8 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
             by default all.
 
     Returns:
-        All levels, those beyond the coarsest unwritten or left out. One image without coarser levels is not copied.
+        All levels, except levels beyond the coarsest, which are unwritten or left out. One image without coarser levels
+        is not copied.
 
     Differentiable: images.
     """
@@ -229,11 +230,11 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
 def gather_levels(
     adj_texels: wp.array, adj_images: Sequence[wp.array | None], sizes: Sizes, *, coarsest: int | None
 ) -> None:
-    """The adjoint of :func:`mip_pyramids`: add the gradients of all levels to those of the images.
+    """The adjoint of :func:`mip_pyramids`: add the gradients of all levels to the images' gradients.
 
     Args:
-        adj_texels: Of the texels, vec3 of shape [batch, texel]; those of finer levels gather what coarser ones have.
-        adj_images: Of the images, vec3 of shape [batch, height, width]; None for those that want none.
+        adj_texels: Of the texels, vec3 of shape [batch, texel]; finer levels gather the gradients of coarser ones.
+        adj_images: Of the images, vec3 of shape [batch, height, width]; None to skip one.
         sizes: Height and width of each image.
         coarsest: Coarsest level that has gradients, None for the last.
     """

@@ -63,7 +63,7 @@ def _reach(count: float):
 
 @wp.func
 def _share(probe: int, count: float):
-    """What a probe weighs of ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
+    """Weight of a probe among ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
     return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0)
 
 
@@ -148,7 +148,7 @@ def at_uv(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2):
 
 @wp.func
 def _scatter(adj_texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, line: wp.vec4, adj_color: wp.vec3):
-    """Add to the gradients of a level's texels: the adjoint of `_filtered`, by what is filtered."""
+    """Add to the gradients of a level's texels: the adjoint of `_filtered`, by its value."""
     place = _place(level, uv)
     reach = _reach(line[3])
     adj_sum = (1.0 / line[3]) * adj_color
@@ -172,7 +172,7 @@ def _color(
     vertex_albedo: wp.array(dtype=wp.vec3),
     texels: wp.array(dtype=wp.vec3),
 ):
-    """What a sample of an instance reflects."""
+    """Reflectance of a sample of an instance."""
     footprint = instance_in(instance, sampled.texture_ids.shape[0])
     texture = sampled.texture_ids[footprint, sample]
     color = wp.vec3()
@@ -205,7 +205,7 @@ def _sample(
     albedo: wp.array2d(dtype=wp.vec3),
     radiance: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples: what they reflect or, if samples of white surfaces are given, their exposure."""
+    """A thread owns a run of samples: their reflectance or, if samples of white surfaces are given, their exposure."""
     instance, thread = split_row(first_row + wp.tid(), sampled.texture_ids.shape[1] // sampled.run)
     of_vertices = vertex_albedo[instance_in(instance, vertex_albedo.shape[0])]
     of_textures = texels[instance_in(instance, texels.shape[0])]
@@ -229,7 +229,7 @@ def _sample_adjoint_by_colors(
     adj_vertex_albedo: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a run of samples: the adjoint of `_sample` by what reflects."""
+    """A thread owns a run of samples: the adjoint of `_sample` by the reflectance."""
     instance, thread = wp.tid()
     footprint = instance_in(instance, sampled.texture_ids.shape[0])
     view = instance_in(instance, sampled.face_ids.shape[0])
@@ -269,8 +269,8 @@ def _slopes(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, step:
     below_right = wp.dot(texels[cell.below_right], adj_color)
     above = (1.0 - cell.s) * above_left + cell.s * above_right
     below = (1.0 - cell.s) * below_left + cell.s * below_right
-    across = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
-    return wp.vec3(across * float(level[1]), (above - below) * float(level[2]), (1.0 - cell.t) * above + cell.t * below)
+    by_s = (1.0 - cell.t) * (above_right - above_left) + cell.t * (below_right - below_left)
+    return wp.vec3(by_s * float(level[1]), (above - below) * float(level[2]), (1.0 - cell.t) * above + cell.t * below)
 
 
 @wp.kernel(enable_backward=False)
@@ -316,8 +316,8 @@ def _sample_adjoint_by_places(
                     adj_count += 0.5 * slopes[2] / count
                 adj_u += weight * slopes[0]
                 adj_v += weight * slopes[1]
-                along = float(probe) * weight
-                adj_line += wp.vec4(along * slopes[0], along * slopes[1], adj_width, adj_count)
+                weighted_probe = float(probe) * weight
+                adj_line += wp.vec4(weighted_probe * slopes[0], weighted_probe * slopes[1], adj_width, adj_count)
             if adj_uvs:
                 wp.atomic_add(adj_uvs, footprint, sample, wp.vec2(adj_u, adj_v))
             if adj_probes:
@@ -340,7 +340,7 @@ def sample_albedo(
     It is a continuous function of the footprint: levels blend, and probes fade in at the ends of their line.
 
     Args:
-        fragments: What each sample sees.
+        fragments: The fragments of the samples.
         faces: Vertex indices, vec3i of shape [face].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex]; not seen on textured faces.
         textures: The textures.
@@ -383,7 +383,7 @@ def textured_radiance(
     footprints: Footprints,
     white: wp.array,
 ) -> wp.array:
-    """Radiance of samples while what they reflect is found, where all else is kept.
+    """Radiance of samples whose reflectance is sampled here, where all else is cached.
 
     It is :func:`sample_albedo` and :func:`warpshadow.stages.film.sample_radiance` in one: neither albedo nor its
     gradient is written.
@@ -423,7 +423,7 @@ def add_to_texels(adj_texels: wp.array, textures: Textures, footprints: Footprin
         adj_texels: Gradients of the texels, to which it adds, vec3 of shape [batch, texel].
         textures: The textures.
         footprints: Of the samples.
-        adj_albedo: Gradients of what the samples reflect, vec3 of shape [batch, height, width].
+        adj_albedo: Gradients of the samples' reflectance, vec3 of shape [batch, height, width].
     """
     inputs = [_make_sampled(textures, footprints), None, rows(adj_albedo), None]
     launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=[None, adj_texels])

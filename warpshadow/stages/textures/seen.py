@@ -1,4 +1,4 @@
-"""Seen texels: which parts of textures images show, and what to fill the others with."""
+"""Seen texels: which parts of textures images show, and how to fill the others."""
 
 import numpy as np
 import warp as wp
@@ -11,10 +11,10 @@ from warpshadow.stages.textures.sample import add_to_texels
 
 
 def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
-    """Sum what each texel weighs in the samples of all images that see it.
+    """Sum the weights of each texel in the samples of all images that see it.
 
     Args:
-        textures: The textures; what is in them does not matter.
+        textures: The textures; only their sizes matter.
         footprints: Of the samples, from :func:`warpshadow.stages.textures.footprint.find_footprints`.
 
     Returns:
@@ -36,7 +36,7 @@ def fill_unseen(texture: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     Args:
         texture: Linear RGB, shape [height, width, 3].
-        weights: What each texel weighs in the images (:func:`seen_texels`), shape [height, width].
+        weights: Weight of each texel in the images (:func:`seen_texels`), shape [height, width].
 
     Returns:
         The texture, filled, shape [height, width, 3]; unchanged where no texel was seen.

@@ -79,8 +79,8 @@ def make_cone(lanes: int) -> wp.Function:
         distance = sqrt(wp.max(dot(relative, relative), Lane(NEAREST2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         sine2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
-        # What the blend's cubic lacks of _COSINE is exactly 0 from 1.01 r on, where u is: sums need no cases, and
-        # sine2 keeps its digits even where a compiler fuses multiplication and addition.
+        # The blend's cubic misses _COSINE by exactly 0 from 1.01 r on, where u is: sums need no cases, and sine2 keeps
+        # its digits even where a compiler fuses multiplication and addition.
         t = wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
         u = Lane(1.0) - t
         lack = wp.cw_mul(u, Lane(3.0 * COSINE - 2.0 * RISE) + (RISE - 2.0 * COSINE) * u)
@@ -96,7 +96,7 @@ def make_cone(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_cone_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`make_cone`'s function: its arguments, result and adjoint → those of offset and radius.
+    """Make the adjoint of :func:`make_cone`'s function: its arguments, result and adjoint → adj of offset and radius.
 
     Cosine, sin²θ and weight depend on X = D/r alone, and sin²θ = 1 − cos²θ, so with c' = dc/dX
 
@@ -118,11 +118,11 @@ def make_cone_adjoint(lanes: int) -> wp.Function:
         distance = sqrt(wp.min(wp.max(dot(relative, relative), Lane(NEAREST2)), Lane(FARTHEST2)))
         inverse = wp.cw_div(Lane(1.0), distance)
         ratio2 = wp.min(wp.cw_mul(inverse, inverse), Lane(SINE2))
-        beyond = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
+        upper_bound = wp.cw_div(wp.cw_mul(ratio2, sqrt(ratio2)), sqrt(Lane(1.0) - ratio2))
         u = Lane(1.0) - wp.min(wp.max((1.0 / BLEND) * (distance - Lane(1.0)), Lane(0.0)), Lane(1.0))
         within = Lane(RISE) + wp.cw_mul(u, Lane(6.0 * COSINE - 4.0 * RISE) + (3.0 * RISE - 6.0 * COSINE) * u)
         is_within = wp.min(wp.max((Lane(1.0 + BLEND) - distance) * 1.0e20, Lane(0.0)), Lane(1.0))
-        cosine_slope = beyond + wp.cw_mul(is_within, (1.0 / BLEND) * within - beyond)
+        cosine_slope = upper_bound + wp.cw_mul(is_within, (1.0 / BLEND) * within - upper_bound)
         near = wp.min((1.0 / FADE) * distance, Lane(1.0))
         weight_slope = (6.0 / FADE) * wp.cw_mul(near, Lane(1.0) - near)
 

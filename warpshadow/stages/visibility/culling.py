@@ -15,14 +15,14 @@ from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.stages.visibility.cones import BLEND
-from warpshadow.stages.visibility.walk import ALL, receivers_type
+from warpshadow.stages.visibility.traversal import ALL, receiver_lanes_type
 
 REACH = 1.001 + BLEND
 """Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
 
 
 @wp.struct
-class Cells:
+class DirectionCells:
     """Cells of directions and the cones around bundles of them, as kernels see them."""
 
     directions: wp.array(dtype=wp.vec3)
@@ -32,10 +32,10 @@ class Cells:
     sin_width: float
 
 
-def make_cells(directions: np.ndarray, width: float, device: wp.Device) -> Cells:
+def make_cells(directions: np.ndarray, width: float, device: wp.Device) -> DirectionCells:
     """Put cells together with the cones around their bundles."""
     axes, cosine, sine = bundle_cones(directions, width)
-    cells = Cells()
+    cells = DirectionCells()
     cells.directions = constant(directions, wp.vec3, device)
     cells.axes = constant(axes, wp.vec3, device)
     cells.half_angles = constant(np.stack([cosine, sine], axis=-1), wp.vec2, device)
@@ -74,13 +74,13 @@ def make_reaches(lanes: int) -> wp.Function:
     """Make the kernel function that says whether a cap reaches a bundle for any receiver."""
     Cap = cap_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, along = fn.is_any_above, fn.along
+    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
 
     @wp.func(inline=True)
     def reaches(cap: Cap, axis: wp.vec3, half_angle: wp.vec2):
         # u·axis > cos(θ + w + the bundle's half-angle)
         limit = half_angle[0] * cap.cosine - half_angle[1] * cap.sine
-        return is_any_above(along(axis, cap.axis) - limit, 0.0)
+        return is_any_above(dot_direction(axis, cap.axis) - limit, 0.0)
 
     return reaches
 
@@ -106,24 +106,24 @@ def make_rises(has_horizon: bool, lanes: int) -> wp.Function:
 
 @functools.cache
 def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
-    """Make the kernel function that lists the bundles of directions that spheres can reach, for the walk.
+    """Make the kernel function that lists the bundles of directions that spheres can reach, for the traversal.
 
     Args:
         has_horizon: Whether receivers have normals.
         Task: Struct that has
 
-            - ``cells`` and ``first_bundle``: the thread's bundles begin there;
-            - ``ends`` [bundle], int32: the place in the walk from which on nothing matters to a bundle;
-            - ``found`` [2, bundle], int32: bundles that a run, and then a quad, may reach, where they are listed.
+            - ``cells`` and ``first_bundle``: the thread's bundles begin there; - ``ends`` [bundle], int32: the place in
+            the traversal from which on nothing matters to a bundle; - ``reached_bundles`` [2, bundle], int32: bundles
+            that a run, and then a quad, may reach, where they are listed.
         lanes: Receivers of a group.
     """
-    Lane, Receivers = lane_type(lanes), receivers_type(lanes)
+    Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
 
     @wp.func
-    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
+    def cull(receivers: ReceiverLanes, bound: wp.vec4, place: int, candidates: int, task: Task):
         """Returns how many of the candidates, none for spheres that are wholly below the horizon."""
         count = int(0)
         cells = task.cells
@@ -137,17 +137,17 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
             cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
             cap = widen(scale(inverse, away), cosine, sine, cells.cos_width, cells.sin_width)
             if is_within or rises(cap, receivers.normals):
-                candidate_count = among
-                if among == ALL:
+                candidate_count = candidates
+                if candidates == ALL:
                     candidate_count = task.ends.shape[0]
                 for k in range(candidate_count):
                     bundle = k
-                    if among != ALL:
-                        bundle = task.found[0, k]
+                    if candidates != ALL:
+                        bundle = task.reached_bundles[0, k]
                     at = task.first_bundle + bundle
                     is_met = task.ends[bundle] > place
                     if is_met and (is_within or reaches(cap, cells.axes[at], cells.half_angles[at])):
-                        task.found[wp.where(among == ALL, 0, 1), count] = bundle
+                        task.reached_bundles[wp.where(candidates == ALL, 0, 1), count] = bundle
                         count += 1
         return count
 

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.lanes import (
-    group_count,
+    block_count,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -29,7 +29,7 @@ from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import (
-    Cells,
+    DirectionCells,
     cap_type,
     make_cells,
     make_cull,
@@ -37,16 +37,16 @@ from warpshadow.stages.visibility.culling import (
     make_rises,
     make_widen,
 )
-from warpshadow.stages.visibility.falloff import make_falloff, make_falloff_pull
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, Spheres
-from warpshadow.stages.visibility.walk import (
-    Clusters,
+from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters
+from warpshadow.stages.visibility.traversal import (
+    ClusterTree,
     make_load_receivers,
     make_spheres,
-    make_walk,
-    pull_type,
-    receivers_type,
-    seen_type,
+    make_traversal,
+    receiver_lanes_type,
+    sphere_adjoint_type,
+    sphere_view_type,
 )
 
 SOFTNESS = 0.35
@@ -60,42 +60,42 @@ PAIR_COST = 0.15
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of what a thread works on: a span of bundles of directions."""
+    """Struct of a thread's work: a span of bundles of directions."""
     Lane = lane_type(lanes)
 
     @wp.struct
-    class Task:
-        cells: Cells
+    class TransmittanceTask:
+        cells: DirectionCells
         first_bundle: int
-        ends: wp.array(dtype=wp.int32)  # [bundle] the place in the walk where nothing is left to block
-        found: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
+        ends: wp.array(dtype=wp.int32)  # [bundle] the place in the traversal where nothing is left to block
+        reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a quad, may reach
         passing: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
-    return Task
+    return TransmittanceTask
 
 
 @functools.cache
 def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
     """Make the kernel function that finds out which receivers and directions a thread works on."""
-    Lane, Task = lane_type(lanes), _task_type(lanes)
-    find_group, load_receivers = make_lane_functions(lanes).find_group, make_load_receivers(has_horizon, lanes)
+    Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
+    find_block, load_receivers = make_lane_functions(lanes).find_block, make_load_receivers(has_horizon, lanes)
 
-    @wp.func(inline=False)
+    @wp.func(inline=lanes == 1)
     def begin(
         row: int,
         span: int,
         worker: int,
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        cells: Cells,
+        cells: DirectionCells,
         all_ends: wp.array3d(dtype=wp.int32),
         scratch: wp.array2d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
     ):
-        batch, group = find_group(row, points.shape[1])
+        batch, group = find_block(row, points.shape[1])
         place = scratch_place(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
-        task = Task(cells, span * ends.shape[0], ends, found[place], scratch[place])
+        task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[place], scratch[place])
         return batch, group, load_receivers(points, normals, batch, group), task
 
     return begin
@@ -103,39 +103,44 @@ def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_block(lanes: int) -> wp.Function:
-    """Make the kernel function that lets a sphere block its share of what passes towards a bundle of directions."""
-    Lane, Task, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
+    """Make the kernel function that lets a sphere block its share of a bundle's transmittance."""
+    Lane, TransmittanceTask, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, along = fn.is_any_above, fn.along
+    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
 
     @wp.func(inline=True)
-    def block(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: Task):
+    def block(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
         """Returns whether anything is left."""
-        most = Lane(0.0)
+        maximum = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
         place = bundle * BUNDLE
         for i in range(BUNDLE):
-            t = wp.cw_mul(along(task.cells.directions[direction + i], cap.axis) - cap.cosine, slope)
+            t = wp.cw_mul(dot_direction(task.cells.directions[direction + i], cap.axis) - cap.cosine, slope)
             t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
             step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
             left = wp.cw_mul(task.passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
-            most = wp.max(most, left)
+            maximum = wp.max(maximum, left)
             task.passing[place + i] = left
-        return is_any_above(most, _OPAQUE)
+        return is_any_above(maximum, _OPAQUE)
 
     return block
 
 
 @functools.cache
 def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Receivers, Seen, Task = lane_type(lanes), receivers_type(lanes), seen_type(lanes), _task_type(lanes)
+    Lane, ReceiverLanes, SphereView, TransmittanceTask = (
+        lane_type(lanes),
+        receiver_lanes_type(lanes),
+        sphere_view_type(lanes),
+        _task_type(lanes),
+    )
     fn = make_lane_functions(lanes)
-    store_columns, sqrt, is_any_above, along = fn.store_columns, fn.sqrt, fn.is_any_above, fn.along
+    store_columns, sqrt, is_any_above, dot_direction = fn.store_columns, fn.sqrt, fn.is_any_above, fn.dot_direction
     begin, falloff, block = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_block(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -143,13 +148,13 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         if rises(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             for k in range(count):
-                bundle = task.found[1, k]
+                bundle = task.reached_bundles[1, k]
                 at = task.first_bundle + bundle
                 is_met = task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at])
                 if is_met and not block(cap, slope, opacity, bundle, task):
                     task.ends[bundle] = seen.place + 1
 
-    walk = make_walk(make_cull(has_horizon, Task, lanes), visit, Task, False, lanes)
+    traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit(
@@ -158,11 +163,11 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
-        cells: Cells,
+        spheres: SphereClusters,
+        cells: DirectionCells,
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
         # out
         all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
@@ -170,7 +175,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         item, span = wp.tid()
         batch, group, receivers, task = begin(
-            first_row + item, span, worker, points, normals, cells, all_ends, scratch, found
+            first_row + item, span, worker, points, normals, cells, all_ends, scratch, reached_bundles
         )
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
@@ -178,9 +183,9 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
             task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
             if wp.static(has_horizon):
                 at = task.first_bundle + bundle
-                if not is_any_above(along(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+                if not is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
                     task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
-        walk(receivers, batch, spheres, Gradients(), task)
+        traverse(receivers, batch, spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
         store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, group, transmittance[batch])
 
@@ -190,19 +195,24 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    Receivers, Seen, Pull, Task = receivers_type(lanes), seen_type(lanes), pull_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, SphereAdjoint, TransmittanceTask = (
+        receiver_lanes_type(lanes),
+        sphere_view_type(lanes),
+        sphere_adjoint_type(lanes),
+        _task_type(lanes),
+    )
     fn = make_lane_functions(lanes)
-    load_products, sqrt, along, add_vectors = fn.load_products, fn.sqrt, fn.along, fn.add_vectors
-    begin, falloff, falloff_pull = _make_begin(has_horizon, lanes), make_falloff(lanes), make_falloff_pull(lanes)
+    load_products, sqrt, dot_direction, add_vectors = fn.load_products, fn.sqrt, fn.dot_direction, fn.add_vectors
+    begin, falloff, sphere_adjoint = _make_begin(has_horizon, lanes), make_falloff(lanes), make_sphere_adjoint(lanes)
     widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
         """The adjoint of the sphere's cone.
 
         With a the share of a cell that it blocks, ā_i = −T̄ T / (1 − a_i).
         """
-        pull = Pull()
+        pull = SphereAdjoint()
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
@@ -217,13 +227,13 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
             sum_z = Lane(0.0)
             adj_opacity = Lane(0.0)
             for k in range(count):
-                bundle = task.found[1, k]
+                bundle = task.reached_bundles[1, k]
                 at = task.first_bundle + bundle
                 if task.ends[bundle] > seen.place and reaches(cap, cells.axes[at], cells.half_angles[at]):
                     is_any_met = True
                     for i in range(BUNDLE):
                         omega = cells.directions[at * BUNDLE + i]
-                        t = wp.cw_mul(along(omega, cap.axis) - cap.cosine, slope)
+                        t = wp.cw_mul(dot_direction(omega, cap.axis) - cap.cosine, slope)
                         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
                         step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                         left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
@@ -237,7 +247,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                         sum_y += omega[1] * adj_t
                         sum_z += omega[2] * adj_t
             if is_any_met:
-                adj_offset, adj_radius, adj_weight = falloff_pull(
+                adj_offset, adj_radius, adj_weight = sphere_adjoint(
                     seen,
                     sine,
                     cap.cosine,
@@ -255,7 +265,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                 pull.weight = adj_weight
         return pull
 
-    walk = make_walk(make_cull(has_horizon, Task, lanes), visit, Task, True, lanes)
+    traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit_adjoint(
@@ -264,14 +274,14 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
-        cells: Cells,
+        spheres: SphereClusters,
+        cells: DirectionCells,
         all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array2d(dtype=Lane),
-        found: wp.array3d(dtype=wp.int32),
+        reached_bundles: wp.array3d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_centers: wp.array2d(dtype=wp.vec3),
@@ -281,7 +291,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and a span of bundles."""
         item, span = wp.tid()
         batch, group, receivers, task = begin(
-            first_row + item, span, worker, points, normals, cells, all_ends, scratch, found
+            first_row + item, span, worker, points, normals, cells, all_ends, scratch, reached_bundles
         )
         load_products(
             transmittance[batch],
@@ -295,7 +305,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         gradients.centers = adj_centers
         gradients.radii = adj_radii
         gradients.extents = adj_extents
-        adj = walk(receivers, batch, spheres, gradients, task)
+        adj = traverse(receivers, batch, spheres, gradients, task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
 
@@ -312,14 +322,14 @@ def transmittance(
     softness: float = SOFTNESS,
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
-    clusters: Clusters | None = None,
+    clusters: ClusterTree | None = None,
 ) -> wp.array:
     """Transmittance of spheres towards cells of directions.
 
     Args:
         points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals, vec3 of shape [batch, vertex]: what lies below a receiver's horizon, where the cosine
-            is zero, may be left at 1. None computes it all.
+        normals: Unit normals, vec3 of shape [batch, vertex]: cells below a receiver's horizon, where the cosine is
+            zero, may be left at 1. None computes it all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
@@ -327,7 +337,7 @@ def transmittance(
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
-        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
+        clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
 
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
@@ -350,7 +360,7 @@ def transmittance(
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
     nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
-    dim = batch_count * group_count(vertex_count, lanes), span_count
+    dim = batch_count * block_count(vertex_count, lanes), span_count
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
     result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)

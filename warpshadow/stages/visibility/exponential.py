@@ -3,17 +3,17 @@
 exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
 
 Squarings are *held* where they would explode. Where many spheres overlap, the truncated sum of their logs has lobes
-above 0, and the exponential of those has no bound: with 10 000 spheres in one direction it leaves float64. A visibility
-v has values from 0 to 1, so the mean of v² over all directions is at most the mean of v. Truncation breaks that rule,
-and d = ⟨v²⟩ − ⟨v⟩, which is then above 0, measures by how much. Each squaring is
+above 0, and their exponential has no bound: with 10 000 spheres in one direction it leaves float64. A visibility v has
+values from 0 to 1, so the mean of v² over all directions is at most the mean of v. Truncation breaks that rule, and d =
+⟨v²⟩ − ⟨v⟩, which is then above 0, measures by how much. Each squaring is
 
     v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
 
-While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the result
-is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the squarings of
-such logs earlier; nothing is lost, since those receivers are dark before their last squarings. LOUD is four times
-QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v changes
-smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
+While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the
+result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the
+squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings. LOUD is four
+times QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v
+changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
 
 The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with
 it, by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
@@ -32,7 +32,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import group_count, lane_count, lane_type, make_lane_functions, module_options
+from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
@@ -60,7 +60,7 @@ LEAST_THRESHOLD = 0.01
 """Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
 
 MOST_SQUARINGS = 20
-"""Limit of the squarings; a log that asks for more is cut down to what they can do."""
+"""Limit of the squarings; a log that asks for more is cut down to it."""
 
 QUIET = 6.0
 """|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
@@ -119,7 +119,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
         depth = sqrt(norm2 + wp.cw_mul(above, above))
         count = Lane(0.0)
         scale = Lane(1.0)
-        most = int(0)
+        maximum = int(0)
         root = Lane(0.0)
         blend = Lane(0.0)
         blend_slope = Lane(0.0)
@@ -133,13 +133,14 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
             p = wp.min(p, MOST_SQUARINGS)
             count[lane] = float(p)
             scale[lane] = s
-            most = wp.max(most, p)
-            # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing overflows
+            maximum = wp.max(maximum, p)
+            # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing
+            # overflows
             root[lane] = wp.exp(0.5 * s * log[0][lane] / _UNIT)
             t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
             blend[lane] = t * t * (3.0 - 2.0 * t)
             blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
-        return count, scale, sqrt(norm2), depth, most, root, blend, blend_slope
+        return count, scale, sqrt(norm2), depth, maximum, root, blend, blend_slope
 
     return measure
 
@@ -252,8 +253,9 @@ def _make_square(order: int, lanes: int) -> wp.Function:
 def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
     """Make the adjoint of :func:`_make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
 
-    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the loudness
-    λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄ λ/|f̂|.
+    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the
+    loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄
+    λ/|f̂|.
     """
     Lane = lane_type(lanes)
     hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
@@ -268,11 +270,11 @@ def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
     ):
         multiply(row, adj_square, table, adj_row)
         mean_square = Lane(0.0)
-        along = Lane(0.0)
+        row_dot = Lane(0.0)
         adj_share = Lane(0.0)
         for i in range(wp.static(order**2)):
             mean_square += wp.cw_mul(row[i], row[i])
-            along += wp.cw_mul(row[i], adj_square[i])
+            row_dot += wp.cw_mul(row[i], adj_square[i])
             adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
         growth = (mean_square / _UNIT - row[0]) / _UNIT
         share, share_slope = hold(wp.cw_mul(depth, growth))
@@ -284,7 +286,7 @@ def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, row[i])
             adj_row[0] = adj_row[0] - adj_growth / _UNIT
-        return along + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
+        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
 
     return square_held_adjoint
 
@@ -294,7 +296,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
     Lane = lane_type(lanes)
     fn = make_lane_functions(lanes)
     load_rows, store_rows, multiply = fn.load_rows, fn.store_rows, make_multiply(order, lanes)
-    find_group = fn.find_group
+    find_block = fn.find_block
     measure, approximate = _make_measure(order, lanes), _make_base(order, base, lanes)
     square_held = _make_square(order, lanes)
 
@@ -316,11 +318,11 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
     ):
         """A thread owns a group of receivers: base approximation of f / 2^p, then p squarings.
 
-        Powers are the approximation of f / 2^{p+1}, then what is squared. Faults count the receivers whose squarings
-        are held, and those whose log is too large or not finite.
+        Powers are the approximation of f / 2^{p+1}, then its squares. Faults count the receivers whose squarings are
+        held, and the receivers whose log is too large or not finite.
         """
         thread = first_row + wp.tid()
-        batch, group = find_group(thread, log_sh.shape[1])
+        batch, group = find_block(thread, log_sh.shape[1])
         own = scratch[scratch_place(worker, thread)]
         row = own[0]
         square = own[1]
@@ -328,7 +330,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         if wp.static(keeps_powers):
             half = powers[batch, group, 0]
         load_rows(log_sh[batch], group, row)
-        count, scale, norm, depth, most, root, blend, _slope = measure(row, threshold)
+        count, scale, norm, depth, maximum, root, blend, _slope = measure(row, threshold)
         mean = row[0]
         row[0] = Lane(0.0)
         if wp.static(base == "quadratic"):
@@ -340,7 +342,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
             held = wp.cw_mul(blend, square_held(half, depth, table, square))
             for i in range(wp.static(order**2)):
                 row[i] = wp.cw_mul(Lane(1.0) - blend, row[i]) + wp.cw_mul(blend, square[i])
-        for step in range(most):
+        for step in range(maximum):
             if wp.static(keeps_powers):
                 for i in range(wp.static(order**2)):
                     powers[batch, group, step + 1, i] = row[i]
@@ -363,7 +365,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
     Lane = lane_type(lanes)
     fn = make_lane_functions(lanes)
     load_rows, add_rows, multiply = fn.load_rows, fn.add_rows, make_multiply(order, lanes)
-    find_group = fn.find_group
+    find_block = fn.find_block
     measure, factors = _make_measure(order, lanes), _make_factor(base, lanes)
     square_held_adjoint = _make_square_adjoint(order, lanes)
 
@@ -391,7 +393,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         also F (√4π q̄0 a' + b' Σ q̄ h) h/|h| and the like of ū. For `quadratic` q = 4 √F u − F (3 + h).
         """
         thread = first_row + wp.tid()
-        batch, group = find_group(thread, log_sh.shape[1])
+        batch, group = find_block(thread, log_sh.shape[1])
         own = scratch[scratch_place(worker, thread)]
         log = own[0]
         adj_row = own[1]
@@ -399,10 +401,10 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         bent = own[3]
         load_rows(log_sh[batch], group, log)
         load_rows(adj_visibility[batch], group, adj_row)
-        count, scale, norm, depth, most, root, blend, blend_slope = measure(log, threshold)
+        count, scale, norm, depth, maximum, root, blend, blend_slope = measure(log, threshold)
         adj_depth = Lane(0.0)
-        for back in range(most):
-            step = most - 1 - back
+        for back in range(maximum):
+            step = maximum - 1 - back
             is_due = wp.min(wp.max(count - Lane(float(step)), Lane(0.0)), Lane(1.0))
             _along, change = square_held_adjoint(powers[batch, group, step + 1], depth, table, adj_row, product)
             adj_depth += wp.cw_mul(is_due, change)
@@ -417,15 +419,15 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         constant, slope, constant_change, slope_change = factors(length, optimal)
         _constant, half_slope, half_constant_change, half_slope_change = factors(0.5 * length, optimal)
 
-        along = Lane(0.0)  # Σ v̄ h
+        row_dot = Lane(0.0)  # Σ v̄ h
         half_along = Lane(0.0)  # Σ v̄ u
         for i in range(wp.static(order**2)):
             log[i] = wp.cw_mul(scale, log[i])
-            along += wp.cw_mul(adj_row[i], log[i])
+            row_dot += wp.cw_mul(adj_row[i], log[i])
             half_along += wp.cw_mul(adj_row[i], half[i])
-        whole = wp.cw_mul(factor, _UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, along))  # Σ v̄ q
+        whole = wp.cw_mul(factor, _UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, row_dot))  # Σ v̄ q
         if wp.static(base == "quadratic"):
-            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * _UNIT * adj_row[0] + along)
+            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * _UNIT * adj_row[0] + row_dot)
         rest = Lane(1.0) - blend
         dc = wp.cw_mul(rest, whole)
         if wp.max(blend) > 0.0:
@@ -444,10 +446,10 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         for i in range(wp.static(order**2)):
             adj_row[i] = wp.cw_mul(wp.cw_mul(factor, rest), adj_row[i])
             half_along += wp.cw_mul(product[i], log[i])
-        along = wp.cw_mul(wp.cw_mul(factor, rest), along)
+        row_dot = wp.cw_mul(wp.cw_mul(factor, rest), row_dot)
         radial = Lane(0.0)
         if wp.static(base == "optimal_linear"):
-            radial = _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(along, slope_change)
+            radial = _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
             radial += _UNIT * wp.cw_mul(product[0], half_constant_change)
             radial += 0.5 * wp.cw_mul(half_along, half_slope_change)
             radial = wp.cw_div(radial, wp.max(length, Lane(1.0e-20)))
@@ -508,7 +510,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     device = log_sh.device
     lanes = lane_count(device)
     batch_count, vertex_count = log_sh.shape[:2]
-    groups = group_count(vertex_count, lanes)
+    groups = block_count(vertex_count, lanes)
     row_count = batch_count * groups
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # memory that no squaring reaches is never touched

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
-from warpshadow.stages.visibility.walk import seen_type
+from warpshadow.stages.visibility.traversal import sphere_view_type
 
 
 @functools.cache
@@ -71,7 +71,7 @@ def make_falloff_adjoint(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def make_falloff_pull(lanes: int) -> wp.Function:
+def make_sphere_adjoint(lanes: int) -> wp.Function:
     """Make the kernel function of the adjoint of all cells that a sphere blocks in part.
 
     With a = A·step(t) the share of a cell that it blocks and t = (u·ω − lo) slope, a visit sums up over cells
@@ -84,12 +84,12 @@ def make_falloff_pull(lanes: int) -> wp.Function:
         ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
     """
     Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
-    Seen, scale = seen_type(lanes), make_lane_functions(lanes).scale
+    SphereView, scale = sphere_view_type(lanes), make_lane_functions(lanes).scale
     falloff_adjoint, cone_adjoint = make_falloff_adjoint(lanes), make_cone_adjoint(lanes)
 
     @wp.func(inline=True)
-    def falloff_pull(
-        seen: Seen,
+    def sphere_adjoint(
+        seen: SphereView,
         sine: Lane,
         low: Lane,
         cos_width: float,
@@ -114,4 +114,4 @@ def make_falloff_pull(lanes: int) -> wp.Function:
         adj_offset, adj_radius = cone_adjoint(seen.offset, seen.curvature, seen.cone, adj_cone)
         return adj_offset, adj_radius, adj_weight
 
-    return falloff_pull
+    return sphere_adjoint

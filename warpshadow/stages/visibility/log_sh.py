@@ -6,34 +6,29 @@ log V(x) ≈ f(x) = Σ_i R(u_i) z(θ_i)                [Lyu et al. 2021, section
 import functools
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import group_count, lane_count, lane_type, make_lane_functions, module_options
+from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import (
-    PRODUCT_COST,
-    ProductTable,
     make_add_rotated_zonal,
-    make_multiply,
     make_rotated_zonal_adjoint,
-    product_table,
     zonal_type,
 )
-from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone, make_cone_adjoint
-from warpshadow.stages.visibility.merging import MERGING, Gradients, Spheres
-from warpshadow.stages.visibility.walk import (
-    Clusters,
+from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
+from warpshadow.stages.visibility.merging import MERGING, Gradients, SphereClusters
+from warpshadow.stages.visibility.traversal import (
+    ClusterTree,
     make_load_receivers,
     make_spheres,
-    make_walk,
-    pull_type,
-    receivers_type,
-    seen_type,
+    make_traversal,
+    receiver_lanes_type,
+    sphere_adjoint_type,
+    sphere_view_type,
 )
 from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_look_up, zonal_table
 
@@ -47,15 +42,15 @@ _PAIR_COST = 0.25
 
 @functools.cache
 def _task_type(order: int, lanes: int) -> Any:
-    """Struct of what a thread works on: a group's coefficients."""
+    """Struct of a thread's work: a group's coefficients."""
     Lane, Band = lane_type(lanes), band_type(order)
 
     @wp.struct
-    class Task:
+    class LogTask:
         table: wp.array2d(dtype=Band)
         row: wp.array(dtype=Lane)  # log-visibility; for the adjoint its adjoint
 
-    return Task
+    return LogTask
 
 
 @functools.cache
@@ -75,12 +70,12 @@ def _make_horizon(lanes: int) -> wp.Function:
 @functools.cache
 def _make_cull(order: int, has_horizon: bool, lanes: int) -> wp.Function:
     """Make the kernel function that says whether spheres are above the horizon of any receiver, if only in part."""
-    Receivers, Task = receivers_type(lanes), _task_type(order, lanes)
+    ReceiverLanes, LogTask = receiver_lanes_type(lanes), _task_type(order, lanes)
     fn = make_lane_functions(lanes)
     is_any_above, dot, offset = fn.is_any_above, fn.dot, fn.offset
 
     @wp.func
-    def cull(receivers: Receivers, bound: wp.vec4, place: int, among: int, task: Task):
+    def cull(receivers: ReceiverLanes, bound: wp.vec4, place: int, candidates: int, task: LogTask):
         """Returns 1 or 0."""
         count = int(1)
         if wp.static(has_horizon):
@@ -94,15 +89,15 @@ def _make_cull(order: int, has_horizon: bool, lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Band, Task = lane_type(lanes), band_type(order), _task_type(order, lanes)
-    Receivers, Seen = receivers_type(lanes), seen_type(lanes)
+    Lane, Band, LogTask = lane_type(lanes), band_type(order), _task_type(order, lanes)
+    ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
-    find_group, store_rows, is_any_above, dot = fn.find_group, fn.store_rows, fn.is_any_above, fn.dot
+    find_block, store_rows, is_any_above, dot = fn.find_block, fn.store_rows, fn.is_any_above, fn.dot
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
     look_up, add_rotated_zonal = make_look_up(order, False, lanes), make_add_rotated_zonal(order, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LogTask):
         weight = seen.cone.weight
         if wp.static(has_horizon):
             fade, _slope = horizon(seen.curvature * dot(receivers.normals, seen.offset))
@@ -114,7 +109,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
                 zonal[band] = wp.cw_mul(zonal[band], amount)
             add_rotated_zonal(seen.cone.axis, zonal, task.row)
 
-    walk = make_walk(_make_cull(order, has_horizon, lanes), visit, Task, False, lanes)
+    traverse = make_traversal(_make_cull(order, has_horizon, lanes), visit, LogTask, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh(
@@ -123,7 +118,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
+        spheres: SphereClusters,
         table: wp.array2d(dtype=Band),
         # scratch
         total: wp.array2d(dtype=Lane),
@@ -132,11 +127,11 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
-        batch, group = find_group(thread, points.shape[1])
+        batch, group = find_block(thread, points.shape[1])
         row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
-        walk(load_receivers(points, normals, batch, group), batch, spheres, Gradients(), Task(table, row))
+        traverse(load_receivers(points, normals, batch, group), batch, spheres, Gradients(), LogTask(table, row))
         store_rows(row, group, log_sh[batch])
 
     return accumulate_log_sh
@@ -145,10 +140,14 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal, Band, Cone = lane_type(lanes), zonal_type(order, lanes), band_type(order), cone_type(lanes)
-    Receivers, Seen, Pull = receivers_type(lanes), seen_type(lanes), pull_type(lanes)
-    Task = _task_type(order, lanes)
+    ReceiverLanes, SphereView, SphereAdjoint = (
+        receiver_lanes_type(lanes),
+        sphere_view_type(lanes),
+        sphere_adjoint_type(lanes),
+    )
+    LogTask = _task_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_group, load_rows, add_vectors = fn.find_group, fn.load_rows, fn.add_vectors
+    find_block, load_rows, add_vectors = fn.find_block, fn.load_rows, fn.add_vectors
     is_any_above, dot, add, scale = fn.is_any_above, fn.dot, fn.add, fn.scale
     cone_adjoint = make_cone_adjoint(lanes)
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
@@ -156,13 +155,13 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
 
     @wp.func(inline=True)
-    def visit(receivers: Receivers, seen: Seen, count: int, task: Task):
+    def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: LogTask):
         """The adjoint of the sphere's cone and of its height over the horizon.
 
-        With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā s²,
-        and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
+        With z_l = a h_l(c), a = s² w and h from the table:  ā = Σ z̄_l h_l,  c̄ = a Σ z̄_l h_l',  s̄² = ā w,  w̄ = ā
+        s², and with w = w_cone w_horizon(n·d/r):  n̄ = d w̄_h w_h'/r,  d̄ += n w̄_h w_h'/r,  r̄ −= n·d/r w̄_h w_h'/r
         """
-        pull = Pull()
+        pull = SphereAdjoint()
         cone = seen.cone
         height = Lane(0.0)
         fade = Lane(1.0)
@@ -202,7 +201,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
             pull.normals = scale(adj_height, seen.offset)
         return pull
 
-    walk = make_walk(_make_cull(order, has_horizon, lanes), visit, Task, True, lanes)
+    traverse = make_traversal(_make_cull(order, has_horizon, lanes), visit, LogTask, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def accumulate_log_sh_adjoint(
@@ -211,7 +210,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         # in
         points: wp.array2d(dtype=wp.vec3),
         normals: wp.array2d(dtype=wp.vec3),
-        spheres: Spheres,
+        spheres: SphereClusters,
         table: wp.array2d(dtype=Band),
         adj_log_sh: wp.array3d(dtype=wp.float32),
         # scratch
@@ -225,7 +224,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     ):
         """A thread owns a group of receivers."""
         thread = first_row + wp.tid()
-        batch, group = find_group(thread, points.shape[1])
+        batch, group = find_block(thread, points.shape[1])
         row = scratch[scratch_place(worker, thread)]
         load_rows(adj_log_sh[batch], group, row)
         receivers = load_receivers(points, normals, batch, group)
@@ -233,7 +232,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         gradients.centers = adj_centers
         gradients.radii = adj_radii
         gradients.extents = adj_extents
-        adj = walk(receivers, batch, spheres, gradients, Task(table, row))
+        adj = traverse(receivers, batch, spheres, gradients, LogTask(table, row))
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
@@ -252,7 +251,7 @@ def accumulate(
     log: str = "eigen",
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
-    clusters: Clusters | None = None,
+    clusters: ClusterTree | None = None,
 ) -> wp.array:
     """Accumulate the log-visibility of spheres in spherical harmonics.
 
@@ -269,7 +268,7 @@ def accumulate(
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
-        clusters: Of these spheres, from :func:`.walk.find_clusters`, where they are found already.
+        clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
 
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
@@ -286,7 +285,7 @@ def accumulate(
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    row_count = batch_count * group_count(vertex_count, lanes)
+    row_count = batch_count * block_count(vertex_count, lanes)
     nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2), skip, clusters)
     inputs = [points, normals, spheres, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
@@ -312,106 +311,3 @@ def accumulate(
         result=wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device),
         variables=[points, normals, *nodes],
     )
-
-
-# ---------------------------------------------------------------------------------------------- the slow reference
-
-
-@functools.cache
-def _make_multiply_spheres(order: int, lanes: int) -> wp.Kernel:
-    Lane, Band = lane_type(lanes), band_type(order)
-    fn = make_lane_functions(lanes)
-    find_group, load, store_rows, offset = fn.find_group, fn.load, fn.store_rows, fn.offset
-    find_cone, look_up = make_cone(lanes), make_look_up(order, False, lanes)
-    add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
-    UNIT = wp.constant(float(np.sqrt(4 * np.pi)))  # the coefficient of the constant function 1
-
-    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
-    def multiply_spheres(
-        first_row: int,
-        worker: int,
-        # in
-        points: wp.array2d(dtype=wp.vec3),
-        centers: wp.array2d(dtype=wp.vec3),
-        radii: wp.array2d(dtype=wp.float32),
-        table: wp.array2d(dtype=Band),
-        products: ProductTable,
-        # scratch
-        scratch: wp.array3d(dtype=Lane),
-        # out
-        visibility: wp.array3d(dtype=wp.float32),
-    ):
-        """A thread owns a group of receivers and multiplies the visibility of one sphere after the other."""
-        thread = first_row + wp.tid()
-        batch, group = find_group(thread, points.shape[1])
-        own = scratch[scratch_place(worker, thread)]
-        so_far = own[0]
-        factor = own[1]
-        product = own[2]
-        for i in range(wp.static(order**2)):
-            so_far[i] = Lane(0.0)
-        so_far[0] = Lane(UNIT)
-        receivers = load(points[batch], group)
-        for sphere in range(centers.shape[1]):
-            radius = radii[batch, sphere]
-            if radius > TINY_RADIUS:
-                cone = find_cone(offset(centers[batch, sphere], receivers), 1.0 / radius)
-                zonal = look_up(cone.cosine, table)
-                for band in range(order):
-                    zonal[band] = -wp.cw_mul(zonal[band], wp.cw_mul(cone.sine2, cone.weight))
-                for i in range(wp.static(order**2)):
-                    factor[i] = Lane(0.0)
-                factor[0] = Lane(UNIT)
-                add_rotated_zonal(cone.axis, zonal, factor)
-                multiply(so_far, factor, products, product)
-                for i in range(wp.static(order**2)):
-                    so_far[i] = product[i]
-        store_rows(so_far, group, visibility[batch])
-
-    return multiply_spheres
-
-
-def multiply_spheres(points: wp.array, centers: wp.array, radii: wp.array, *, order: int = 8) -> wp.array:
-    """Multiply the SH visibilities of the spheres one by one: what log space saves, as its reference.
-
-        V(x) = Π_i* (1 − cap(θ_i) turned to u_i),  * the truncated SH product
-
-    Args:
-        points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
-        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
-        order: Number of SH bands n, 2 to 8.
-
-    Returns:
-        SH visibility, float32 of shape [batch, vertex, order²].
-
-    Raises:
-        ValueError: for hundreds of spheres in one direction, whose product, truncated again and again, overflows.
-
-    Differentiable: no.
-    """
-    sh.check_order(order)
-    check_spheres(points, None, centers, radii)
-    device = points.device
-    lanes = lane_count(device)
-    batch_count, vertex_count = points.shape
-    row_count = batch_count * group_count(vertex_count, lanes)
-    visibility = wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device)
-    launch(
-        _make_multiply_spheres(order, lanes),
-        row_count,
-        cost=PRODUCT_COST * lanes * radii.shape[1] * order**4,
-        inputs=[
-            points,
-            centers,
-            radii,
-            zonal_table(order, "indicator", str(device)),
-            product_table(order, str(device)),
-        ],
-        scratch=[Scratch((3, order**2), lane_type(lanes))],
-        outputs=[visibility],
-    )
-    if not (device.is_capturing or np.isfinite(visibility.numpy()).all()):
-        count = radii.shape[1]
-        raise ValueError(f"centers: the SH product of {count} spheres is not finite, expected fewer that overlap")
-    return visibility

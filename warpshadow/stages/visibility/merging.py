@@ -7,7 +7,7 @@ quad under a half-angle of about E/D, and takes
     m = smoothstep((τ² − (E/D)²) / (τ² − τ0²)),  τ0 = 0.7 τ
 
 of the quad's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that nothing
-jumps as bodies move. What is seen is moved by τ at most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
+jumps as bodies move. The apparent displacement is τ at most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
 
 How large a quad looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
 they cover more than the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their parts of
@@ -46,8 +46,8 @@ _SHADOW = 5.4  # of an ellipsoid, from the moments of spheres
 _FARTHEST2 = 1.0e30  # (D/E)² is kept where its products are float32
 
 
-class Nodes(NamedTuple):
-    """Spheres, and after them those of their quads; of the quads there may be none."""
+class ClusterNodes(NamedTuple):
+    """Spheres, and after them the spheres of their quads; of the quads there may be none."""
 
     centers: wp.array  # [batch, node] vec3
     radii: wp.array  # [batch, node] float32
@@ -124,8 +124,8 @@ def merged_count(sphere_count: int, merging: float) -> int:
     return sphere_count // QUAD if merging > 0 and sphere_count >= MERGED_FROM else 0
 
 
-def merge(centers: wp.array, radii: wp.array) -> Nodes:
-    """Merge every four spheres that follow each other; what is left over stays as it is.
+def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
+    """Merge every four consecutive spheres; the remainder stays as it is.
 
     Args:
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
@@ -139,10 +139,12 @@ def merge(centers: wp.array, radii: wp.array) -> Nodes:
     merged_radii, extents = (wp.empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
     launch(_merge, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
     counts = [sphere_count, shape[1]]
-    return Nodes(concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents)
+    return ClusterNodes(
+        concatenate([centers, merged_centers], counts), concatenate([radii, merged_radii], counts), extents
+    )
 
 
-def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Nodes:
+def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> ClusterNodes:
     """Merge spheres where there are enough of them and ``merging``, in cell radii, is not 0.
 
     Raises:
@@ -152,11 +154,11 @@ def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Nodes
     """
     if merged_count(radii.shape[1], merging):
         return merge(centers, radii)
-    return Nodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
+    return ClusterNodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
 
 
 @wp.struct
-class Spheres:
+class SphereClusters:
     """Spheres and their quads, as kernels see them."""
 
     centers: wp.array2d(dtype=wp.vec3)  # [batch, node]
@@ -171,20 +173,20 @@ class Spheres:
 
 
 @wp.func
-def meets(begin: int, end: int, spheres: Spheres):
+def meets(begin: int, end: int, spheres: SphereClusters):
     """Whether one of some spheres that follow each other is left out."""
     return wp.max(begin, spheres.skip_begin) < wp.min(end, spheres.skip_end)
 
 
 @wp.func
-def within(begin: int, end: int, spheres: Spheres):
+def within(begin: int, end: int, spheres: SphereClusters):
     """Whether all of some spheres that follow each other are left out."""
     return begin >= spheres.skip_begin and end <= spheres.skip_end
 
 
 @wp.struct
 class Gradients:
-    """Where to add the gradients of spheres, those that are wanted."""
+    """Where to add the gradients of spheres; unwanted ones are empty."""
 
     centers: wp.array2d(dtype=wp.vec3)
     radii: wp.array2d(dtype=wp.float32)
@@ -234,7 +236,7 @@ def _make_relative(lanes: int) -> wp.Function:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.func
-    def relative(points: Vectors, batch: int, quad: int, spheres: Spheres):
+    def relative(points: Vectors, batch: int, quad: int, spheres: SphereClusters):
         center = spheres.centers[batch, spheres.count + quad]
         inverse = 1.0 / wp.max(spheres.extents[batch, quad], TINY_RADIUS)
         offset = Vectors(
@@ -254,7 +256,7 @@ def make_merged(lanes: int) -> wp.Function:
     blend, relative = _make_blend(lanes), _make_relative(lanes)
 
     @wp.func
-    def merged(points: Vectors, batch: int, quad: int, spheres: Spheres):
+    def merged(points: Vectors, batch: int, quad: int, spheres: SphereClusters):
         share = Lane(0.0)
         if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
             offset, _inverse = relative(points, batch, quad, spheres)
@@ -277,7 +279,9 @@ def make_merged_adjoint(lanes: int) -> wp.Function:
     is_any_above, scale, dot, total = fn.is_any_above, fn.scale, fn.dot, fn.total
 
     @wp.func
-    def adjoint(points: Vectors, batch: int, quad: int, adj_merged: Lane, spheres: Spheres, gradients: Gradients):
+    def adjoint(
+        points: Vectors, batch: int, quad: int, adj_merged: Lane, spheres: SphereClusters, gradients: Gradients
+    ):
         adj_offset = Vectors()
         if quad < spheres.extents.shape[1] and not meets(QUAD * quad, QUAD * (quad + 1), spheres):
             offset, inverse = relative(points, batch, quad, spheres)

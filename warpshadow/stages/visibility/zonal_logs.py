@@ -69,7 +69,7 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
 
     Args:
         order: Number of bands n.
-        function: The log "eigen" or "cap", or "indicator" for the cap itself.
+        function: The log, "eigen" or "cap".
         device: Where the table lives.
     """
     from scipy.interpolate import CubicSpline
@@ -79,7 +79,7 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
         cosine = np.minimum(knots, 1 - 1e-9)  # the limit of 0/0
         values = zonal_eigen_log(order, cosine) / (1 - cosine**2)[:, None]
     else:
-        values = {"cap": -CAP_DEPTH, "indicator": 1.0}[function] * _zonal_cap_per_sine2(order, knots)
+        values = -CAP_DEPTH * _zonal_cap_per_sine2(order, knots)
     powers = CubicSpline(knots, values).c[::-1].transpose(1, 0, 2)
     powers = powers / float(_INTERVALS) ** np.arange(4)[:, None]
     return wp.array(powers.astype(np.float32), dtype=band_type(order), device=device)

@@ -1,0 +1,80 @@
+"""Preparing in another process: what it leaves in the caches, what it says, and how it ends."""
+
+import time
+
+import pytest
+
+import warpshadow as ws
+from warpshadow.assets.cache import cached_files
+
+pytest.importorskip("viser", reason="viser is not installed")
+from pages import PATIENCE, WirePage
+
+from warpshadow.viewer.app import ViewerApp
+from warpshadow.viewer.preparing import Preparation, has_fitted_spheres
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection"),
+]
+
+LONG = 10 * PATIENCE  # a process compiles kernels
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
+
+
+def scene(blockers=2, subdivisions=2):
+    ball = ws.Body(ws.icosphere(subdivisions=subdivisions), blockers=blockers)
+    camera = ws.Camera.look_at((0, 0, 5), (0, 0, 0), size=(64, 48))
+    return ws.Scene([ball], ws.synthetic_sky(height=32), camera, ws.Visibility(method="directional"))
+
+
+def eventually(condition):
+    end = time.monotonic() + LONG
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_another_process_fills_the_caches_and_says_how_far_it_is():
+    notes = []
+    assert not has_fitted_spheres(scene())
+    Preparation(scene(), notes.append)
+    eventually(lambda: "" in notes)
+    assert has_fitted_spheres(scene()) and len(cached_files("spheres")) == 1
+    assert len(cached_files("own_shadows")) == 2  # as it moves, and at rest
+    assert any(note.startswith("rendering: ") for note in notes) and notes[-1] == ""
+
+
+def test_a_process_that_is_closed_ends_and_keeps_what_it_has():
+    notes = []
+    preparation = Preparation(scene(512, subdivisions=4), notes.append)
+    eventually(lambda: any("fitting" in note and " 0 of" not in note for note in notes))
+    preparation.close()
+    assert preparation._process.wait(LONG) is not None
+    assert [path.name.endswith(".part.npz") for path in cached_files("spheres")] == [True]
+    assert "" not in notes
+
+
+def test_pages_see_rays_until_spheres_are_there():
+    site = ViewerApp(scene(), host="127.0.0.1", port=0)
+    page = WirePage(site.url)
+    try:
+        page.look_from(position=(0, 0, -8.0))
+        page.until(lambda message: " rays," in str(message))
+        eventually(lambda: site._is_prepared)
+        page.until(lambda message: " directions," in str(message))
+        assert any("by rays until all is prepared: rendering" in str(message) for message in page.heard)
+    finally:
+        page.close()
+        site.close()
+
+
+def test_what_is_cached_is_used_at_once():
+    ws.spheres.fit_spheres(scene().bodies[0].mesh, 2, progress=False)
+    site = ViewerApp(scene(), host="127.0.0.1", port=0)
+    assert site._preparation is None
+    site.close()

@@ -1,0 +1,128 @@
+"""Form factors between a body's patches and its own probes: found once, by rays in its frame, and cached on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.groups import Group
+from warpshadow.pipeline.self_visibility import SelfVisibility
+from warpshadow.stages.bounces.factors import patch_mesh, trace_factors
+from warpshadow.stages.bounces.patches import Patches
+from warpshadow.stages.sparse import SparseMatrix
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+VERSION = 1
+"""Part of the key of cached form factors: raise it whenever they would come out differently."""
+
+_RAYS = 512
+"""Rays of a probe."""
+
+
+class SelfFormFactors:
+    """Form factors of bodies for themselves, each body's found when it is first asked for.
+
+    Args:
+        self_visibility: Has the bodies' probes.
+        patches: Has their patches.
+        progress: Show progress where it takes longer than a second.
+    """
+
+    def __init__(self, self_visibility: SelfVisibility, patches: ScenePatches, *, progress: bool = False):
+        self._self_visibility, self._patches, self._progress = self_visibility, patches, progress
+        self._of_body: dict[int, SparseMatrix] = {}
+        self._between: dict[Senders, SparseMatrix] = {}
+
+    def of(self, body: int) -> SparseMatrix:
+        """Form factors of each of a body's probes to its own patches."""
+        if body not in self._of_body:
+            merged_scene, probes = self._patches.merged_scene, self._self_visibility.probes(body)
+            mesh, points, normals = merged_scene.scene.bodies[body].mesh, probes.positions, probes.normals
+            if merged_scene.is_two_sided[body]:
+                points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
+            vertices = probes.positions[: len(mesh.positions)]
+            arguments = self._patches.of_body(body), vertices, mesh.surface.faces, points, normals
+            form_factors = self_form_factors(*arguments, device=merged_scene.device, progress=self._progress)
+            self._of_body[body] = SparseMatrix.of(form_factors, device=merged_scene.device)
+        return self._of_body[body]
+
+    def between_patches(self, senders: Senders, sources: Sequence[Group]) -> SparseMatrix:
+        """Form factors of each patch to other patches of its body, averaged over its sources."""
+        if senders not in self._between:
+            from scipy.sparse import vstack
+
+            of_sources = vstack([self._of_group(senders, group) for group in sources])
+            between = senders.mean.on_host() @ of_sources
+            self._between[senders] = SparseMatrix.of(between, device=senders.merged_scene.device)
+        return self._between[senders]
+
+    def _of_group(self, senders: Senders, group: Group) -> csr_matrix:
+        """Form factors of each source of a group to the patches of its body, among all patches."""
+        from scipy.sparse import csr_matrix
+
+        shape, body = (group.points.shape[1], len(senders.areas)), group.body
+        if body not in senders.bodies or senders.merged_scene.is_flat[body]:
+            return csr_matrix(shape, dtype=np.float32)
+        assert body is not None and group.places is not None
+        factors, (probes, weights) = self.of(body).on_host(), (item.numpy()[0] for item in group.places)
+        starts = np.arange(0, probes.size + 1, 3)
+        of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
+        first = senders.first[senders.bodies.index(body)]
+        return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
+
+
+def self_form_factors(
+    patches: Patches,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    device: wp.DeviceLike,
+    progress: bool = False,
+) -> csr_matrix:
+    """Form factors of each probe of a body to its own patches: from the cache, or traced.
+
+    Args:
+        patches: Of the body.
+        positions, faces: Its mesh, NumPy.
+        points: Its probes, shape [probe, 3].
+        normals: Unit normals, shape [probe, 3].
+        device: Where rays are traced.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        As :func:`~warpshadow.stages.bounces.factors.trace_factors` does.
+    """
+    key = hashlib.sha256(json.dumps([VERSION, _RAYS, patches.count, len(points)]).encode())
+    for array in (patches.pieces.positions(positions, faces), patches.of_pieces, points, normals):
+        key.update(np.ascontiguousarray(array).tobytes())
+
+    def read(stored: Mapping[str, np.ndarray]) -> csr_matrix:
+        from scipy.sparse import csr_matrix
+
+        form_factors = csr_matrix((stored["data"], stored["indices"], stored["indptr"]), (len(points), patches.count))
+        form_factors.check_format(full_check=True)
+        return form_factors
+
+    def trace(_: Unfinished) -> csr_matrix:
+        mesh = patch_mesh(patches, positions, faces, device=device)
+        arguments = patches.of_pieces, patches.count, points, normals
+        return trace_factors(mesh, *arguments, rays=_RAYS, progress=progress)
+
+    return load_or_compute(
+        cache_path("form_factors", key.hexdigest()),
+        read,
+        trace,
+        lambda form_factors: {name: getattr(form_factors, name) for name in ("data", "indices", "indptr")},
+        what="form factors",
+    )

@@ -1,0 +1,290 @@
+"""Bounces where geometry does not move: rays once, then small matrices in each iteration, by any method that lights.
+
+Of patches p, points x on them at which they are lit (sources s), and receivers, rays find the form factors F once.
+With direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
+
+    B = a (M S + M F B),  M the mean over sources outside of other bodies,        starting from B = a M S,
+
+and receivers gather F B. Light that a body sends to itself may go on for longer than that.
+Receivers of an image are many: F is found at some of them, and interpolated.
+
+Direct light and form factors must agree on how much of a hemisphere is open: where spheres block a part 1 − s of an
+even sky, and rays hit bodies in a part f, F is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
+white balls in a white furnace were 0.91 to 1.06 bright. Points inside another body see its inside; they count neither
+in means over the sources of a patch nor as nodes. The radiosity is linear in light: of free light among bodies whose
+colors are known all of it is one matrix, which is cached. Differentiable in light and albedo.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
+from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
+from warpshadow.pipeline.lighting import LitPoints, receiver_words
+from warpshadow.pipeline.node import Input, Node
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.scene.scene import Bounces
+from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
+from warpshadow.stages.bounces.factors import (
+    UNLIT,
+    PatchFormFactors,
+    loose_mesh,
+    mean_outside,
+    ratios,
+    scaled,
+    scaled_to_sky,
+    trace_factors,
+)
+from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation
+from warpshadow.stages.bounces.radiosity import reflect
+from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+RAYS = 1024
+"""Rays of a node or source, which find its form factors …"""
+
+STILL_RAYS = 256
+"""… and those of a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
+against paths with these, and of 1.93% with 1024, in 3.1 and 7.1 s of CPU time."""
+
+
+class _Factors(NamedTuple):
+    """Cached results of a geometry."""
+
+    of_sources: SparseMatrix  # [patch, source], means over the sources that lie in no other body
+    of_itself: SparseMatrix  # [patch, patch] of the same body, means over the sources of the first
+    of_others: SparseMatrix  # [patch, patch] of different ones, likewise
+    of_nodes: SparseMatrix  # [node, patch], nodes of each view after one another
+    of_receivers: SparseMatrix  # [receiver, node]
+    shape: tuple[int, int]  # views, receivers of each
+
+    def to_receivers(self, direct: wp.array, bounced: wp.array) -> wp.array:
+        """Add the bounced light of nodes to direct shading, vec3 of shape [batch, receiver]. Differentiable: both."""
+        if self.shape[0] == 1:
+            return multiply(self.of_receivers, bounced, plus=direct)
+        if len(bounced) > 1:
+            raise ValueError(
+                f"light, albedo, textures: got a batch of {len(bounced)} for {self.shape[0]} views by "
+                'method "ray-traced" with bounces, expected one for them all; method = "directional" takes '
+                "batches"
+            )
+        return multiply(self.of_receivers, bounced, plus=direct.reshape((1, -1))).reshape(self.shape)
+
+
+class StaticBounces:
+    """Light that bounces between the bodies of a scene that do not move.
+
+    Args:
+        patches: Of the scene.
+        bounces: How often, 1 or more; "all" until nothing is left.
+        rays: Of a node or source.
+        progress: Show progress where it takes longer than a second.
+    """
+
+    def __init__(self, patches: ScenePatches, bounces: Bounces, *, rays: int = RAYS, progress: bool = False):
+        self._patches, self._progress, self._bounces, self._rays = patches, progress, bounces, rays
+
+    def sources(self, points: LitPoints, materials: Materials) -> Node:
+        """Node of the points of patches that are lit, of one instance."""
+        senders = self._patches.senders(materials)
+        return points.cached("sources", senders, lambda: Node("", senders.sources, points.vertices, points.normals))
+
+    def in_known_light(self, direct: Node, at_sources: Node, points: LitPoints, materials: Materials) -> Node:
+        """Shading with bounces.
+
+        Args:
+            direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
+            at_sources: Node of that of :meth:`sources`, vec3 of shape [batch, source].
+            points: The receivers.
+            materials: Reflectance of the bodies.
+        """
+        senders = self._patches.senders(materials)
+        if not senders.bodies:
+            return direct
+        make = functools.partial(Node, "", _mean, at_sources, self._factors(points, materials, senders))
+        return self._shading(direct, points.cached("light of patches", at_sources, make), points, materials)
+
+    def in_free_light(
+        self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
+    ) -> Node:
+        """The same in free light; its transfer among the colors of the scene is cached.
+
+        Args:
+            direct: As above.
+            transfers: Node of the transfer vectors of the sources, [1, source, coefficient], in parts.
+            light: The coefficients.
+            points: The receivers.
+            materials: Reflectance of the bodies.
+        """
+        senders = self._patches.senders(materials)
+        if not senders.bodies:
+            return direct
+
+        def spread(parts: list[wp.array], factors: _Factors) -> wp.array:
+            """Light on patches by each coefficient of white light, vec3 of shape [coefficient, patch]."""
+            grey = np.concatenate([part.numpy()[0] for part in parts]).T[..., None]
+            return _mean(wp.array(np.repeat(grey, 3, axis=2), dtype=wp.vec3, device=parts[0].device), factors)
+
+        arguments = transfers, self._factors(points, materials, senders)
+        lit = points.cached("patches in each coefficient", transfers, lambda: Node("", spread, *arguments))
+        if materials is not points.materials:
+            transfer = points.cached("transfer of patches", lit, lambda: Node("", _as_transfer, lit))
+            return self._shading(direct, Node("", colored_light, transfer, light), points, materials)
+
+        def bounced() -> Node:
+            arguments = self._patches.albedo(materials, senders.bodies), lit, self._factors(points, materials, senders)
+            find = functools.partial(self._at_cache_points, senders=senders)
+            return Node("transfer of bounces", lambda *arguments: _as_transfer(find(*arguments)), *arguments)
+
+        def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: _Factors) -> wp.array:
+            return factors.to_receivers(direct, colored_light(transfer, light))
+
+        transfer, factors = points.cached("bounces", lit, bounced), self._factors(points, materials, senders)
+        return Node("bounces", shade, direct, transfer, light, factors, items=self._words(points, senders))
+
+    def _shading(self, direct: Node, at_patches: Node, points: LitPoints, materials: Materials) -> Node:
+        """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
+        senders = self._patches.senders(materials)
+
+        def bounce(direct: wp.array, albedo: wp.array, at_patches: wp.array, factors: _Factors) -> wp.array:
+            return factors.to_receivers(direct, self._at_cache_points(albedo, at_patches, factors, senders))
+
+        albedo, factors = self._patches.albedo(materials, senders.bodies), self._factors(points, materials, senders)
+        return Node("bounces", bounce, direct, albedo, at_patches, factors, items=self._words(points, senders))
+
+    def _at_cache_points(self, albedo: wp.array, at_patches: wp.array, factors: _Factors, senders: Senders) -> wp.array:
+        """Bounced light at nodes, vec3 of shape [batch, node]. Differentiable: albedo, at_patches."""
+
+        def others_light_of(radiosity: wp.array | None) -> wp.array:
+            """Light on patches from the sky and from other bodies."""
+            return at_patches if radiosity is None else multiply(factors.of_others, radiosity, plus=at_patches)
+
+        def with_self_light(others_light: wp.array, radiosity: wp.array | None) -> wp.array:
+            return reflect(
+                albedo, others_light if radiosity is None else multiply(factors.of_itself, radiosity, plus=others_light)
+            )
+
+        arguments = self._bounces, others_light_of, with_self_light, senders.areas
+        return multiply(factors.of_nodes, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
+
+    def _words(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
+        return lambda: f"{receiver_words(points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+
+    def _factors(self, points: LitPoints, materials: Materials, senders: Senders) -> Node:
+        def find(
+            positions: wp.array,
+            sources: Receivers,
+            receivers: Receivers,
+            sky_at_sources: wp.array | None,
+            sky_at_receivers: wp.array | None,
+        ) -> _Factors:
+            from scipy.sparse import block_diag, coo_matrix, vstack
+
+            if len(positions) > 1:
+                raise ValueError(
+                    f'geometry: got a batch of {len(positions)} for method "ray-traced" with bounces and free light or '
+                    'given reflectance, expected one; method = "directional" takes batches'
+                )
+            mesh, of_faces = self._mesh(positions.numpy()[0], senders)
+            casts = np.array([body.casts_shadow for body in self._patches.merged_scene.scene.bodies])
+
+            def trace(points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None) -> PatchFormFactors:
+                count = len(senders.areas)
+                arguments = mesh, of_faces, count + len(UNLIT), points, normals
+                form_factors = trace_factors(*arguments, rays=self._rays, progress=self._progress)
+                return scaled_to_sky(form_factors, np.append(casts[senders.body_of_patch], [True] * len(UNLIT)), sky)
+
+            def at_view(
+                points: np.ndarray, normals: np.ndarray, sky: np.ndarray | None
+            ) -> tuple[csr_matrix, csr_matrix]:
+                """Means over nodes, [receiver, node], and the nodes' form factors, of the receivers of a view."""
+                nodes = choose_cache_points(points)
+                seen = trace(points[nodes], normals[nodes], None if sky is None else sky[nodes])
+                is_node = ~seen.is_buried | seen.is_buried.all()
+                nodes = nodes[is_node]
+                means = interpolation(points, normals, nodes)
+                if sky is not None:
+                    means = scaled(means, ratios(1 - sky, means @ (1 - sky[nodes])))
+                return means, seen.factors[is_node]
+
+            at, facing, device = receivers.points.numpy(), receivers.normals.numpy(), positions.device
+            skies = [None if sky is None else sky.numpy()[..., 0] for sky in (sky_at_sources, sky_at_receivers)]
+            at_source = None if skies[0] is None else skies[0][0]
+            at_receivers = [None] * len(at) if skies[1] is None else np.broadcast_to(skies[1], at.shape[:2])
+            seen_by_sources = trace(sources.points.numpy()[0], sources.normals.numpy()[0], at_source)
+            of_receivers, of_nodes = zip(*map(at_view, at, facing, at_receivers), strict=True)
+            mean = mean_outside(senders.mean.on_host(), seen_by_sources.is_buried)
+            between = (mean @ seen_by_sources.factors).tocoo()
+            is_own = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
+            of_itself, of_others = (
+                coo_matrix((between.data[which], (between.row[which], between.col[which])), between.shape)
+                for which in (is_own, ~is_own)
+            )
+            return _Factors(
+                SparseMatrix.of(mean, device=device),
+                SparseMatrix.of(of_itself, device=device),
+                SparseMatrix.of(of_others, device=device),
+                SparseMatrix.of(vstack(of_nodes), device=device),
+                SparseMatrix.of(block_diag(of_receivers), device=device),
+                at.shape[:2],
+            )
+
+        def make() -> Node:
+            sources = self.sources(points, materials)
+            arguments = points.method, materials, points.vertices, points.spheres, sources, points.call
+            at_sources = LitPoints(*arguments, normals=points.normals, blocking=points.blocking)
+            skies = [points.method.openness(item) for item in (at_sources, points)]
+            return Node(
+                "form factors",
+                find,
+                points.vertices,
+                sources,
+                points.receivers_node,
+                *skies,
+                items=lambda: f"{len(senders.sides):,} sources × {len(senders.areas):,} patches",
+                has_adjoint=False,
+            )
+
+        return points.cached("form factors", senders, make)
+
+    def _mesh(self, positions: np.ndarray, senders: Senders) -> tuple[wp.Mesh, np.ndarray]:
+        """The mesh that rays meet, of the pieces of all bodies, and the patches of the sides of its faces.
+
+        After all patches follow the entries UNLIT, for surfaces that send nothing.
+        """
+        merged_scene = self._patches.merged_scene
+        corners, owners, count = [], [], len(senders.areas)
+        for number, body in enumerate(merged_scene.scene.bodies):
+            own = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
+            faces = body.mesh.surface.faces
+            if number in senders.bodies:
+                place = senders.bodies.index(number)
+                patches = senders.patches[place]
+                corners.append(patches.pieces.positions(own, faces))
+                owned = np.where(patches.of_pieces < 0, -1, patches.of_pieces + senders.first[place])
+            else:
+                corners.append(own[faces])
+                owned = np.full((2, len(faces)), -1)
+            unlit = np.array([0, 0 if merged_scene.is_two_sided[number] else 1])
+            owners.append(np.where(owned < 0, count + unlit[:, None], owned))
+        return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(owners, axis=1)
+
+
+def _mean(at_sources: wp.array, factors: _Factors) -> wp.array:
+    """Mean light on patches, given that at their sources: vec3 of shape [batch, patch]. Differentiable: light."""
+    return multiply(factors.of_sources, at_sources)
+
+
+def _as_transfer(lit: wp.array) -> ColoredTransfer:
+    """The matrix of receivers that are lit by each coefficient alone, vec3 of shape [coefficient, receiver]."""
+    return ColoredTransfer.of(lit.numpy(), device=lit.device)

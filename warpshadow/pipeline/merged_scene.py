@@ -1,0 +1,498 @@
+"""Merged scene: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
+
+import functools
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, concatenate
+from warpshadow.device.threads import one_at_a_time
+from warpshadow.maths.spatial_sort import z_order
+from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.scene import AUTO, SPHERE_METHODS, BodyLike, Scene
+from warpshadow.spheres import MANY, Spheres
+from warpshadow.stages.bound_spheres import SphereBinding
+from warpshadow.stages.deform import DeformationGraph
+from warpshadow.stages.poses import Poses
+
+Array = TypeVar("Array")
+"""Element type of a geometry: Warp's arrays, or tensors."""
+
+Other = TypeVar("Other")
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry(Generic[Array]):
+    """Movable geometry: the vertices of all bodies, and the spheres that represent them.
+
+    Args:
+        positions: Vertices [scene units], vec3 of shape [batch, vertex].
+        centers: Spheres' centers [scene units], vec3 of shape [batch, sphere].
+        radii: Spheres' radii [scene units], float32 of shape [batch, sphere].
+        moving: Bodies that differ from the scene's, from 0; None where any may. The others are the same in every
+            instance, and no gradient to them is asked for.
+        rotations: How each body is turned from its mesh, mat33 of shape [batch, body]; None where that is not known.
+            Whoever changes the shape of a body in another way than by :meth:`Renderer.deformed` leaves them out.
+        deformed: Bodies whose shape is not that of their mesh, from 0.
+    """
+
+    positions: Array
+    centers: Array
+    radii: Array
+    moving: tuple[int, ...] | None = field(default=None, kw_only=True)
+    rotations: Array | None = field(default=None, kw_only=True)
+    deformed: tuple[int, ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Hold the bodies in order."""
+        if self.moving is not None:
+            object.__setattr__(self, "moving", tuple(sorted(set(self.moving))))
+        object.__setattr__(self, "deformed", tuple(sorted(set(self.deformed))))
+
+    def arrays(self) -> dict[str, Array]:
+        """The arrays of the bodies, by name."""
+        return {"positions": self.positions, "centers": self.centers, "radii": self.radii}
+
+    def map(self, function: Callable[[Array], Other]) -> "Geometry[Other]":
+        """Apply a function to each array and return the geometry of the results."""
+        rotations = None if self.rotations is None else function(self.rotations)
+        arrays = map(function, self.arrays().values())
+        return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
+
+
+PLACED = "placed(…) makes a geometry of poses"
+"""Message for arrays that do not form a geometry."""
+
+CENTER = "center"
+"""Of pivots: the middle of the bounds of a body's mesh."""
+
+Pivot = str | npt.ArrayLike | wp.array | None
+"""Pivots of the bodies, each in its own space: "center", a point, or one for each body; None: the origin."""
+
+GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32}
+"""Dtypes of a geometry's arrays, by their names."""
+
+
+def as_geometry(name: str, arguments: object) -> Geometry:
+    """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
+
+    Raises:
+        ValueError: for anything else, by the name of the argument.
+    """
+    if isinstance(arguments, Geometry):
+        return arguments
+    if not isinstance(arguments, (tuple, list)) or len(arguments) != len(GEOMETRY_DTYPES):
+        count = f" of {len(arguments)}" if isinstance(arguments, (tuple, list)) else ""
+        raise ValueError(
+            f"{name}: got {type(arguments).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
+            f"tuple of {', '.join(GEOMETRY_DTYPES)}"
+        )
+    return Geometry(*arguments)
+
+
+class MergedScene:
+    """Shared by all poses of a scene: topology, and the bodies' rest shapes, each in its own space.
+
+    Args:
+        scene: The scene; its spheres are fitted when first asked for.
+        device: Where the arrays live.
+        progress: Show progress of the fits.
+
+    Attributes:
+        faces: Indices of vertices, vec3i of shape [face]; the faces of a body wind alike.
+        uvs: Texture coordinates, vec2 of shape [1, uv].
+        uv_faces: Indices of uvs, vec3i of shape [face].
+        first_vertex, first_face: Where each body begins, and the end of the last, NumPy of shape [body + 1].
+    """
+
+    def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
+        self.scene = scene.with_method()
+        self.device = wp.get_device(device)
+        self._progress = progress
+        self._faces_of: dict[tuple[int, int], wp.array] = {}
+        self._bindings: dict[int, SphereBinding] = {}  # by bodies
+        self._take_spheres: Callable[[], list[Spheres]] | None = None
+        meshes = [body.mesh for body in scene.bodies]
+        uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
+        surfaces = [mesh.surface for mesh in meshes]
+        faces = [surface.faces for surface in surfaces]
+        uv_faces = [np.zeros_like(item.faces) if item.uv_faces is None else item.uv_faces for item in surfaces]
+        self.first_vertex = _starts([mesh.positions for mesh in meshes])
+        self.first_face = _starts([mesh.faces for mesh in meshes])
+        self.faces = self._array(_stacked_faces(faces, self.first_vertex), wp.vec3i)
+        self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
+        self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
+
+    @functools.cached_property
+    def vertex_order(self) -> np.ndarray:
+        """Order in which neighboring vertices of a body follow each other, shape [vertex]."""
+        orders = [z_order(body.mesh.positions.astype(np.float64)) for body in self.scene.bodies]
+        return np.concatenate([first + order for first, order in zip(self.first_vertex[:-1], orders, strict=True)])
+
+    @functools.cached_property
+    def body_of_face(self) -> np.ndarray:
+        """Body that each face belongs to, shape [face]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_face))
+
+    @functools.cached_property
+    def body_of_vertex(self) -> np.ndarray:
+        """Body that each vertex belongs to, shape [vertex]."""
+        return np.repeat(np.arange(len(self.scene.bodies)), np.diff(self.first_vertex))
+
+    @functools.cached_property
+    def face_bodies(self) -> wp.array | None:
+        """Number of the body that each face belongs to, int32 of shape [face]; None where there is one."""
+        return self._array(self.body_of_face, wp.int32) if len(self.scene.bodies) > 1 else None
+
+    @functools.cached_property
+    def edges(self) -> wp.array:
+        """Face across each edge, vec3i of shape [face]: :func:`warpshadow.assets.topology.edge_neighbors`."""
+        parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
+        moved = [
+            np.where(part < 0, part, part + first) for part, first in zip(parts, self.first_face[:-1], strict=True)
+        ]
+        return self._array(np.concatenate(moved), wp.vec3i)
+
+    @functools.cached_property
+    def creases(self) -> wp.array | None:
+        """Creases of bodies that are shaded by pixel, int32 of shape [face]: ``Mesh.creases``; None where none has any.
+
+        On bodies that are shaded at vertices the mean slopes of :mod:`warpshadow.stages.slopes` go across creases.
+        """
+        is_by_pixel = [body.receivers == "pixel" for body in self.scene.bodies]
+        result = np.zeros(self.first_face[-1], np.int32)
+        for body in np.flatnonzero(is_by_pixel):
+            result[self.first_face[body] : self.first_face[body + 1]] = self.scene.bodies[body].mesh.creases
+        return self._array(result, wp.int32) if result.any() else None
+
+    @functools.cached_property
+    def is_two_sided(self) -> np.ndarray:
+        """Open bodies, which may be seen from behind, bool of shape [body]."""
+        return np.array([not body.mesh.surface.is_closed for body in self.scene.bodies])
+
+    @functools.cached_property
+    def is_flat(self) -> np.ndarray:
+        """Bodies that lie in a plane, bool of shape [body]."""
+        return np.array([body.mesh.is_flat for body in self.scene.bodies])
+
+    @functools.cached_property
+    def two_sided_faces(self) -> wp.array:
+        """Faces of open bodies, int32 of shape [item]."""
+        return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
+
+    @functools.cached_property
+    @one_at_a_time
+    def _spheres(self) -> list:
+        """Spheres of each body in its own space; none where the method asks for none."""
+        if self._take_spheres is not None:
+            return self._take_spheres()
+        return scene_blockers(self.scene, device=self.device, progress=self._progress)
+
+    @property
+    def sphere_counts(self) -> np.ndarray:
+        """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for, or 64."""
+        if "_spheres" in self.__dict__:
+            return np.diff(self.first_sphere)
+        if self.scene.visibility.method not in SPHERE_METHODS:
+            return np.zeros(len(self.scene.bodies), int)
+        blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
+        return np.array([len(requested) if isinstance(requested, Spheres) else requested for requested in blockers])
+
+    @functools.cached_property
+    def first_sphere(self) -> np.ndarray:
+        """Where each body's spheres begin, and the end of the last, shape [body + 1]."""
+        return _starts([spheres.radii for spheres in self._spheres])
+
+    @functools.cached_property
+    def rest(self) -> Geometry:
+        """The bodies at rest, each in its own space; the batch is 1."""
+        positions = np.concatenate([body.mesh.positions for body in self.scene.bodies])
+        centers = np.concatenate([spheres.centers for spheres in self._spheres])
+        radii = np.concatenate([spheres.radii for spheres in self._spheres])
+        return Geometry(
+            self._array(positions[None], wp.vec3),
+            self._array(centers[None], wp.vec3),
+            self._array(radii[None], wp.float32),
+            moving=(),
+            rotations=self._array(np.tile(np.eye(3), (1, len(self.scene.bodies), 1, 1)), wp.mat33),
+        )
+
+    @functools.cached_property
+    def poses(self) -> Poses:
+        """Where the scene has its bodies; the batch is 1."""
+        bodies = self.scene.bodies
+        return Poses(
+            self._array(np.stack([body.rotation_matrix() for body in bodies])[None], wp.mat33),
+            self._array(np.stack([body.translation for body in bodies])[None], wp.vec3),
+            self._array(np.array([[body.scale for body in bodies]]), wp.float32),
+        )
+
+    def pivots(self, pivot: str | npt.ArrayLike | wp.array) -> wp.array:
+        """Pivots of the bodies, each in its own space, vec3 of shape [batch, body]."""
+        if isinstance(pivot, wp.array):
+            return pivot
+        if isinstance(pivot, str):
+            check.choice("pivot", pivot, (CENTER,))
+            points = np.array([np.mean(body.mesh.bounds, axis=0) for body in self.scene.bodies])
+        else:
+            count = len(self.scene.bodies)
+            points = check.numbers("pivot", pivot, expected=f"'center', or a point, [3], or one a body, [{count}, 3]")
+            check.shape("pivot", points.shape, (3,) if points.ndim < 2 else (count, 3), "in a body's own space")
+            check.finite("pivot", points)
+        return self._array(np.broadcast_to(points, (len(self.scene.bodies), 3))[None], wp.vec3)
+
+    @functools.cached_property
+    def scene_geometry(self) -> Geometry:
+        """Where the scene has its bodies and their spheres; the batch is 1."""
+        return self.placed()
+
+    @one_at_a_time
+    def placed(
+        self,
+        poses: Poses | None = None,
+        rest: Geometry | None = None,
+        *,
+        moving: Iterable[BodyLike] | None = None,
+        pivot: Pivot = None,
+    ) -> Geometry[wp.array]:
+        """Place the bodies in the world; see :meth:`Renderer.placed`. Differentiable: poses, rest, pivot."""
+        rest = self.rest if rest is None else as_geometry("rest", rest)
+        if poses is None:  # the scene's stand where they do, whatever they turn about
+            poses, pivot = self.poses, None
+        check.shape("poses", poses.scales.shape, ("batch", len(self.scene.bodies)))
+        if pivot is not None:
+            poses = poses.about(self.pivots(pivot))
+        numbers = None if moving is None else self.scene.body_numbers(moving, "moving")
+        turned = None if rest.rotations is None else poses.turned(rest.rotations)
+        if numbers is None or rest.moving is None:
+            return Geometry(
+                poses.points(rest.positions, self._vertex_bodies),
+                poses.points(rest.centers, self._sphere_bodies),
+                poses.radii(rest.radii, self._sphere_bodies),
+                rotations=turned,
+                deformed=rest.deformed,
+            )
+        bodies = {*numbers, *rest.moving}
+        vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
+        own = self.scene_geometry
+        if turned is not None:
+            assert own.rotations is not None
+            every, arguments = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
+            turned = exchanged(own.rotations, every, lambda a, b: arguments[:, a:b])
+        return Geometry(
+            exchanged(
+                own.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
+            ),
+            exchanged(own.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
+            exchanged(own.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            moving=tuple(bodies),
+            rotations=turned,
+            deformed=rest.deformed,
+        )
+
+    def take_spheres(self, other: "MergedScene", bodies: Sequence[int]) -> None:
+        """Have the spheres that some bodies of another merged_scene have, which are this one's, once they are asked
+        for.
+
+        The spheres of a ground depend on the bodies on it.
+        """
+        self._take_spheres = lambda: [other._spheres[number] for number in bodies]
+
+    def part(self, geometry: Geometry, bodies: Sequence[int]) -> Geometry:
+        """The geometry of some bodies, rising, as that of a scene of these alone. Differentiable in it."""
+
+        def items(array: wp.array, starts: np.ndarray) -> wp.array:
+            runs = self.runs(starts, bodies)
+            return concatenate([array[:, first:end] for first, end in runs], [end - first for first, end in runs])
+
+        centers, radii = self.spheres_of(bodies, (geometry.centers, geometry.radii))
+        every, turned = np.arange(len(self.scene.bodies) + 1), geometry.rotations
+        return Geometry(
+            items(geometry.positions, self.first_vertex),
+            centers,
+            radii,
+            rotations=None if turned is None else items(turned, every),
+            deformed=tuple(bodies.index(body) for body in geometry.deformed if body in bodies),
+        )
+
+    def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of some bodies, taken from the arrays of all spheres.
+        Differentiable: spheres.
+        """
+        runs = self.runs(self.first_sphere, bodies)
+        if runs == [(0, spheres[1].shape[1])]:
+            return spheres
+        if not runs:
+            centers, radii = (wp.empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
+            return centers, radii
+        counts = [end - first for first, end in runs]
+        centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
+        return centers, radii
+
+    def spheres_among(self, bodies: Sequence[int], body: int | None) -> tuple[int, int]:
+        """Begin and end of each body's spheres among the spheres of some bodies, rising; (0, 0) for other bodies."""
+        if body is None or body not in bodies:
+            return 0, 0
+        counts, place = self.sphere_counts, bodies.index(body)
+        first = int(counts[list(bodies[:place])].sum())
+        return first, first + int(counts[body])
+
+    @staticmethod
+    def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
+        """Ranges of the items of some bodies, consecutive ones joined and empty ones left out.
+
+        Args:
+            starts: Where each body's items begin, and the end of the last: :attr:`first_vertex`, :attr:`first_sphere`
+                or :attr:`first_face`.
+            bodies: The bodies, from 0.
+        """
+        runs: list[tuple[int, int]] = []
+        for first, end in ((int(starts[number]), int(starts[number + 1])) for number in sorted(bodies)):
+            if runs and runs[-1][1] == first:
+                runs[-1] = runs[-1][0], end
+            elif end > first:
+                runs.append((first, end))
+        return runs
+
+    @one_at_a_time
+    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
+        """Bind the vertices of a body to its spheres; see :meth:`Renderer.deformation_graph`."""
+        number = self.scene.body_number(body)
+        points = self.scene.bodies[number].mesh.positions
+        return DeformationGraph.bind(points, self._spheres[number].centers, count=count, device=self.device)
+
+    @one_at_a_time
+    def deformed(
+        self,
+        body: BodyLike,
+        positions: wp.array | None = None,
+        centers: wp.array | None = None,
+        radii: wp.array | None = None,
+        *,
+        rest: Geometry[wp.array] | None = None,
+    ) -> Geometry[wp.array]:
+        """Exchange the shape of one body at rest; see :meth:`Renderer.deformed`. Differentiable: all arrays."""
+        number = self.scene.body_number(body)
+        rest = self.rest if rest is None else as_geometry("rest", rest)
+        first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
+        if positions is not None and centers is None and len(self._spheres[number]):
+            own_vertices, own_spheres = slice(*first_vertex.tolist()), slice(*first_sphere.tolist())
+            check.shape("positions", positions.shape, ("batch", own_vertices.stop - own_vertices.start))
+            own = rest.positions[:, own_vertices], rest.centers[:, own_spheres], rest.radii[:, own_spheres]
+            centers, moved_radii = self._sphere_binding(number).moved(positions, *own)
+            radii = moved_radii if radii is None else radii
+        return Geometry(
+            _spliced("positions", rest.positions, positions, first_vertex),
+            _spliced("centers", rest.centers, centers, first_sphere),
+            _spliced("radii", rest.radii, radii, first_sphere),
+            moving=None if rest.moving is None else (*rest.moving, number),
+            rotations=None if rest.rotations is None else exchanged(rest.rotations, [], lambda *_: rest.rotations),
+            deformed=(*rest.deformed, number),
+        )
+
+    def _sphere_binding(self, number: int) -> SphereBinding:
+        """The spheres of a body, bound to the vertices of its faces."""
+        if number not in self._bindings:
+            mesh, spheres = self.scene.bodies[number].mesh, self._spheres[number]
+            arguments = mesh.positions, np.unique(mesh.faces), spheres.centers, spheres.radii
+            self._bindings[number] = SphereBinding.bind(*arguments, device=self.device)
+        return self._bindings[number]
+
+    @property
+    def casting(self) -> list[int]:
+        """Bodies that cast shadows, from 0."""
+        return [number for number, body in enumerate(self.scene.bodies) if body.casts_shadow]
+
+    def casting_mesh(self, positions: wp.array, bodies: Collection[int] | None = None) -> wp.Mesh | None:
+        """Build the mesh for rays: the faces of bodies that cast shadows.
+
+        Args:
+            positions: Vertices of all bodies [scene units], vec3 of shape [vertex]; they are copied.
+            bodies: Which bodies count, from 0; None for all.
+
+        Returns:
+            None where no such body casts a shadow.
+        """
+        casting = [number for number in self.casting if bodies is None or number in bodies]
+        return self._mesh(positions, np.isin(self.body_of_face, casting)) if casting else None
+
+    def mesh(self, positions: wp.array) -> wp.Mesh:
+        """Make the mesh of all bodies.
+
+        Args:
+            positions: Their vertices [scene units], vec3 of shape [vertex]; they are copied.
+        """
+        return self._mesh(positions, np.ones(len(self.body_of_face), bool))
+
+    def _mesh(self, positions: wp.array, keeps_face: np.ndarray) -> wp.Mesh:
+        faces = self.faces.numpy()[keeps_face]
+        return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
+
+    def faces_of(self, first: int, end: int) -> wp.array:
+        """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
+        if (first, end) not in self._faces_of:
+            faces = self.faces.numpy()
+            own = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
+            self._faces_of[first, end] = self._array(own, wp.vec3i)
+        return self._faces_of[first, end]
+
+    @functools.cached_property
+    def _vertex_bodies(self) -> wp.array:
+        return self._members(self.first_vertex)
+
+    @functools.cached_property
+    def _sphere_bodies(self) -> wp.array:
+        return self._members(self.first_sphere)
+
+    def _members(self, starts: np.ndarray) -> wp.array:
+        """Body of each item, int32."""
+        return self._array(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), wp.int32)
+
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _starts(parts: list[np.ndarray]) -> np.ndarray:
+    """Where each part begins when they are put after one another, and the end of the last."""
+    return np.cumsum([0, *map(len, parts)])
+
+
+def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
+    return np.concatenate([part + first for part, first in zip(parts, starts[:-1], strict=True)])
+
+
+def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
+    """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
+    if part is None:
+        return exchanged(whole, [], lambda *_: whole)
+    first, end = place.tolist()
+    check.shape(name, part.shape, ("batch", end - first))
+    common_batch({"rest": whole, name: part})
+    return exchanged(whole, [(first, end)], lambda *_: part)
+
+
+def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
+    """Exchange runs of items of a whole.
+
+    Args:
+        whole: Shape [batch, item].
+        runs: Where each begins and ends, rising.
+        part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
+
+    Returns:
+        Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
+
+    Differentiable: whole, where it is not exchanged, and parts.
+    """
+    pieces, last = [] if runs else [whole], 0
+    for first, end in runs:
+        pieces += [whole[:, last:first]] if first > last else []
+        pieces.append(part_of(first, end))
+        last = end
+    pieces += [whole[:, last:]] if runs and last < whole.shape[1] else []
+    return concatenate(pieces, [piece.shape[1] for piece in pieces])

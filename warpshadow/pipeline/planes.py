@@ -1,0 +1,111 @@
+"""PlaneBlockers: bodies that lie in a plane, such as a ground or walls, and block light as that.
+
+Small spheres in a sheet would bulge out of it, and a large one that touches it from behind leaves light between them.
+Instead, the share of a cell of directions that a plane covers is computed.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.stages.planes.grid import find_grid
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_CORNERS = 64
+"""Directions in which the vertices of a body are sought that are farthest out."""
+
+
+class PlanesOfGroup(NamedTuple):
+    """Flat bodies around some receivers."""
+
+    planes: PlaneBlockers
+    frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
+    skip: int | None = None  # the one that the receivers are part of
+
+
+class ScenePlanes:
+    """The flat bodies of a scene, each prepared when it is first asked for.
+
+    Args:
+        merged_scene: All bodies.
+    """
+
+    def __init__(self, merged_scene: MergedScene):
+        self._merged_scene = merged_scene
+        self._bodies: dict[int, PlaneBody] = {}
+        self._among: dict[tuple[tuple[int, ...], tuple[int, ...]], PlaneBlockers] = {}
+
+    @functools.cached_property
+    def numbers(self) -> tuple[int, ...]:
+        """Bodies that lie in a plane."""
+        return tuple(np.flatnonzero(self._merged_scene.is_flat).tolist())
+
+    def others(self, number: int) -> list[np.ndarray]:
+        """Vertices of each other body where the scene has it, in a body's frame."""
+        bodies = self._merged_scene.scene.bodies
+        own = bodies[number]
+        return [
+            (body.world_points() - own.translation) @ own.rotation_matrix() / own.scale
+            for other, body in enumerate(bodies)
+            if other != number
+        ]
+
+    def among(self, bodies: tuple[int, ...], blocking: tuple[int, ...]) -> PlaneBlockers:
+        """Some flat bodies, of which some block light; they send none."""
+        key = bodies, blocking
+        if key not in self._among:
+            chosen = [self._body(number)._replace(blocks=number in blocking) for number in bodies]
+            vertex_count = int(self._merged_scene.first_vertex[-1])
+            self._among[key] = PlaneBlockers.of(chosen, 0, vertex_count, device=self._merged_scene.device)
+        return self._among[key]
+
+    def frames(self, bodies: tuple[int, ...], positions: wp.array) -> wp.array:
+        """Where some flat bodies are, of vertices [batch, vertex]; see :meth:`PlaneBlockers.frames`.
+        Differentiable in them.
+        """
+        return self.among(bodies, bodies).frames(positions)
+
+    @functools.cached_property
+    def first_corner(self) -> np.ndarray:
+        """Where each body's corners begin, and the end of the last, shape [body + 1]."""
+        return np.cumsum([0, *map(len, self._corners)])
+
+    def corners(self, positions: wp.array) -> wp.array:
+        """Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]. Differentiable in vertices."""
+        return multiply(self._corners_of_vertices, positions)
+
+    @functools.cached_property
+    def _corners(self) -> list[np.ndarray]:
+        """Of each body the vertices that are farthest out in some direction."""
+        directions = np.concatenate([fibonacci(_CORNERS), np.eye(3), -np.eye(3)])
+        result = []
+        for body in self._merged_scene.scene.bodies:
+            used = np.unique(body.mesh.faces)
+            result.append(np.unique(used[(body.mesh.positions[used] @ directions.T).argmax(axis=0)]))
+        return result
+
+    @functools.cached_property
+    def _corners_of_vertices(self) -> SparseMatrix:
+        from scipy.sparse import csr_matrix
+
+        starts = self._merged_scene.first_vertex
+        columns = np.concatenate([first + own for first, own in zip(starts[:-1], self._corners, strict=True)])
+        entries = np.ones(len(columns)), (np.arange(len(columns)), columns)
+        matrix = csr_matrix(entries, shape=(len(columns), int(starts[-1])))
+        return SparseMatrix.of(matrix, device=self._merged_scene.device)
+
+    def _body(self, number: int) -> PlaneBody:
+        if number not in self._bodies:
+            mesh, others = self._merged_scene.scene.bodies[number].mesh, self.others(number)
+            corners = mesh.positions, mesh.surface.faces
+            grid, _ = find_grid(*corners, is_two_sided=False, others=np.concatenate(others) if others else None)
+            first_vertex = int(self._merged_scene.first_vertex[number])
+            self._bodies[number] = PlaneBody(grid, *corners, first_vertex, 0, blocks=True)
+        return self._bodies[number]

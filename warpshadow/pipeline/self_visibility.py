@@ -1,0 +1,364 @@
+"""Self-visibility: which bodies trace their shadows on themselves with rays, and the cached results.
+
+The self-visibility of a rigid body does not change in its own frame. So rays find it once, and it is cached on disk
+beside the spheres that are fitted to the mesh. Spheres of other bodies block their shares of the remaining light.
+"""
+
+import functools
+import hashlib
+import json
+import weakref
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
+from warpshadow.assets.mesh import Mesh
+from warpshadow.device.batch import cut
+from warpshadow.device.progress import announce
+from warpshadow.device.tape import unrecorded
+from warpshadow.pipeline.merged_scene import Geometry, MergedScene
+from warpshadow.pipeline.node import Input
+from warpshadow.spheres.normalized_mesh import normalize
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.ray_packets import FaceTree, build_face_tree
+from warpshadow.stages.receivers import Receivers, Span
+from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
+from warpshadow.stages.self_visibility.lobes import BodyRotation, find_turned, project_rows
+from warpshadow.stages.self_visibility.lookup import (
+    ResamplingKernels,
+    ResamplingWeights,
+    find_resampling_kernels,
+    find_resampling_weights,
+)
+from warpshadow.stages.self_visibility.probes import (
+    ProbeTable,
+    ProbeWeights,
+    VisibilityProbes,
+    find_probes,
+    longest_edge,
+)
+from warpshadow.stages.self_visibility.sun_cells import RayProbes
+from warpshadow.stages.self_visibility.trace import RAYS, RUN, VisibilityRows, ray_count, trace_rows, trace_seconds
+
+VERSION = 4
+"""Part of the key of cached rows: raise it whenever they would come out differently."""
+
+
+Found = TypeVar("Found")
+
+_OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]] = weakref.WeakKeyDictionary()
+"""Probes and rows of each mesh in memory, for all renderers, by their kind, whether samples receive, and device."""
+
+
+class Blocking(NamedTuple):
+    """How the bodies of a geometry block light: by their spheres, but for some."""
+
+    traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
+    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
+    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
+    planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
+
+
+BY_SPHERES = Blocking()
+"""All bodies block by their spheres."""
+
+
+class SelfVisibilityLookup(NamedTuple):
+    """Self-visibility lookups of a body's receivers."""
+
+    rows: VisibilityRows
+    lookup: ResamplingWeights
+    kernels: ResamplingKernels
+    rays: tuple[RayProbes, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
+
+    @property
+    def turned(self) -> wp.array:
+        """The part that depends on the rotations, of shape [batch, …]."""
+        return self.lookup.weights
+
+
+class SelfVisibilityLobes(NamedTuple):
+    """The same where light is in harmonics: the body's lobes, and how they are turned."""
+
+    lobes: wp.array  # [row, order²]
+    turn: BodyRotation
+
+    @property
+    def turned(self) -> wp.array:
+        """The part that depends on the rotations, of shape [batch, …]."""
+        return self.turn.rotations
+
+
+class SelfVisibility:
+    """Traced self-visibility of the bodies, each in its own frame.
+
+    Args:
+        merged_scene: The bodies.
+        samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have probes within faces.
+        progress: Show progress where something takes longer than a second.
+    """
+
+    def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):
+        self._merged_scene, self._samples_receive, self._progress = merged_scene, samples_receive, progress
+        self._probes: dict[int, VisibilityProbes] = {}
+        self._tables: dict[int, ProbeTable] = {}
+        self._rows: dict[int, VisibilityRows] = {}
+        self._lobes: dict[tuple[int, int], wp.array] = {}
+
+    # ------------------------------------------------------------------------------------------ which bodies
+
+    def blocking(self, geometry: Geometry | None, rotations: Input | None) -> Blocking:
+        """How the bodies of a geometry, by default the scene's, block light; none as planes."""
+        why = tuple(self._why_spheres(body, geometry) for body in range(len(self._samples_receive)))
+        return Blocking(tuple(body for body, reason in enumerate(why) if not reason), rotations, why)
+
+    def _why_spheres(self, body: int, geometry: Geometry | None) -> str:
+        """Why a body's own spheres block its light in a geometry, by default the scene's; empty if they do not."""
+        scene = self._merged_scene.scene
+        if not scene.bodies[body].casts_shadow:
+            return "it casts no shadow"
+        if self._how(body) == "spheres":
+            return 'self_shadows = "spheres"'
+        if geometry is not None and body in geometry.deformed:
+            return "its shape is free"
+        if geometry is not None and geometry.rotations is None:
+            return "geometry has no rotations; placed(…) makes one that has them"
+        return ""
+
+    @property
+    def wants_rays(self) -> bool:
+        """Whether receivers of some body send rays to sun cells."""
+        return any(map(self._sends_rays, range(len(self._samples_receive))))
+
+    def _sends_rays(self, body: int) -> bool:
+        """Whether receivers of a body send rays: receivers at pixels do.
+        Between vertices an edge would be too sharp.
+        """
+        return self._how(body) == "rays" and bool(self._samples_receive[body])
+
+    def _how(self, body: int) -> str:
+        """The kind of shadow that a body casts on itself: one of SELF_SHADOWS."""
+        scene = self._merged_scene.scene
+        return scene.bodies[body].self_shadows or scene.visibility.self_shadows
+
+    # ------------------------------------------------------------------------------------------ where
+
+    def probes(self, body: int) -> VisibilityProbes:
+        """The probes of a body, in the frame of its fit."""
+        if body not in self._probes:
+            mesh, device = self._merged_scene.scene.bodies[body].mesh, self._merged_scene.device
+            faces = mesh.surface.faces
+
+            def find() -> VisibilityProbes:
+                used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
+                positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
+                points = wp.array(positions[None], dtype=wp.vec3, device=device)
+                normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
+                longest = longest_edge(positions, faces, samples_receive=bool(self._samples_receive[body]))
+                return find_probes(positions, normals, faces, longest)
+
+            self._probes[body] = self._of_mesh(body, "probes", find)
+        return self._probes[body]
+
+    def _of_mesh(self, body: int, what: str, find: Callable[[], Found]) -> Found:
+        """Self-visibility of a body's mesh, shared by all renderers, computed at first use."""
+        cached: dict = _OF_MESHES.setdefault(self._merged_scene.scene.bodies[body].mesh, {})
+        key = what, bool(self._samples_receive[body]), self._merged_scene.device.alias
+        if key not in cached:
+            cached[key] = find()
+        return cached[key]
+
+    def places(self, receivers: Receivers, span: Span) -> ProbeWeights:
+        """Where receivers of a body lie among its probes. Differentiable: barycentrics of samples."""
+        assert receivers.vertices is not None
+        table, first, end = self._table(span.body), span.first, span.end
+        vertex_count = receivers.vertices.size
+        if first < vertex_count:
+            return table.of_vertices(receivers.vertices[first:end])
+        seen, first, end = receivers.seen, first - vertex_count, end - vertex_count
+        assert seen is not None
+        return table.of_samples(Fragments(cut(seen.face_ids, first, end), cut(seen.barycentrics, first, end)))
+
+    def places_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
+        """Where vertices of a body, after the last of which backs are numbered, lie among its probes."""
+        return self._table(body).of_vertices(wp.array(vertices, dtype=wp.int32, device=self._merged_scene.device))
+
+    def _table(self, body: int) -> ProbeTable:
+        if body not in self._tables:
+            merged_scene, probes = self._merged_scene, self.probes(body)
+            self._tables[body] = ProbeTable(
+                int(merged_scene.first_vertex[body]),
+                int(merged_scene.first_vertex[-1]),
+                int(merged_scene.first_face[body]),
+                int(merged_scene.first_face[-1]),
+                len(probes.positions),
+                wp.array(probes.pieces, dtype=wp.vec4i, device=merged_scene.device),
+            )
+        return self._tables[body]
+
+    # ------------------------------------------------------------------------------------------ which
+
+    def lookups(
+        self,
+        bodies: tuple[int, ...],
+        rotations: wp.array,
+        directions: np.ndarray,
+        spreads: np.ndarray | None,
+        *,
+        has_sun: bool = False,
+    ) -> dict[int, SelfVisibilityLookup]:
+        """Lookups of bodies' receivers for cells, as for find_resampling_kernels. Differentiable: rotations.
+
+        Args:
+            bodies, rotations, directions, spreads: The inputs of the lookup.
+            has_sun: Whether there are sun cells, to which receivers of some bodies send rays.
+        """
+        self._announce(bodies)
+        result = {}
+        for body in bodies:
+            if not self._merged_scene.is_flat[body]:
+                rows = self.rows(body)
+                kernels = find_resampling_kernels(directions, spreads, rows.ray_count, rotations.device)
+                rays = (self._ray_probes(body), rotations) if has_sun and self._sends_rays(body) else None
+                result[body] = SelfVisibilityLookup(
+                    rows, find_resampling_weights(rotations, body, kernels), kernels, rays
+                )
+        return result
+
+    def _ray_probes(self, body: int) -> RayProbes:
+        """Where rays for a sun start."""
+        normals, positions = self._normals(body), self.probes(body).positions
+
+        def find() -> RayProbes:
+            places = np.tile(positions, (len(normals) // len(positions), 1))
+            at = (wp.array(values, dtype=wp.vec3, device=self._merged_scene.device) for values in (places, normals))
+            return RayProbes(self._tree(body), *at)
+
+        return self._of_mesh(body, "ray probes", find)
+
+    def _tree(self, body: int) -> FaceTree:
+        """The hierarchy of a body's faces."""
+        faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
+        build = functools.partial(build_face_tree, self.probes(body).positions, faces, self._merged_scene.device)
+        return self._of_mesh(body, "tree", build)
+
+    def turned_lobes(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, SelfVisibilityLobes]:
+        """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
+        self._announce(bodies)
+        return {
+            body: SelfVisibilityLobes(self._lobes_of(body, order), find_turned(rotations, body, order))
+            for body in bodies
+            if not self._merged_scene.is_flat[body]
+        }
+
+    def _lobes_of(self, body: int, order: int) -> wp.array:
+        if (body, order) not in self._lobes:
+            self._lobes[body, order] = project_rows(self.rows(body), self._normals(body), order)
+        return self._lobes[body, order]
+
+    def missing(self, bodies: tuple[int, ...]) -> int:
+        """Number of bodies, of some, of which nothing is in memory yet."""
+        return sum(not (self._merged_scene.is_flat[body] or body in self._rows) for body in bodies)
+
+    def _row_count(self, body: int) -> int:
+        return len(self.probes(body).positions) * (1 + bool(self._merged_scene.is_two_sided[body]))
+
+    def _normals(self, body: int) -> np.ndarray:
+        """Normals of the probes of a body, and of their backs if it is open."""
+        sides = (1, -1) if self._merged_scene.is_two_sided[body] else (1,)
+        return np.concatenate([side * self.probes(body).normals for side in sides])
+
+    def rows(self, body: int) -> VisibilityRows:
+        """Self-visibility of the probes of a body: in memory, on disk, or traced."""
+        if body not in self._rows:
+            self._rows[body] = self._of_mesh(body, "rows", lambda: self._find_rows(body))
+        return self._rows[body]
+
+    def _announce(self, bodies: tuple[int, ...]) -> None:
+        """Say how long rows that are to be traced take, if that is long."""
+        seconds, point_count, requested = 0.0, 0, set()
+        for body in bodies:
+            is_known = self._merged_scene.is_flat[body] or body in self._rows
+            if not is_known and (path := self._rows_path(body)) not in requested and not path.exists():
+                requested.add(path)
+                point_count += self._row_count(body)
+                faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
+                seconds += trace_seconds(self._row_count(body), len(faces))
+        of_bodies = "a body on itself" if len(requested) == 1 else f"{len(requested)} bodies on themselves"
+        announce(
+            f"tracing the shadow of {of_bodies}, from {point_count:,} points,",
+            seconds,
+            'once; self_shadows = "spheres" leaves it out, and so does method = "ray-traced", for still images',
+            shows=self._progress,
+        )
+
+    def _rows_path(self, body: int) -> Path:
+        """Where the cache has the rows of a body."""
+        mesh, probes = self._merged_scene.scene.bodies[body].mesh, self.probes(body)
+        count = ray_count(self._row_count(body))
+        numbers = [
+            VERSION,
+            count,
+            len(probes.positions),
+            bool(self._merged_scene.is_two_sided[body]),
+            len(mesh.positions),
+        ]
+        key = hashlib.sha256(json.dumps(numbers).encode())
+        key.update(probes.positions.tobytes())
+        key.update(np.asarray(mesh.surface.faces, np.int32).tobytes())
+        return cache_path("own_shadows", key.hexdigest())
+
+    def _find_rows(self, body: int) -> VisibilityRows:
+        mesh, device = self._merged_scene.scene.bodies[body].mesh, self._merged_scene.device
+        probes, faces = self.probes(body), mesh.surface.faces
+        count = ray_count(self._row_count(body))
+        if count < RAYS:
+            called = self._merged_scene.scene.bodies[body].called
+            check.warn(
+                f"body {body} ({called!r}): {len(probes.positions):,} points have {count} rays each for the body's "
+                f"shadow on itself, in place of {RAYS}, which would take too much memory",
+            )
+
+        def read(stored: Mapping[str, np.ndarray]) -> VisibilityRows:
+            for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RUN)):
+                check.shape(name, stored[name].shape, (self._row_count(body), width))
+                if stored[name].dtype != dtype:
+                    raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
+            return VisibilityRows(*(wp.array(stored[name], device=device) for name in VisibilityRows._fields))
+
+        def trace(unfinished: Unfinished) -> VisibilityRows:
+            points = wp.array(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
+            whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
+            normals = self._normals(body)
+            places = np.tile(probes.positions, (len(normals) // len(probes.normals), 1))
+
+            def keep(bits: wp.array) -> None:
+                done = f"{len(bits):,} of {len(places):,} points"
+                unfinished.keep(lambda: {"bits": bits.numpy()}, done)
+
+            with unrecorded():
+                rows = trace_rows(
+                    self._tree(body),
+                    places,
+                    normals,
+                    count,
+                    before=unfinished.before.get("bits"),
+                    keep=keep,
+                    progress=self._progress,
+                )
+                is_buried = find_buried(whole, places, normals, len(probes.positions), rows)
+                return rows.dilated(find_dilation(probes, is_buried))
+
+        return load_or_compute(
+            self._rows_path(body),
+            read,
+            trace,
+            lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},
+            what="self-shadow",
+        )

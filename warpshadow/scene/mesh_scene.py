@@ -1,0 +1,140 @@
+"""Scenes of one mesh: which of its axes is up, a ground, a sky and a camera that frames it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.mesh_files import MeshSource
+from warpshadow.assets.primitives import infinite_ground
+from warpshadow.assets.sky import synthetic_sky
+from warpshadow.check import AnyPath
+from warpshadow.scene.scene import Body, Scene
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
+
+GUESS = "guess"
+"""Ways to point up: the one that :func:`guess_up` finds."""
+
+_AXES = {"y": 1, "z": 2}
+_Y_UP_FORMATS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")  # glTF says so, and USD is turned as it is read
+_Z_UP_FORMATS = (".stl",)  # as programs for printing and construction have it
+
+_FOOT = 0.02  # height of the part that touches the ground, as a part of the size
+_FIRMER = 0.2  # difference of footings that decides
+_THIN = 0.3  # extent of plates and doors along their normal, as a part of the next
+_SAMPLES = 4000
+_SYMMETRIC, _ASYMMETRIC = 1.1, 2.0  # distances to the mirrored surface, in distances between samples
+
+
+class UpGuess(NamedTuple):
+    """Which axis of a mesh points up, and why."""
+
+    axis: str
+    reason: str
+
+
+def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
+    """Guess whether y or z of a mesh points up.
+
+    Things stand on feet or bases that are large beside the parts above, and upside down they are not their own mirror
+    image. A plate may lie and a door may stand, so a thin base does not count. Where nothing decides it is y.
+
+    Args:
+        mesh: The mesh.
+        suffix: Of its file, in lower case. glTF and USD have y up as they are read; where nothing decides, STL has z.
+
+    Of 24 shapes that have y up, one, a knot, is taken for z; turned to z, 16 are found, and of
+    the others, such as a fence, a ball and a tree, nothing but the suffix decides (tests/scene/test_mesh_scene.py).
+    """
+    if suffix in _Y_UP_FORMATS:
+        return UpGuess("y", f"as {suffix} files have it")
+    rng = np.random.default_rng(0)
+    samples = _samples(mesh, rng), _samples(mesh, rng)
+    mirrored = {axis: _mirror_distance(*samples, number) for axis, number in _AXES.items()}
+    for axis, other in (("y", "z"), ("z", "y")):
+        if mirrored[other] < _SYMMETRIC and mirrored[axis] > _ASYMMETRIC:
+            return UpGuess(axis, f"along {other} it is symmetric")
+    points = mesh.world_points().astype(np.float64)
+    footing = {axis: _footing(points, samples[0].mean(axis=0), number) for axis, number in _AXES.items()}
+    axis, other = sorted(footing, key=lambda item: -footing[item])
+    extents = np.ptp(points, axis=0)
+    is_thin = extents[_AXES[axis]] < _THIN * np.delete(extents, _AXES[axis]).min()
+    if footing[axis] < footing[other] + _FIRMER or is_thin:
+        is_z = suffix in _Z_UP_FORMATS
+        return UpGuess("z" if is_z else "y", f"as {suffix} files often have it" if is_z else "its shape does not say")
+    return UpGuess(axis, f"it stands firmer than on {other}")
+
+
+def default_scene(
+    body: Body | Mesh | MeshSource,
+    *,
+    up: str = "y",
+    size: tuple[int, int] = (256, 256),
+    light: EnvironmentMap | AnyPath | None = None,
+) -> Scene:
+    """Put a mesh on a ground without end, under a sky with a sun, before a camera that frames it.
+
+    Args:
+        body: A body, or a source of one: a mesh, or any source that :func:`warpshadow.load_mesh` reads. It becomes 2
+            units large. Where it has many sharp edges that its normals round, they are parted, :meth:`Body.creased`.
+        up: Axis of the mesh that points up, "y" or "z", or "guess", which :func:`guess_up` finds by its shape.
+        size: Width and height of the image [pixels].
+        light: In place of the sky: an environment map, or the file of one.
+    """
+    check.choice("up", up, (*_AXES, GUESS))
+    suffix = Path(body).suffix.lower() if check.is_path(body) else ""
+    body = body if isinstance(body, Body) else Body(body)
+    axis = guess_up(body.mesh, suffix).axis if up == GUESS else up
+    body = body.creased() if body.mesh.rounds_edges else body
+    body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
+    ground = Body(infinite_ground(6.0), albedo=(0.4, 0.4, 0.4))
+    return Scene([body, ground], synthetic_sky() if light is None else light, Camera.framing(body, size=size))
+
+
+def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
+    """Area on which points stand, as a part of that of their shadow from above; 0 where they would fall over."""
+    level = np.delete(points, axis, axis=1)
+    height = points[:, axis] - points[:, axis].min()
+    base, shadow = _hull(level[height < _FOOT * np.ptp(points, axis=0).max()]), _hull(level)
+    if base is None or shadow is None:
+        return 0.0
+    is_stable = (base.equations @ [*np.delete(middle, axis), 1.0] < 0).all()
+    return base.volume / shadow.volume if is_stable else 0.0  # scipy calls the area of a polygon that
+
+
+def _hull(points: np.ndarray) -> ConvexHull | None:
+    """Convex hull of points in a plane; None for points on a line."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+
+
+def _mirror_distance(one: np.ndarray, other: np.ndarray, axis: int) -> float:
+    """Mean distance from samples of a surface, upside down, to others; 1 is that of the same as they are."""
+    from scipy.spatial import KDTree
+
+    tree, mirrored = KDTree(one), other.copy()
+    mirrored[:, axis] = one[:, axis].min() + one[:, axis].max() - mirrored[:, axis]
+    usual = tree.query(other)[0].mean()
+    return float(tree.query(mirrored)[0].mean() / usual) if usual else 1.0
+
+
+def _samples(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
+    """Points of a mesh's surface, as many on equal areas, shape [sample, 3]."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    total = areas.sum()
+    chosen = corners[rng.choice(len(corners), _SAMPLES, p=areas / total if total else None)]
+    return np.einsum("sk,skd->sd", rng.dirichlet((1, 1, 1), _SAMPLES), chosen)

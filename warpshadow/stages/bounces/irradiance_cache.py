@@ -1,0 +1,62 @@
+"""Irradiance cache: a few of the receivers, at which bounced light is gathered for all of them. It varies slowly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpshadow.maths.spatial_sort import z_order
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+CACHE_POINT_COUNT = 2048
+"""Cache points of an image: of 256 × 256 pixels one in 32."""
+
+_NEIGHBORS = 3
+
+_TURN = 0.1
+"""Distance that a difference of normals by 1 counts as, in parts of the receivers' extent."""
+
+
+def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> np.ndarray:
+    """Choose receivers that are as dense as all are, numbers of shape [cache point].
+
+    Args:
+        points: Receivers, shape [receiver, 3].
+        count: Most cache points; all receivers where they are fewer.
+    """
+    curve_order = z_order(points.astype(np.float64))
+    return curve_order[
+        np.arange(min(count, len(curve_order))) * len(curve_order) // max(min(count, len(curve_order)), 1)
+    ]
+
+
+def interpolation(points: np.ndarray, normals: np.ndarray, cache_points: np.ndarray) -> csr_matrix:
+    """The matrix that interpolates between the nearest cache points, by place and normal.
+
+    With d_i the distances to the nearest cache points in order, the three nearest weigh (1/d_i − 1/d_4)² [Renka 1988].
+
+    Args:
+        points: Receivers, shape [receiver, 3].
+        normals: Their unit normals, shape [receiver, 3].
+        cache_points: Which of them are cache points, shape [cache point].
+
+    Returns:
+        Shape [receiver, cache point]; rows sum to 1.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.spatial import cKDTree
+
+    extent = float(np.ptp(points, axis=0).max(initial=0.0)) or 1.0
+    features = np.concatenate([points / extent, _TURN * normals], axis=1).astype(np.float64)
+    reached = min(_NEIGHBORS + 1, len(cache_points))
+    distances, neighbors = cKDTree(features[cache_points]).query(features, k=reached)
+    distances, neighbors = distances.reshape(len(points), reached), neighbors.reshape(len(points), reached)
+    nearness = 1 / np.maximum(distances, 1e-9)
+    weights = (nearness - nearness[:, -1:]) ** 2
+    weights[weights.sum(axis=1) == 0, 0] = 1  # all are as far
+    weights /= weights.sum(axis=1, keepdims=True)
+    starts = np.arange(len(points) + 1) * reached
+    return csr_matrix((weights.astype(np.float32).ravel(), neighbors.ravel(), starts), (len(points), len(cache_points)))

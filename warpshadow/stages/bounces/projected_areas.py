@@ -1,0 +1,184 @@
+"""Projected area of patches towards each cell, without the parts hidden by their own body or by a plane.
+
+Towards a receiver that sees a patch in direction ω, its sources s with weights w show
+
+    g_p(ω) = Σ_s w_ps max(−n′_s·ω, 0) T_s(−ω)
+
+parts of its area. T_s is the body's self-transmittance in the cell that contains −ω. Other bodies do not count: the
+receiver's self-transmittance covers them, and one of them may be where the receiver is.
+
+Plane blockers cannot count as T, since a receiver on a ground is behind the ground in each direction from which it is
+lit. But receivers above a ground hardly see patches that face it and are near it. The bottom of a sphere of radius r,
+which is at height d, is seen from the ground not at the slope at which its middle is seen, but at d / (d + r) of that:
+so the part of a normal that points into a plane with normal N fades,
+
+    n′ = n + c max(−n·N, 0) N,  c = f r² / (d² + r²) · Π_axes [S((y_most − y) / r) − S((y_least − y) / r)]
+
+which is about 1 − d / (d + r), but smooth where bodies lie: S is the smoothstep of
+:mod:`warpshadow.stages.planes.cells`, y where the source is along the plane, and f the part of the front that it sees;
+so it is for the back, with −N.
+
+Measured with a ground and two bounces, images against all bounces by a path tracer, relative RMSE: a machine part that
+lies on the ground 7.8% by normals alone, 7.6% with T, 5.5% with T and n′; a cow 2.1%, 2.0% and 1.8%; a man of thin
+limbs in a bare sun 7.1% by all. Where two bodies that are not flat touch, neither hides the other.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+from warpshadow.maths.directions import check_directions
+from warpshadow.stages.planes.cells import step
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+from warpshadow.stages.sparse import SparseMatrix
+
+
+@wp.func
+def _part_within(place: float, minimum: float, maximum: float, reach: float):
+    """Part of an interval around a place that lies between two others."""
+    return step((maximum - place) / reach) - step((minimum - place) / reach)
+
+
+@wp.kernel
+def _turn_from_planes(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    spheres: wp.array(dtype=wp.int32),
+    fronts: wp.array3d(dtype=wp.float32),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=PlaneGrid),
+    # out
+    turned: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a source of an instance."""
+    batch, source = wp.tid()
+    point = points[instance_in(batch, points.shape[0]), source]
+    normal = normals[instance_in(batch, normals.shape[0]), source]
+    result = normal
+    if spheres[source] >= 0:
+        radius = radii[instance_in(batch, radii.shape[0]), spheres[source]]
+        of_planes = instance_in(batch, frames.shape[0])
+        for f in range(grids.shape[0]):
+            grid = grids[f]
+            u = frames[of_planes, 3 * f + 1]
+            v = frames[of_planes, 3 * f + 2]
+            up = wp.normalize(wp.cross(u, v))
+            along_up = wp.dot(normal, up)
+            front = fronts[instance_in(batch, fronts.shape[0]), source, f]
+            away = front * wp.max(-along_up, 0.0) - (1.0 - front) * wp.max(along_up, 0.0)
+            if grid.blocks != 0 and radius > 0.0:
+                offset = point - frames[of_planes, 3 * f]
+                height = wp.dot(offset, up) / radius
+                x = wp.dot(offset, u) / wp.length(u)
+                y = wp.dot(offset, v) / wp.length(v)
+                # the plane's units are its scale in the scene's
+                within = _part_within(x, grid.least[0] * wp.length(u), grid.most[0] * wp.length(u), radius)
+                within *= _part_within(y, grid.least[1] * wp.length(v), grid.most[1] * wp.length(v), radius)
+                result += within / (1.0 + height * height) * away * up
+    turned[batch, source] = result
+
+
+def turn_from_planes(
+    points: wp.array,
+    normals: wp.array,
+    radii: wp.array,
+    spheres: np.ndarray,
+    fronts: wp.array,
+    frames: wp.array,
+    planes: PlaneBlockers,
+) -> wp.array:
+    """Normals of sources without the part that points into a plane on which they lie.
+
+    Args:
+        points: Sources [scene units], vec3 of shape [batch, source].
+        normals: Their unit normals, vec3 of shape [batch, source].
+        radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
+        spheres: The blocker nearest to the patch of each source, −1 for none, which keeps its normal: NumPy of shape
+            [source].
+        fronts: Part of the front of each plane that sources see, float32 of shape [batch, source, plane], from
+            :func:`.fronts.find_fronts`.
+        frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
+        planes: The planes. Planes that cast no shadow do not count.
+
+    Returns:
+        n′, vec3 of shape [batch, source]. Any batch may be 1.
+
+    Differentiable: points, normals, radii, fronts, frames.
+    """
+    check.shape("normals", normals.shape, ("batch", points.shape[1]))
+    check.shape("spheres", spheres.shape, (points.shape[1],))
+    check.shape("frames", frames.shape, ("batch", 3 * planes.count))
+    if len(spheres) and spheres.max() >= radii.shape[1]:
+        raise ValueError(f"spheres: got {spheres.max()}, expected −1 to {radii.shape[1] - 1}")
+    check.shape("fronts", fronts.shape, ("batch", points.shape[1], planes.count))
+    arguments = {"points": points, "normals": normals, "radii": radii, "fronts": fronts, "frames": frames}
+    count = common_batch(arguments)
+    turned = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
+    numbers = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
+    launch(
+        _turn_from_planes,
+        turned.shape,
+        inputs=[points, normals, radii, numbers, fronts, frames, planes.grids],
+        outputs=[turned],
+    )
+    return turned
+
+
+@wp.kernel
+def _show(
+    # in
+    normals: wp.array2d(dtype=wp.vec3),
+    transmittance: wp.array3d(dtype=wp.float32),
+    starts: wp.array(dtype=wp.int32),
+    sources: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    directions: wp.array(dtype=wp.vec3),
+    opposite: wp.array(dtype=wp.int32),
+    # out
+    shown: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a patch of an instance and a direction."""
+    batch, patch, direction = wp.tid()
+    total = float(0.0)
+    for k in range(starts[patch], starts[patch + 1]):
+        normal = normals[instance_in(batch, normals.shape[0]), sources[k]]
+        cosine = wp.max(-wp.dot(normal, directions[direction]), 0.0)
+        total += (
+            weights[k]
+            * cosine
+            * transmittance[instance_in(batch, transmittance.shape[0]), sources[k], opposite[direction]]
+        )
+    shown[batch, patch, direction] = total
+
+
+def find_projected_areas(
+    normals: wp.array, transmittance: wp.array, mean: SparseMatrix, directions: np.ndarray
+) -> wp.array:
+    """Projected areas of patches towards cells, for :func:`.proxy_radiance.find_proxy_radiance`.
+
+    Args:
+        normals: Of the sources, n′, vec3 of shape [batch, source], from :func:`turn_from_planes`.
+        transmittance: T, self-transmittance of each source, float32 of shape [batch, source, direction].
+        mean: The matrix w, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
+
+    Returns:
+        g, float32 of shape [batch, patch, direction]. Any batch may be 1.
+
+    Differentiable: normals, transmittance.
+    """
+    check_directions(directions)
+    check.shape("normals", normals.shape, ("batch", mean.shape[1]))
+    check.shape("passing", transmittance.shape, ("batch", mean.shape[1], len(directions)))
+    count = common_batch({"normals": normals, "passing": transmittance})
+    opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
+    device = normals.device
+    cells = constant(directions, wp.vec3, device), constant(opposite, wp.int32, device)
+    shown = wp.empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
+    launch(_show, shown.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[shown])
+    return shown

@@ -1,0 +1,75 @@
+"""Proxies: the spheres that receivers see in place of the patches of bodies that are not flat.
+
+A patch of area A has a sphere of radius ρ = √(A/2), whose center is ρ/2 below it: as wide as the diagonal of a square
+patch, so that neighbors overlap, bulging out of the body by ρ/2. As bodies grow, so does it, by the radius of the
+sphere that blocks light beside it.
+
+If the spheres that block light stood in for the patches around them, the foot of a ball would be lit by the ball's
+whole side, where it sees the little below, which is dark: at 0.2, 0.4 and 0.6 radii from the contact of a ball with a
+ground by 6.0, 1.7 and 1.3 times the light of paths; with a sphere for each patch it is 1.36, 0.96 and 0.94 times.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+_BELOW = wp.constant(0.5)
+"""How far below its patch a center is, in radii."""
+
+
+@wp.kernel
+def _place(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    blocker_radii: wp.array2d(dtype=wp.float32),
+    numbers: wp.array(dtype=wp.int32),
+    ratios: wp.array(dtype=wp.float32),
+    # out
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns a patch of an instance."""
+    batch, patch = wp.tid()
+    radius = float(0.0)
+    if numbers[patch] >= 0:
+        radius = ratios[patch] * blocker_radii[instance_in(batch, blocker_radii.shape[0]), numbers[patch]]
+    point = points[instance_in(batch, points.shape[0]), patch]
+    normal = normals[instance_in(batch, normals.shape[0]), patch]
+    centers[batch, patch] = point - _BELOW * radius * normal
+    radii[batch, patch] = radius
+
+
+def place_proxies(
+    sources: Receivers, mean: SparseMatrix, blocker_radii: wp.array, numbers: np.ndarray, ratios: np.ndarray
+) -> tuple[wp.array, wp.array]:
+    """Place the spheres that stand in for patches.
+
+    Args:
+        sources: Where patches are lit.
+        mean: The weights of these, [patch, source], from :func:`.radiosity.mean_over_sources`.
+        blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
+        numbers: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
+        ratios: Radius of each proxy in radii of that sphere, shape [patch].
+
+    Returns:
+        Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
+
+    Differentiable: points and normals of the sources, blocker_radii.
+    """
+    check.shape("numbers", numbers.shape, (mean.shape[0],))
+    check.shape("ratios", ratios.shape, (mean.shape[0],))
+    count = common_batch({"sources": sources.points, "normals": sources.normals, "radii": blocker_radii})
+    device = blocker_radii.device
+    centers = wp.empty((count, len(numbers)), dtype=wp.vec3, device=device)
+    radii = wp.empty((count, len(numbers)), dtype=wp.float32, device=device)
+    means = multiply(mean, sources.points), multiply(mean, sources.normals)
+    fixed = constant(np.asarray(numbers, np.int32), wp.int32, device), constant(ratios, wp.float32, device)
+    launch(_place, centers.shape, inputs=[*means, blocker_radii, *fixed], outputs=[centers, radii])
+    return centers, radii

@@ -1,0 +1,126 @@
+"""Radiance of proxies: the light of a body's patches, as the spheres in their place send it.
+
+Each patch p has a sphere of its own; several share one only where spheres are merged. Towards a receiver that sees the
+sphere in direction ω, its patches send
+
+    E_j(ω) = Σ_p A_p (g_p + 0.01) B_p / Σ_p A_p (g_p + 0.01)
+
+the mean of their radiosities B by the area that they show: g_p is that of a unit (:mod:`.projected_areas`). Patches
+that face away, or are hidden, count for a hundredth of their area: where none shows itself the mean is still one, so it
+is smooth, and nothing is divided by zero.
+
+Through a cell a receiver sees a mean over the spheres in it (:mod:`warpshadow.stages.bounces.sphere_light`).
+There, too, patches should count by the area that they show: the spheres on the far side of a body show none. So
+numerator and denominator stay apart, both over Σ_p A_p. By g_p = max(−n_p·ω, 0), on a ground around a bunny of 64
+spheres that is in the sky and the sun the light that the bunny sends is 14% off by either, of a sun alone 33%, where
+equal weights give 37%; of a white bunny 8% and without bias, where equal weights lose 6% of the light.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
+
+_HIDDEN = wp.constant(0.01)
+"""Part of its area that a patch counts for where it shows none."""
+
+_SHOWN = 0.25
+"""Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
+
+
+def patches_of_clusters(
+    spheres: np.ndarray, nearest: np.ndarray, *, merging: float = MERGING
+) -> tuple[np.ndarray, np.ndarray]:
+    """Patches of spheres and then, where spheres merge, of the quads' spheres, which have the patches of all four.
+
+    Args:
+        spheres: Sphere of each patch, −1 for none, shape [patch].
+        nearest: Patch nearest to each sphere, which a sphere that has none takes; −1 if its body is black, as the
+            sphere then is. Shape [sphere].
+        merging: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+
+    Returns:
+        Where the patches of each node begin, and the end, int32 of shape [node + 1]; and these patches, int32.
+    """
+    permutation = np.argsort(spheres, kind="stable")
+    ends = np.searchsorted(spheres[permutation], np.arange(len(nearest) + 1))
+    lists = [permutation[first:end] for first, end in zip(ends[:-1], ends[1:], strict=True)]
+    lists = [own if len(own) or patch < 0 else np.array([patch]) for own, patch in zip(lists, nearest, strict=True)]
+    for quad in range(merged_count(len(nearest), merging)):
+        lists.append(np.concatenate(lists[QUAD * quad : QUAD * (quad + 1)]))
+    starts = np.cumsum([0, *map(len, lists)])
+    return starts.astype(np.int32), np.concatenate([*lists, []]).astype(np.int32)
+
+
+@wp.kernel
+def _tabulate(
+    # in
+    radiosity: wp.array2d(dtype=wp.vec3),
+    shown: wp.array3d(dtype=wp.float32),
+    starts: wp.array(dtype=wp.int32),
+    numbers: wp.array(dtype=wp.int32),
+    shares: wp.array(dtype=wp.float32),
+    minimum: wp.array(dtype=wp.float32),
+    # out
+    proxy_radiance: wp.array3d(dtype=wp.vec4),
+):
+    """A thread owns a node and a direction; shares are A / Σ A, and so sums are linear, as Warp's adjoint needs it."""
+    batch, node, direction = wp.tid()
+    sent = radiosity[instance_in(batch, radiosity.shape[0])]
+    shows = shown[instance_in(batch, shown.shape[0])]
+    light = wp.vec3()
+    open = float(minimum[node])
+    for k in range(starts[node], starts[node + 1]):
+        patch = numbers[k]
+        part = shares[k] * (shows[patch, direction] + _HIDDEN)
+        light += part * sent[patch]
+        open += part
+    proxy_radiance[batch, node, direction] = wp.vec4(light[0], light[1], light[2], open)
+
+
+def find_proxy_radiance(
+    radiosity: wp.array,
+    shown: wp.array,
+    areas: np.ndarray,
+    starts: np.ndarray,
+    numbers: np.ndarray,
+) -> wp.array:
+    """Light that spheres send towards cells of directions, for :func:`.sphere_light.sphere_light`.
+
+    It costs nodes × directions × patches of a node, for any number of receivers.
+
+    Args:
+        radiosity: Of patches: white under a radiance of 1 has 1, vec3 of shape [batch, patch]. shown: g, projected area
+            of each patch towards each cell, float32 of shape [batch, patch, direction], from
+            :func:`.projected_areas.find_projected_areas`.
+        areas: Of patches [scene units²], not negative, float32 of shape [patch].
+        starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
+
+    Returns:
+        Σ A (g + 0.01) B / Σ A and Σ A (g + 0.01) / Σ A, vec4 of shape [batch, node, direction].
+
+    Differentiable: radiosity, shown.
+    """
+    batch_count = common_batch({"radiosity": radiosity, "shown": shown})
+    patch_count = len(areas)
+    check.shape("radiosity", radiosity.shape, (radiosity.shape[0], patch_count))
+    check.shape("shown", shown.shape, (shown.shape[0], patch_count, "direction"))
+    check.finite("areas", np.asarray(areas), minimum=0.0)
+    if starts[0] != 0 or (np.diff(starts) < 0).any() or starts[-1] != len(numbers):
+        raise ValueError(f"starts: got {np.asarray(starts)!r}, expected 0 to the {len(numbers)} numbers, rising")
+    if len(numbers) and not 0 <= min(numbers) <= max(numbers) < patch_count:
+        raise ValueError(f"numbers: got {min(numbers)} to {max(numbers)}, expected patches, 0 to {patch_count - 1}")
+    device = radiosity.device
+    nodes = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    totals = np.bincount(nodes, areas[numbers], len(starts) - 1)
+    shares = areas[numbers] / np.where(totals > 0, totals, 1)[nodes]
+    integers = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, numbers)]
+    floats = [shares, np.where(totals > 0, 0.0, _SHOWN)]
+    tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
+    proxy_radiance = wp.empty((batch_count, len(starts) - 1, shown.shape[2]), dtype=wp.vec4, device=device)
+    launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, shown, *tables], outputs=[proxy_radiance])
+    return proxy_radiance

@@ -1,0 +1,162 @@
+"""Kept visibility of static bodies, combined with that of moving bodies."""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
+from warpshadow.device.launch import differentiable, launch
+
+
+class CachedRows(NamedTuple):
+    """Rows of numbers, and which of them each receiver has."""
+
+    rows: wp.array  # [row, channel, item] float32
+    index: wp.array  # [receiver] int32
+
+
+@wp.kernel(enable_backward=False)
+def _light_cells(
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    # out
+    shading: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  B = Σ_q T_q S_q."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    total = wp.vec3()
+    for chunk in range(cells.shape[2]):
+        t = transmittance[batch, receiver, chunk]
+        total += wp.vec3(
+            wp.dot(t, cells[row, 0, chunk]), wp.dot(t, cells[row, 1, chunk]), wp.dot(t, cells[row, 2, chunk])
+        )
+    shading[batch, receiver] = total
+
+
+@wp.kernel(enable_backward=False)
+def _light_cells_adjoint(
+    # in
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver:  T̄_q += S_q · B̄."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    adj = adj_shading[batch, receiver]
+    for chunk in range(cells.shape[2]):
+        adj_transmittance[batch, receiver, chunk] = (
+            adj_transmittance[batch, receiver, chunk]
+            + adj[0] * cells[row, 0, chunk]
+            + adj[1] * cells[row, 1, chunk]
+            + adj[2] * cells[row, 2, chunk]
+        )
+
+
+def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
+    """Light receivers on static bodies by known light, which static and moving bodies shadow.
+
+    Args:
+        transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
+        cached: Irradiance from each cell of directions, shadowed by static bodies, [row, 3, direction].
+
+    Returns:
+        Shading, vec3 of shape [batch, receiver].
+
+    Differentiable: transmittance.
+    """
+    device = transmittance.device
+    if device.is_cpu:
+        use_vector_registers(__name__)
+    factors = [cached.index, as_chunks(cached.rows)]
+
+    def forward(shading: wp.array) -> None:
+        launch(_light_cells, shading.shape, inputs=[as_chunks(transmittance), *factors], outputs=[shading])
+
+    def adjoint(adj_shading: wp.array) -> None:
+        outputs = [as_chunks(transmittance.grad)]
+        launch(_light_cells_adjoint, adj_shading.shape, inputs=[*factors, adj_shading], outputs=outputs)
+
+    shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
+    return differentiable(forward, adjoint, shading, variables=[transmittance])
+
+
+@wp.kernel(enable_backward=False)
+def _multiply_cells(
+    # in
+    factors: wp.array3d(dtype=Chunk),
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    # out
+    products: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver, to whose products it adds."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    for chunk in range(cells.shape[2]):
+        products[batch, receiver, chunk] = products[batch, receiver, chunk] + wp.cw_mul(
+            factors[batch, receiver, chunk], cells[row, 0, chunk]
+        )
+
+
+def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
+    """Transfer vectors of receivers on static bodies: their cached transfer, times the others' transmittance.
+
+    Args:
+        transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
+        cached: Transfer vectors with static bodies alone, [row, 1, direction].
+
+    Returns:
+        Transfer vectors, float32 of shape [batch, receiver, direction].
+
+    Differentiable: transmittance.
+    """
+    device = transmittance.device
+    if device.is_cpu:
+        use_vector_registers(__name__)
+    factors = [cached.index, as_chunks(cached.rows)]
+
+    def multiply(values: wp.array, products: wp.array) -> None:
+        inputs = [as_chunks(values), *factors]
+        launch(_multiply_cells, values.shape[:2], inputs=inputs, outputs=[as_chunks(products)])
+
+    return differentiable(
+        lambda transfer: multiply(transmittance, transfer),
+        lambda adj_transfer: multiply(adj_transfer, transmittance.grad),
+        result=wp.zeros(transmittance.shape, dtype=wp.float32, device=device),
+        variables=[transmittance],
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _add_rows(
+    # in
+    index: wp.array(dtype=wp.int32),
+    rows: wp.array3d(dtype=wp.float32),
+    channel: int,
+    # out
+    sums: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver, to whose sums it adds."""
+    batch, receiver = wp.tid()
+    row = index[receiver]
+    for item in range(rows.shape[2]):
+        sums[batch, receiver, item] = sums[batch, receiver, item] + rows[row, channel, item]
+
+
+def add_rows(cached: CachedRows, sums: wp.array, channel: int = 0) -> None:
+    """Add the kept sums over static bodies to sums over moving bodies, in place.
+
+    No adjoint is needed: a constant leaves the gradient as it is.
+
+    Args:
+        cached: Of shape [row, channel, item].
+        sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
+        channel: Which is added.
+    """
+    launch(_add_rows, sums.shape[:2], inputs=[cached.index, cached.rows, channel], outputs=[sums])

@@ -1,1 +1,0 @@
-"""Flats: bodies that lie in planes, and what they block of the light."""

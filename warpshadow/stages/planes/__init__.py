@@ -1,0 +1,1 @@
+"""Plane blockers: bodies that lie in planes, and the light they block."""

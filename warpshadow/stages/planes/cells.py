@@ -1,0 +1,491 @@
+"""A cell of directions hits a plane: the covered part, and the radiosity there, with gradients.
+
+Seen from a receiver x, a cell with direction ω and angular radius ρ = 2/√Q meets a plane with normal N, which is the
+distance d below the receiver:
+
+    c = −N·ω                                  cosine
+    c′ = ρ s(c/ρ),  s(z) = z,  and 1/3 + 2/3 ((z + 1)/2)³ below z = 1
+                                              mean cosine of the part of the cell that is below the plane's horizon
+    t = d / c′                                distance
+    y = x + t ω                               where, in the plane
+    h = S(c/ρ) · Π_axes [S((y_most − y)/e) − S((y_least − y)/e)],  e = t ρ √(1 + (ω_axis / c′)²)
+                                              coverage: part of the cell that the rectangle takes
+
+S(z) is the smoothstep from 0 at −1 to 1 at 1, so h has no step at the horizon, or at the border. Where the mesh has
+holes, h is multiplied with the mesh's share of the footprint. Radiosity is bilinear in two mip levels of the grid,
+which are blended so that their texels are as wide as the footprint is in the mean of both axes, 2 t ρ / √c′: twice the
+disc of the cell, as interpolation between means is, so that together cells see all texels alike. For a sun alone that
+is too wide: there texels are half as wide.
+
+No receiver is nearer to a side than a margin, so that t is not 0. Which side it is on, :mod:`.fronts` says; by height
+alone the front fades away and the back appears from the plane to a margin below it.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+
+
+@wp.struct
+class PlaneArrays:
+    """The planes as kernels read them."""
+
+    grids: wp.array(dtype=PlaneGrid)
+    levels: wp.array(dtype=wp.vec3i)
+    level_scales: wp.array(dtype=wp.vec2)
+    covered: wp.array(dtype=wp.vec3)
+    skip: int  # the plane that the receivers are part of, -1 for none
+    radius: float  # ρ
+    spot_radius: float  # half the width of texels, for a unit of distance
+    per_radius: float
+
+
+def check_planes(
+    planes: PlaneBlockers,
+    points: wp.array,
+    frames: wp.array,
+    directions: np.ndarray,
+    skip: int | None,
+) -> None:
+    """Raise ValueError for arrays that do not fit together."""
+    check.shape("points", points.shape, ("batch", "receiver"))
+    check.shape("directions", directions.shape, ("direction", 3))
+    check.shape("frames", frames.shape, ("batch", 3 * planes.count))
+    if skip is not None:
+        check.choice("skip", skip, range(planes.count))
+
+
+def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None, *, tiles: bool = True) -> PlaneArrays:
+    """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none.
+
+    Where cells do not tile the sphere, as those of a sun alone, texels are half as wide.
+    """
+    scene = PlaneArrays()
+    scene.grids, scene.levels, scene.level_scales = planes.grids, planes.levels, planes.level_scales
+    scene.covered, scene.skip = planes.covered, -1 if skip is None else skip
+    scene.radius = radius
+    scene.spot_radius = scene.radius if tiles else 0.5 * scene.radius
+    scene.per_radius = 1 / scene.radius
+    return scene
+
+
+@wp.func
+def step(z: float):
+    """The smoothstep from 0 at −1 to 1 at 1."""
+    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+@wp.func
+def step_slope(z: float):
+    """Its derivative."""
+    u = wp.clamp(0.5 * z + 0.5, 0.0, 1.0)
+    return 3.0 * u * (1.0 - u)
+
+
+# ---------------------------------------------------------------------------------------------------- receivers
+
+
+@wp.struct
+class ReceiverInPlane:
+    """A receiver as a plane has it: in the plane's own axes."""
+
+    at: wp.vec3  # along both axes, and its height [units of the body]
+    along_u: wp.vec3  # axes of unit length
+    along_v: wp.vec3
+    normal: wp.vec3  # 0 where the plane has no area
+
+
+@wp.func
+def find_in_plane(point: wp.vec3, frames: wp.array(dtype=wp.vec3), f: int):
+    """Find a receiver in the axes of a plane."""
+    place = ReceiverInPlane()
+    scale_u = wp.length(frames[3 * f + 1])
+    scale_v = wp.length(frames[3 * f + 2])
+    if scale_u > 0.0 and scale_v > 0.0:
+        place.along_u = frames[3 * f + 1] / scale_u
+        place.along_v = frames[3 * f + 2] / scale_v
+        place.normal = wp.cross(place.along_u, place.along_v)
+        offset = point - frames[3 * f]
+        place.at = wp.vec3(
+            wp.dot(offset, place.along_u) / scale_u,
+            wp.dot(offset, place.along_v) / scale_v,
+            wp.dot(offset, place.normal) / scale_u,
+        )
+    return place
+
+
+@wp.func
+def find_in_plane_adjoint(
+    point: wp.vec3,
+    frames: wp.array(dtype=wp.vec3),
+    f: int,
+    place: ReceiverInPlane,
+    adj: ReceiverInPlane,
+    instance: int,
+    adj_frames: wp.array2d(dtype=wp.vec3),
+):
+    """Add to the gradients of the frames of an instance; returns that of the point."""
+    scale_u = wp.length(frames[3 * f + 1])
+    scale_v = wp.length(frames[3 * f + 2])
+    if not (scale_u > 0.0 and scale_v > 0.0):
+        return wp.vec3()
+    offset = point - frames[3 * f]
+    adj_x = adj.at[0] / scale_u
+    adj_y = adj.at[1] / scale_v
+    adj_height = adj.at[2] / scale_u
+    adj_offset = adj_x * place.along_u + adj_y * place.along_v + adj_height * place.normal
+    if adj_frames:
+        adj_normal = adj.normal + adj_height * offset
+        adj_u = adj.along_u + adj_x * offset + wp.cross(place.along_v, adj_normal)
+        adj_v = adj.along_v + adj_y * offset + wp.cross(adj_normal, place.along_u)
+        # of an axis' direction, and of its length
+        adj_u = (adj_u - wp.dot(adj_u, place.along_u) * place.along_u) / scale_u - (
+            adj_x * place.at[0] + adj_height * place.at[2]
+        ) * place.along_u
+        adj_v = (adj_v - wp.dot(adj_v, place.along_v) * place.along_v) / scale_v - (adj_y * place.at[1]) * place.along_v
+        wp.atomic_add(adj_frames, instance, 3 * f, -adj_offset)
+        wp.atomic_add(adj_frames, instance, 3 * f + 1, adj_u)
+        wp.atomic_add(adj_frames, instance, 3 * f + 2, adj_v)
+    return adj_offset
+
+
+@wp.func
+def front_of(fronts: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, f: int):
+    """Part of the front that a receiver sees, as it is given or by its height."""
+    if fronts:
+        return fronts[batch, receiver, f]
+    return front_weight(grid, height)
+
+
+@wp.func
+def front_of_adjoint(
+    fronts: wp.array3d(dtype=wp.float32),
+    grid: PlaneGrid,
+    height: float,
+    adj: float,
+    batch: int,
+    receiver: int,
+    f: int,
+    adj_fronts: wp.array3d(dtype=wp.float32),
+):
+    """Add to the gradient of the height."""
+    if fronts:
+        if adj_fronts:
+            adj_fronts[batch, receiver, f] = adj_fronts[batch, receiver, f] + adj
+        return float(0.0)
+    return adj * front_weight_slope(grid, height)
+
+
+@wp.func
+def front_weight(grid: PlaneGrid, height: float):
+    """Part of the front that a receiver sees; of the back it sees the rest."""
+    return step(1.0 + 2.0 * height / grid.margin)
+
+
+@wp.func
+def front_weight_slope(grid: PlaneGrid, height: float):
+    """Its derivative."""
+    return step_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
+
+
+@wp.func
+def on_side(grid: PlaneGrid, place: ReceiverInPlane, is_back: bool):
+    """Where a receiver is above a side: a margin where it is not, and smoothly its height from two of them on."""
+    height = wp.where(is_back, -place.at[2], place.at[2])
+    rise = wp.clamp(height / grid.margin, 0.0, 2.0)
+    return wp.vec3(
+        place.at[0], place.at[1], grid.margin * (1.0 + 0.25 * rise * rise) + wp.max(height - 2.0 * grid.margin, 0.0)
+    )
+
+
+@wp.func
+def toward_side(place: ReceiverInPlane, is_back: bool, direction: wp.vec3):
+    """Direction along the axes of a plane, and its cosine with a side."""
+    along_normal = wp.dot(direction, place.normal)
+    return wp.vec3(
+        wp.dot(direction, place.along_u),
+        wp.dot(direction, place.along_v),
+        wp.where(is_back, along_normal, -along_normal),
+    )
+
+
+@wp.func
+def side_adjoint(
+    grid: PlaneGrid,
+    place: ReceiverInPlane,
+    is_back: bool,
+    direction: wp.vec3,
+    adj_at: wp.vec3,
+    adj_toward: wp.vec3,
+    adj_place: ReceiverInPlane,
+):
+    """Add to the gradient of a receiver over a plane, by the gradients of :func:`on_side` and :func:`toward_side`."""
+    sign = wp.where(is_back, -1.0, 1.0)
+    adj_height = sign * wp.clamp(0.5 * sign * place.at[2] / grid.margin, 0.0, 1.0) * adj_at[2]
+    adj = ReceiverInPlane()
+    adj.at = adj_place.at + wp.vec3(adj_at[0], adj_at[1], adj_height)
+    adj.along_u = adj_place.along_u + adj_toward[0] * direction
+    adj.along_v = adj_place.along_v + adj_toward[1] * direction
+    adj.normal = adj_place.normal - (sign * adj_toward[2]) * direction
+    return adj
+
+
+# ---------------------------------------------------------------------------------------------------- coverage
+
+
+@wp.struct
+class PlaneFootprint:
+    """Footprint of a cell on a plane, for a receiver over one side."""
+
+    share: float  # part of the cell that the rectangle takes
+    distance: float  # [units of the body]
+    per_cosine: float  # 1 / c′, the mean cosine of the part of the cell below the horizon
+    center: wp.vec2  # in the plane
+
+
+@wp.func
+def _is_amid(grid: PlaneGrid, footprint: PlaneFootprint, radius: float):
+    """Whether a footprint is so far from the border that it does not matter."""
+    reach = footprint.distance * radius * footprint.per_cosine
+    nearest = wp.min(footprint.center - grid.least)
+    return wp.min(nearest, wp.min(grid.most - footprint.center)) > reach
+
+
+@wp.func
+def find_footprint(grid: PlaneGrid, scene: PlaneArrays, at: wp.vec3, toward: wp.vec3, presence: float):
+    """Find the footprint of a cell on a side.
+
+    Args:
+        grid: The plane.
+        scene: Has the radius of cells.
+        at: Where the receiver is: along both axes, and its height above the side.
+        toward: Direction of the cell along both axes, and its cosine, above −ρ.
+        presence: Part of the side that is there.
+    """
+    footprint = PlaneFootprint()
+    footprint.share = presence
+    cosine = toward[2]
+    if cosine < scene.radius:
+        ratio = cosine * scene.per_radius
+        u = 0.5 * ratio + 0.5
+        cosine = scene.radius * (1.0 / 3.0 + 2.0 / 3.0 * u * u * u)
+        footprint.share *= step(ratio)
+    footprint.per_cosine = 1.0 / cosine
+    footprint.distance = at[2] * footprint.per_cosine
+    footprint.center = wp.vec2(at[0] + footprint.distance * toward[0], at[1] + footprint.distance * toward[1])
+    if not _is_amid(grid, footprint, scene.radius):
+        for axis in range(2):
+            slope = toward[axis] * footprint.per_cosine
+            extent = footprint.distance * scene.radius * wp.sqrt(1.0 + slope * slope)
+            upper_bound = (grid.most[axis] - footprint.center[axis]) / extent
+            before = (grid.least[axis] - footprint.center[axis]) / extent
+            footprint.share = footprint.share * (step(upper_bound) - step(before))
+    return footprint
+
+
+@wp.func
+def find_footprint_adjoint(
+    grid: PlaneGrid,
+    scene: PlaneArrays,
+    toward: wp.vec3,
+    presence: float,
+    footprint: PlaneFootprint,
+    adj_share: float,
+    adj_distance: float,
+    adj_cosine: float,
+    adj_center: wp.vec2,
+):
+    """Gradients of ``at``, ``toward`` and ``presence``, given the footprint's and the mean cosine's, c′."""
+    radius = scene.radius
+    horizon = step(toward[2] * scene.per_radius)
+    inside_x = float(1.0)
+    inside_y = float(1.0)
+    adj_t = adj_distance
+    adj_c = adj_cosine
+    adj_x = adj_center[0]
+    adj_y = adj_center[1]
+    adj_toward = wp.vec3()
+    if not _is_amid(grid, footprint, radius):
+        slope = wp.vec2(toward[0], toward[1]) * footprint.per_cosine
+        stretch = wp.vec2(wp.sqrt(1.0 + slope[0] * slope[0]), wp.sqrt(1.0 + slope[1] * slope[1]))
+        extent = footprint.distance * radius * stretch
+        upper_bound = wp.cw_div(grid.most - footprint.center, extent)
+        before = wp.cw_div(grid.least - footprint.center, extent)
+        inside_x = step(upper_bound[0]) - step(before[0])
+        inside_y = step(upper_bound[1]) - step(before[1])
+        adj_inside = adj_share * presence * horizon * wp.vec2(inside_y, inside_x)
+        at_most = wp.cw_div(
+            wp.cw_mul(adj_inside, wp.vec2(step_slope(upper_bound[0]), step_slope(upper_bound[1]))), extent
+        )
+        at_least = wp.cw_div(wp.cw_mul(adj_inside, wp.vec2(step_slope(before[0]), step_slope(before[1]))), extent)
+        adj_x += at_least[0] - at_most[0]
+        adj_y += at_least[1] - at_most[1]
+        adj_extent = wp.cw_mul(at_least, before) - wp.cw_mul(at_most, upper_bound)
+        adj_t += radius * wp.dot(adj_extent, stretch)
+        adj_slope = (footprint.distance * radius) * wp.cw_div(wp.cw_mul(adj_extent, slope), stretch)
+        adj_toward = wp.vec3(adj_slope[0] * footprint.per_cosine, adj_slope[1] * footprint.per_cosine, 0.0)
+        adj_c -= wp.dot(adj_slope, slope) * footprint.per_cosine
+    adj_inside_share = adj_share * inside_x * inside_y
+    adj_t += adj_x * toward[0] + adj_y * toward[1]
+    adj_c -= adj_t * footprint.distance * footprint.per_cosine
+    if toward[2] < radius:
+        u = 0.5 * toward[2] * scene.per_radius + 0.5
+        adj_c = adj_c * u * u + adj_inside_share * presence * step_slope(2.0 * u - 1.0) * scene.per_radius
+    adj_toward += wp.vec3(adj_x * footprint.distance, adj_y * footprint.distance, adj_c)
+    return wp.vec3(adj_x, adj_y, adj_t * footprint.per_cosine), adj_toward, adj_inside_share * horizon
+
+
+# ---------------------------------------------------------------------------------------------------- radiosity
+
+
+@wp.struct
+class TexelFootprint:
+    """Where on a grid a footprint lies, and how large it is there."""
+
+    texel: wp.vec2  # in texels of the finest level, from its corner
+    slopes: wp.vec2  # of that by the center in the plane
+    level: int  # finer of the two levels
+    part: float  # of the coarser one
+    part_slope: float  # of that by the logarithm of the footprint's width
+
+
+@wp.func
+def find_spot(grid: PlaneGrid, scene: PlaneArrays, footprint: PlaneFootprint):
+    """Find the spot of a footprint."""
+    spot = TexelFootprint()
+    x = footprint.center[0] * grid.per_spread
+    y = footprint.center[1] * grid.per_spread
+    size_x = 1.0 + wp.abs(x)
+    size_y = 1.0 + wp.abs(y)
+    spot.texel = grid.first + wp.vec2(
+        wp.sign(x) * wp.log(size_x) * grid.texels[0], wp.sign(y) * wp.log(size_y) * grid.texels[1]
+    )
+    spot.slopes = grid.per_spread * wp.vec2(grid.texels[0] / size_x, grid.texels[1] / size_y)
+    width = (
+        2.0 * footprint.distance * scene.spot_radius * wp.sqrt(spot.slopes[0] * spot.slopes[1] * footprint.per_cosine)
+    )
+    while spot.level < grid.level_count - 1 and width >= 2.0:
+        spot.level = spot.level + 1
+        width *= 0.5
+    if width > 1.0 and spot.level < grid.level_count - 1:
+        spot.part = width - 1.0
+        spot.part_slope = width
+    return spot
+
+
+@wp.func
+def _log_slope(z: float):
+    """Derivative of log √g′(z), g the squeeze of a grid's coordinates."""
+    return -0.5 * wp.sign(z) / (1.0 + wp.abs(z))
+
+
+@wp.struct
+class _Corners:
+    """Four texels of a level around a spot, and where it lies between them."""
+
+    above: int  # the left one above
+    below: int
+    right: int  # step from the right texel to the next: 1, or 0 in a level of one column
+    s: float
+    t: float
+    slopes: wp.vec2  # of s and t by the texel of the finest level
+
+
+@wp.func
+def _find_corners(scene: PlaneArrays, number: int, texel: wp.vec2):
+    corners = _Corners()
+    level = scene.levels[number]
+    scale = scene.level_scales[number]
+    last_x = float(level[1] - 1)
+    last_y = float(level[2] - 1)
+    x = texel[0] * scale[0] - 0.5
+    y = texel[1] * scale[1] - 0.5
+    corners.slopes = wp.vec2(
+        wp.where(x > 0.0 and x < last_x, scale[0], 0.0), wp.where(y > 0.0 and y < last_y, scale[1], 0.0)
+    )
+    x = wp.clamp(x, 0.0, last_x)
+    y = wp.clamp(y, 0.0, last_y)
+    column = wp.min(int(x), wp.max(level[1] - 2, 0))
+    row = wp.min(int(y), wp.max(level[2] - 2, 0))
+    corners.s = x - float(column)
+    corners.t = y - float(row)
+    corners.right = wp.min(level[1] - 1, 1)
+    corners.above = level[0] + row * level[1] + column
+    corners.below = corners.above + wp.where(level[2] > 1, level[1], 0)
+    return corners
+
+
+@wp.func
+def _between(texels: wp.array(dtype=wp.vec3), corners: _Corners):
+    above = (1.0 - corners.s) * texels[corners.above] + corners.s * texels[corners.above + corners.right]
+    below = (1.0 - corners.s) * texels[corners.below] + corners.s * texels[corners.below + corners.right]
+    return (1.0 - corners.t) * above + corners.t * below
+
+
+@wp.func
+def _slopes_between(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj: wp.vec3):
+    """Slopes of the dot product with a color, by the texel of the finest level."""
+    a = wp.dot(adj, texels[corners.above])
+    b = wp.dot(adj, texels[corners.above + corners.right])
+    c = wp.dot(adj, texels[corners.below])
+    d = wp.dot(adj, texels[corners.below + corners.right])
+    slope_u = (1.0 - corners.t) * (b - a) + corners.t * (d - c)
+    down = (1.0 - corners.s) * (c - a) + corners.s * (d - b)
+    return wp.vec2(corners.slopes[0] * slope_u, corners.slopes[1] * down)
+
+
+@wp.func
+def fetch(texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, spot: TexelFootprint):
+    """Mean over a footprint, in the mip levels from ``first_level`` on."""
+    value = _between(texels, _find_corners(scene, first_level + spot.level, spot.texel))
+    if spot.part > 0.0:
+        coarse = _between(texels, _find_corners(scene, first_level + spot.level + 1, spot.texel))
+        value = (1.0 - spot.part) * value + spot.part * coarse
+    return value
+
+
+@wp.func
+def fetch_adjoint(
+    texels: wp.array(dtype=wp.vec3),
+    grid: PlaneGrid,
+    scene: PlaneArrays,
+    first_level: int,
+    footprint: PlaneFootprint,
+    spot: TexelFootprint,
+    adj: wp.vec3,
+):
+    """Gradients of the place, and of the logarithm of t / √c′, as which the footprint is wide."""
+    fine = _find_corners(scene, first_level + spot.level, spot.texel)
+    slopes = _slopes_between(texels, fine, adj)
+    adj_log = float(0.0)
+    if spot.part > 0.0:
+        coarse = _find_corners(scene, first_level + spot.level + 1, spot.texel)
+        slopes = (1.0 - spot.part) * slopes + spot.part * _slopes_between(texels, coarse, adj)
+        adj_log = spot.part_slope * wp.dot(adj, _between(texels, coarse) - _between(texels, fine))
+    adj_x = slopes[0] * spot.slopes[0]
+    adj_y = slopes[1] * spot.slopes[1]
+    if adj_log != 0.0:
+        adj_x += adj_log * grid.per_spread * _log_slope(footprint.center[0] * grid.per_spread)
+        adj_y += adj_log * grid.per_spread * _log_slope(footprint.center[1] * grid.per_spread)
+    return wp.vec3(adj_x, adj_y, adj_log)
+
+
+@wp.func
+def scatter(
+    adj_texels: wp.array(dtype=wp.vec3), scene: PlaneArrays, first_level: int, spot: TexelFootprint, adj: wp.vec3
+):
+    """Add to the gradients of texels: the adjoint of :func:`fetch` by its values."""
+    part = 1.0 - spot.part
+    for coarser in range(2):
+        if part > 0.0:
+            c = _find_corners(scene, first_level + spot.level + coarser, spot.texel)
+            above = (part * (1.0 - c.t)) * adj
+            below = (part * c.t) * adj
+            wp.atomic_add(adj_texels, c.above, (1.0 - c.s) * above)
+            wp.atomic_add(adj_texels, c.above + c.right, c.s * above)
+            wp.atomic_add(adj_texels, c.below, (1.0 - c.s) * below)
+            wp.atomic_add(adj_texels, c.below + c.right, c.s * below)
+        part = spot.part

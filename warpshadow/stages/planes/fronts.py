@@ -1,0 +1,273 @@
+"""Fronts: which side of a plane receivers are on.
+
+Where bodies touch, as two walls at their seam or a box and the ground that it stands on, points lie in the plane of
+another body, or within float32 of it. They are on the side on which their own body lies. Of a receiver at height h and
+of normal n, on a body that reaches from height l to height u over a plane with normal N,
+
+    front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
+
+S is the smoothstep of :mod:`.cells`, and m its margin, a thousandth of a texel. Over so short a way a front changes by
+a step, so the last term has no gradient: with one, a row of vertices of a wall in the plane of a ground had 280 times
+the gradient that it has beside it. So a body that is wholly in front has all its receivers in front, and one through
+which the plane passes has them where they are. Of a body in the same plane their normals decide.
+
+Where two or three planes meet, a receiver on the seam must see each of them as one before it does: at its own place it
+is at the border of both, and half of each would cover nothing. So receivers within 2 k of planes are lit where they are
+lifted to, off all of them, k = 5 m:
+
+    x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
+
+A body that has sunk into a ground a little has sources of bounced light on its surface below. A point there gets the
+light of the ground's back: the light of the sky there. But receivers do not see the sources, they see spheres. So a
+source is on the side of a plane on which the blocker nearest to its patch is:
+
+    front = S(1.25 (h + c) / r)
+
+c is the height of that sphere's center, and r its radius. A sphere that touches a plane from above has all its sources
+in front, and one that touches it from below, behind; 1.25 leaves room for spheres that bulge out of their mesh. So the
+light at a source changes over the depth of a sphere. With a margin of a tenth of a texel it jumped: the gradient of a
+ball that touches a ground held for steps of 1/5000 of its radius.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.stages.planes.cells import step
+from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
+
+_ROOM = wp.constant(1.25)
+"""A source is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
+
+_LIFT = wp.constant(5.0)
+"""How far receivers in a plane are lifted off it, in its margins."""
+
+_TINY = wp.constant(1.0e-18)
+"""Radius up to which a sphere blocks nothing."""
+
+
+class NearestBlockers(NamedTuple):
+    """Of each source of light the sphere that blocks light nearest to its patch."""
+
+    centers: wp.array  # [batch, sphere] vec3
+    radii: wp.array  # [batch, sphere] float32
+    numbers: wp.array  # [point] int32, the sphere of each; −1 for none
+
+    def part(self, part: slice) -> NearestBlockers:
+        """The same of some points."""
+        return self._replace(numbers=self.numbers[part])
+
+
+@wp.func
+def _height(point: wp.vec3, frames: wp.array2d(dtype=wp.vec3), instance: int, f: int):
+    """Height of a point over a plane that has an area [units of the body]."""
+    axis_u = frames[instance, 3 * f + 1]
+    up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+    return wp.dot(point - frames[instance, 3 * f], up) / wp.length(axis_u)
+
+
+@wp.func
+def _over_margin(height: float, margin: float):
+    """Height in half margins; without a gradient, since over so short a way fronts change by a step."""
+    return 2.0 * height / margin
+
+
+@wp.func_grad(_over_margin)
+def _over_margin_adjoint(height: float, margin: float, adj_result: float):
+    return
+
+
+@wp.kernel(enable_backward=False)
+def _find_extremes(
+    # in
+    corners: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    # out
+    extremes: wp.array2d(dtype=wp.vec2i),
+):
+    """A thread owns an instance and a plane."""
+    batch, f = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    up = wp.cross(frames[instance, 3 * f + 1], frames[instance, 3 * f + 2])
+    lowest, highest = int(0), int(0)
+    of_corners = instance_in(batch, corners.shape[0])
+    first = corners[of_corners, 0]
+    minimum, maximum = float(0.0), float(0.0)
+    for corner in range(1, corners.shape[1]):
+        height = wp.dot(corners[of_corners, corner] - first, up)
+        if height < minimum:
+            lowest, minimum = corner, height
+        if height > maximum:
+            highest, maximum = corner, height
+    extremes[batch, f] = wp.vec2i(lowest, highest)
+
+
+@wp.kernel
+def _find_leanings(
+    # in
+    corners: wp.array2d(dtype=wp.vec3),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=PlaneGrid),
+    extremes: wp.array2d(dtype=wp.vec2i),
+    # out
+    leanings: wp.array2d(dtype=wp.float32),
+):
+    """A thread owns an instance and a plane."""
+    batch, f = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    leaning = float(0.0)
+    if wp.length_sq(frames[instance, 3 * f + 1]) > 0.0:
+        of_corners = instance_in(batch, corners.shape[0])
+        low = _height(corners[of_corners, extremes[batch, f][0]], frames, instance, f)
+        high = _height(corners[of_corners, extremes[batch, f][1]], frames, instance, f)
+        leaning = wp.clamp((high + low) / wp.max(high - low, grids[f].margin), -1.0, 1.0)
+    leanings[batch, f] = leaning
+
+
+@wp.kernel
+def _find_fronts(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    leanings: wp.array2d(dtype=wp.float32),
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    numbers: wp.array(dtype=wp.int32),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=PlaneGrid),
+    # out
+    fronts: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a point of an instance and a plane."""
+    batch, receiver, f = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    axis_u = frames[instance, 3 * f + 1]
+    front = float(0.0)
+    if wp.length_sq(axis_u) > 0.0:
+        height = _height(points[instance_in(batch, points.shape[0]), receiver], frames, instance, f)
+        number = int(-1)
+        if numbers:
+            number = numbers[receiver]
+        radius = float(0.0)
+        if number >= 0:
+            radius = radii[instance_in(batch, radii.shape[0]), number] / wp.length(axis_u)
+        if radius > _TINY:
+            middle = _height(centers[instance_in(batch, centers.shape[0]), number], frames, instance, f)
+            if _ROOM * wp.abs(height + middle) < radius:
+                front = step(_ROOM * (height + middle) / radius)
+            else:
+                front = wp.where(height + middle > 0.0, 1.0, 0.0)
+        elif wp.abs(height) < 2.0 * grids[f].margin:
+            leaning = float(1.0)
+            if leanings:
+                leaning = leanings[instance_in(batch, leanings.shape[0]), f]
+            up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+            facing = wp.dot(normals[instance_in(batch, normals.shape[0]), receiver], up)
+            front = step(leaning + (1.0 - leaning * leaning) * facing + _over_margin(height, grids[f].margin))
+        else:
+            front = wp.where(height > 0.0, 1.0, 0.0)
+    fronts[batch, receiver, f] = front
+
+
+def find_fronts(
+    points: wp.array,
+    normals: wp.array,
+    corners: wp.array | None,
+    spheres: NearestBlockers | None,
+    frames: wp.array,
+    planes: PlaneBlockers,
+) -> wp.array:
+    """Part of the front of each plane that receivers see; of the back they see the rest.
+
+    Args:
+        points: The receivers [scene units], vec3 of shape [batch, receiver].
+        normals: Their unit normals, vec3 of shape [batch, receiver].
+        corners: Vertices of their body that are farthest out [scene units], vec3 of shape [batch, corner]. None
+            where it is not known: receivers are in front down to the plane itself.
+        spheres: The blockers nearest to sources of light; None where no receiver is one.
+        frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
+            may be 1.
+        planes: The planes.
+
+    Returns:
+        Float32 of shape [batch, receiver, plane], 0 to 1.
+
+    Differentiable: points, normals, corners, centers and radii of spheres, frames.
+    """
+    centers, radii, numbers = (None, None, None) if spheres is None else spheres
+    check.shape("normals", normals.shape, ("batch", points.shape[1]))
+    check.shape("frames", frames.shape, ("batch", 3 * planes.count))
+    if numbers is not None:
+        check.shape("numbers", numbers.shape, (points.shape[1],))
+    arguments = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
+    count = common_batch({**arguments, "corners": corners})
+    leanings = None if corners is None else _leanings(corners, frames, planes)
+    fronts = wp.empty((count, points.shape[1], planes.count), dtype=wp.float32, device=points.device)
+    inputs = [points, normals, leanings, centers, radii, numbers, frames, planes.grids]
+    launch(_find_fronts, fronts.shape, inputs=inputs, outputs=[fronts])
+    return fronts
+
+
+def _leanings(corners: wp.array, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+    """On which side of each plane a body lies, b, float32 of shape [batch, plane]. Differentiable: corners, frames."""
+    count = common_batch({"corners": corners, "frames": frames})
+    extremes = wp.empty((count, planes.count), dtype=wp.vec2i, device=corners.device)
+    launch(_find_extremes, extremes.shape, inputs=[corners, frames], outputs=[extremes])
+    leanings = wp.empty((count, planes.count), dtype=wp.float32, device=corners.device)
+    inputs = [corners, frames, planes.grids, extremes]
+    launch(_find_leanings, leanings.shape, inputs=inputs, outputs=[leanings])
+    return leanings
+
+
+@wp.kernel
+def _lift(
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    fronts: wp.array3d(dtype=wp.float32),
+    frames: wp.array2d(dtype=wp.vec3),
+    grids: wp.array(dtype=PlaneGrid),
+    skip: int,
+    # out
+    lifted: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a point of an instance."""
+    batch, receiver = wp.tid()
+    instance = instance_in(batch, frames.shape[0])
+    point = points[instance_in(batch, points.shape[0]), receiver]
+    result = point
+    for f in range(grids.shape[0]):
+        axis_u = frames[instance, 3 * f + 1]
+        if f != skip and wp.length_sq(axis_u) > 0.0:
+            height = _height(point, frames, instance, f) / (2.0 * _LIFT * grids[f].margin)
+            if wp.abs(height) < 1.0:
+                near = 1.0 - height * height
+                up = wp.normalize(wp.cross(axis_u, frames[instance, 3 * f + 2]))
+                side = 2.0 * fronts[batch, receiver, f] - 1.0
+                result += side * near * near * _LIFT * grids[f].margin * wp.length(axis_u) * up
+    lifted[batch, receiver] = result
+
+
+def lifted_points(
+    points: wp.array, fronts: wp.array, frames: wp.array, planes: PlaneBlockers, skip: int | None
+) -> wp.array:
+    """Lift receivers off the planes in whose planes they lie.
+
+    Args:
+        points, frames, planes: As for :func:`find_fronts`.
+        fronts: Found by it.
+        skip: Number of the plane that the receivers are part of; None for none.
+
+    Returns:
+        Points, vec3 of shape [batch, receiver].
+
+    Differentiable: points, fronts, frames.
+    """
+    lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)
+    inputs = [points, fronts, frames, planes.grids, -1 if skip is None else skip]
+    launch(_lift, lifted.shape, inputs=inputs, outputs=[lifted])
+    return lifted

@@ -1,0 +1,186 @@
+"""Plane blockers: the bodies that lie in planes, such as a ground or walls, with the mip levels of their grids."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.stages.planes.grid import PlaneTexture, stretched
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+_MARGIN = 0.001
+"""Margin of planes, in widths of the smallest texel."""
+
+
+class PlaneBody(NamedTuple):
+    """A body with a grid, among all bodies."""
+
+    grid: PlaneTexture
+    positions: np.ndarray
+    """Its vertices at rest, in its own frame, shape [vertex, 3]."""
+    faces: np.ndarray
+    """Its faces, indices into all faces, shape [face, 3]."""
+    first_vertex: int
+    """Offset of its vertices among the vertices of all bodies."""
+    first_patch: int
+    """Offset of its patches among the patches of all bodies."""
+    blocks: bool
+    """Whether it casts shadows."""
+
+
+@wp.struct
+class PlaneGrid:
+    """A grid as kernels read it."""
+
+    least: wp.vec2  # corners of the rectangle [units of the body]
+    most: wp.vec2
+    texels: wp.vec2  # texels of the finest level for a unit of squeezed coordinates
+    first: wp.vec2  # texel at the origin
+    per_spread: float
+    margin: float
+    first_level: int  # of the front; the back's follow, if it has any
+    level_count: int
+    sides: int
+    is_whole: int  # the mesh covers the rectangle
+    blocks: int
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneBlockers:
+    """The flat bodies of a scene.
+
+    Args:
+        count: Number of planes.
+        blocking: The plane blockers.
+        grids: Their grids, of shape [plane].
+        levels: First texel, width and height of each mip level, for each side of each plane, vec3i of shape [level].
+        level_scales: Its texels for one of the finest level, vec2 of shape [level].
+        covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
+        texels_of_patches: Matrix of mip levels, [texel, patch]; None where no patches are given.
+        frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
+    """
+
+    count: int
+    blocking: tuple[int, ...]
+    grids: wp.array
+    levels: wp.array
+    level_scales: wp.array
+    covered: wp.array
+    texels_of_patches: SparseMatrix | None
+    frames_of_vertices: SparseMatrix
+
+    @staticmethod
+    def of(bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike) -> PlaneBlockers:
+        """Prepare flat bodies, among bodies that have so many patches and vertices together; 0 if none sends light."""
+        from scipy.sparse import vstack
+
+        levels: list[tuple[int, int, int]] = []
+        scales: list[tuple[float, float]] = []
+        grids, covered, pyramids, frames, texel_count = [], [], [], [], 0
+        for body in bodies:
+            grid, first_level = body.grid, len(levels)
+            matrices = _halvings(*grid.covered.shape)
+            for side in range(grid.sides):
+                for matrix, (height, width) in matrices:
+                    levels.append((texel_count, width, height))
+                    scales.append((width / grid.covered.shape[1], height / grid.covered.shape[0]))
+                    texel_count += width * height
+                    covered.append(matrix @ grid.covered.ravel())
+                    if patch_count:
+                        first = body.first_patch + side * grid.covered.size
+                        pyramids.append(_shifted(matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count))
+            grids.append(_kernel_grid(body, first_level, len(matrices)))
+            frames.append(_frame_matrix(body, vertex_count))
+        return PlaneBlockers(
+            len(bodies),
+            tuple(number for number, body in enumerate(bodies) if body.blocks),
+            wp.array(grids, dtype=PlaneGrid, device=device),
+            wp.array(np.array(levels), dtype=wp.vec3i, device=device),
+            wp.array(np.array(scales), dtype=wp.vec2, device=device),
+            wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
+            SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
+            SparseMatrix.of(vstack(frames), device=device),
+        )
+
+    def frames(self, positions: wp.array) -> wp.array:
+        """Where planes are: origin, and both axes, each as long as the body's scale.
+
+        Args:
+            positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each flat count, so
+                bodies must be moved and scaled only, not bent.
+
+        Returns:
+            vec3 of shape [batch, 3 · plane].
+
+        Differentiable: positions.
+        """
+        return multiply(self.frames_of_vertices, positions)
+
+
+@functools.lru_cache(16)
+def _halvings(height: int, width: int) -> list[tuple[csr_matrix, tuple[int, int]]]:
+    """Matrices from a grid to each of its mip levels, each half as large as the one before, and their sizes.
+
+    Not to be written to: grids of different scenes are often of one size.
+    """
+    from scipy.sparse import kron
+
+    sizes = [(height, width)]
+    while max(sizes[-1]) > 1:
+        sizes.append((max(sizes[-1][0] // 2, 1), max(sizes[-1][1] // 2, 1)))
+    return [(kron(_means(height, rows), _means(width, columns)).tocsr(), (rows, columns)) for rows, columns in sizes]
+
+
+def _means(fine: int, coarse: int) -> csr_matrix:
+    """Means of ``fine`` equal texels in ``coarse`` ones of the same length in all."""
+    from scipy.sparse import csr_matrix
+
+    edges = np.arange(coarse + 1) * fine / coarse
+    texels = np.arange(fine)
+    overlap = np.minimum(edges[1:, None], texels + 1) - np.maximum(edges[:-1, None], texels)
+    return csr_matrix(np.maximum(overlap, 0) * coarse / fine)
+
+
+def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
+    """The matrix as part of one with ``count`` columns, from the column ``first`` on."""
+    from scipy.sparse import csr_matrix
+
+    return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
+
+
+def _kernel_grid(body: PlaneBody, first_level: int, level_count: int) -> PlaneGrid:
+    grid, flat = body.grid, PlaneGrid()
+    texels = np.array(grid.covered.shape[::-1]) / (grid.high - grid.low)
+    flat.least = wp.vec2(*(grid.spread * stretched(grid.low)))
+    flat.most = wp.vec2(*(grid.spread * stretched(grid.high)))
+    flat.texels, flat.first = wp.vec2(*texels), wp.vec2(*(-grid.low * texels))
+    flat.per_spread, flat.margin = 1 / grid.spread, _MARGIN * float(grid.texel_sizes().min())
+    flat.first_level, flat.level_count, flat.sides = first_level, level_count, grid.sides
+    flat.is_whole, flat.blocks = int((grid.covered == 1).all()), int(body.blocks)
+    return flat
+
+
+def _frame_matrix(body: PlaneBody, vertex_count: int) -> csr_matrix:
+    """Rows that combine three vertices, far apart, to a flat's origin and axes."""
+    from scipy.sparse import csr_matrix
+
+    vertices = np.unique(body.faces)
+    points = (body.positions[vertices].astype(np.float64) - body.grid.origin) @ body.grid.frame[:2].T
+    first = np.linalg.norm(points - points.mean(axis=0), axis=1).argmax()
+    second = np.linalg.norm(points - points[first], axis=1).argmax()
+    axis_u = points[second] - points[first]
+    third = np.abs(axis_u[0] * (points - points[first])[:, 1] - axis_u[1] * (points - points[first])[:, 0]).argmax()
+    chosen = [first, second, third]
+    # the rows w with Σ w = 1 and Σ w p = 0 for the origin, and Σ w = 0 and Σ w p = e for an axis e
+    system = np.concatenate([points[chosen].T, np.ones((1, 3))])
+    weights = np.linalg.solve(system, np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).T).T
+    columns = np.tile(body.first_vertex + vertices[chosen], 3)
+    return csr_matrix((weights.ravel(), (np.repeat(np.arange(3), 3), columns)), shape=(3, vertex_count))

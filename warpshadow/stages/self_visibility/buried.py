@@ -1,0 +1,104 @@
+"""Buried probes: points of a body that lie inside another part of it, as the root of a handle does in a cup.
+
+They are dark, but faces lead from them to where light is, and would darken it. So a buried probe copies the nearest
+unburied probe, along edges, as texels of light maps do (dilation).
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.launch import launch
+from warpshadow.maths.directions import fibonacci
+from warpshadow.stages.ray_tracing import nearest
+from warpshadow.stages.self_visibility.probes import VisibilityProbes
+from warpshadow.stages.self_visibility.trace import VisibilityRows
+
+_RAYS = 64
+"""Directions that tell on which side faces are met."""
+
+
+@wp.kernel(enable_backward=False)
+def _find_buried(
+    # in
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    probe_count: int,
+    directions: wp.array(dtype=wp.vec3),
+    bits: wp.array2d(dtype=wp.uint32),
+    # out
+    is_buried: wp.array(dtype=wp.bool),
+):
+    """A thread owns a row."""
+    row = wp.tid()
+    if bits:
+        for word in range(bits.shape[1]):
+            if bits[row, word] != wp.uint32(0):
+                is_buried[row] = False
+                return
+    outer = int(0)
+    inner = int(0)
+    for ray in range(directions.shape[0]):
+        if wp.dot(normals[row], directions[ray]) > 0.0:
+            hit = nearest(mesh, points[row], normals[row], directions[ray])
+            if hit.face >= 0:
+                if hit.is_back == (row >= probe_count):
+                    outer += 1
+                else:
+                    inner += 1
+            elif not bits:
+                is_buried[row] = False
+                return
+    is_buried[row] = inner > outer
+
+
+def find_buried(
+    mesh: wp.Mesh, points: np.ndarray, normals: np.ndarray, probe_count: int, rows: VisibilityRows | None = None
+) -> np.ndarray:
+    """Find the rows of probes that no ray escapes from, and whose rays mostly meet faces on their other side.
+
+    Args:
+        mesh: The mesh, in the frame of the points.
+        points: Probes, and their backs if they have any, [row, 3].
+        normals: Unit normals [row, 3].
+        probe_count: Number of probes.
+        rows: What they see, where that is known.
+
+    Returns:
+        Bool of shape [row].
+    """
+    device = mesh.points.device
+    places, facing, directions = (
+        wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
+    )
+    is_buried = wp.empty(len(points), dtype=wp.bool, device=device)
+    inputs = [mesh.id, places, facing, probe_count, directions, None if rows is None else rows.bits]
+    launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
+    return is_buried.numpy()
+
+
+def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray:
+    """For each row, the row it copies visibility from: itself, or its nearest unburied neighbor along edges.
+
+    Args:
+        probes: The probes.
+        is_buried: Bool of shape [row]: the probes, and their backs if they have any.
+
+    Returns:
+        Numbers of rows, int of shape [row]. A buried row from which no way leads to another kind keeps its own.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    dilation, probe_count = np.arange(len(is_buried)), len(probes.positions)
+    ends = np.unique(np.sort(probes.edges, axis=1), axis=0)
+    lengths = np.linalg.norm(probes.positions[ends[:, 0]] - probes.positions[ends[:, 1]], axis=1)
+    graph = csr_matrix((np.maximum(lengths, 1e-12), ends.T), (probe_count, probe_count))  # 0 is no edge
+    for first in range(0, len(is_buried), probe_count):
+        buried = is_buried[first : first + probe_count]
+        if buried.any() and not buried.all():
+            open_probes = np.flatnonzero(~buried)
+            *_, nearest_open = dijkstra(graph, False, open_probes, return_predecessors=True, min_only=True)
+            dilates = buried & (nearest_open >= 0)
+            dilation[first : first + probe_count][dilates] = first + nearest_open[dilates]
+    return dilation

@@ -1,0 +1,383 @@
+"""Self-transmittance of receivers past their own body, gathered from its rows.
+
+    T_self(x, q) = Σ_k w_qk Σ_j b_j S[row_j, c_qk]
+
+over the lookups of cell q (:mod:`.lookup`) and the three rows of the receiver with their weights b (:mod:`.probes`).
+It is found where the receiver's horizon is below, and 1 elsewhere, where the cosine is zero.
+
+Receivers of a group look up the same coarse cells, each in rows of its own. So these are first brought into lanes: then
+a lookup is one vector, where it would be bytes from all over memory. A single lane reads its bytes.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warpshadow.device.batch import common_batch, expand, instance_in
+from warpshadow.device.lanes import (
+    Chunk,
+    as_chunks,
+    block_count,
+    lane_count,
+    lane_type,
+    make_lane_functions,
+    module_options,
+    use_vector_registers,
+)
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
+from warpshadow.stages.self_visibility.probes import ProbeWeights
+from warpshadow.stages.self_visibility.trace import VisibilityRows
+
+_LOOKUP_COST = 0.2
+"""Nanoseconds that a lookup takes."""
+
+_MEAN_LOOKUPS = 6
+"""Lookups of a cell, for the cost."""
+
+_WORD = wp.constant(4)
+"""Coarse cells of a word of 32 bits."""
+
+
+@functools.cache
+def _probes_type(lanes: int) -> Any:
+    """Struct of where a group of receivers lies."""
+    Rows = wp.types.matrix(shape=(3, lanes), dtype=wp.int32)
+    Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+
+    @wp.struct
+    class ProbeLanes:
+        rows: Rows  # of each corner, the first of them thrice where all receivers are vertices
+        weights: Weights
+        corner_count: int  # 1 where all receivers are vertices
+
+    return ProbeLanes
+
+
+class _ProbeFunctions(NamedTuple):
+    """Kernel functions on the probes of a group."""
+
+    load_probes: wp.Function
+    spread: wp.Function
+    look: wp.Function
+
+
+@functools.cache
+def _make_probe_functions(lanes: int) -> _ProbeFunctions:
+    """Make the kernel functions for a number of lanes."""
+    Lane, ProbeLanes = lane_type(lanes), _probes_type(lanes)
+    Rows = wp.types.vector(length=lanes, dtype=wp.int32)
+
+    @wp.func
+    def load_probes(
+        all_rows: wp.array2d(dtype=wp.vec3i), all_weights: wp.array2d(dtype=wp.vec3), batch: int, group: int
+    ):
+        rows = all_rows[instance_in(batch, all_rows.shape[0])]
+        weights = all_weights[instance_in(batch, all_weights.shape[0])]
+        probes = ProbeLanes()
+        probes.corner_count = 1
+        for lane in range(lanes):
+            receiver = wp.min(group * lanes + lane, rows.shape[0] - 1)
+            row = rows[receiver]
+            weight = wp.vec3(1.0, 0.0, 0.0)
+            if row[0] != row[1] or row[0] != row[2]:
+                weight = weights[receiver]
+                probes.corner_count = 3
+            for corner in range(3):
+                probes.rows[corner, lane] = row[corner]
+                probes.weights[corner, lane] = weight[corner]
+        return probes
+
+    # In plain Warp, which finds the address of each word by itself, it takes six times as long.
+    @wp.func_native(f"""
+    const wp::float32 unit = 1.0 / 255.0;
+    for (int word = 0; word < words.shape[1]; ++word) {{
+        unsigned packed[{lanes}];
+        for (int lane = 0; lane < {lanes}; ++lane)
+            packed[lane] = wp::index(words, rows.c[lane], word);
+        for (int part = 0; part < {_WORD}; ++part) {{
+            auto& share = wp::index(shares, word * {_WORD} + part);
+            for (int lane = 0; lane < {lanes}; ++lane)
+                share.c[lane] += weights.c[lane] * ((wp::float32)((packed[lane] >> 8 * part) & 255) * unit);
+        }}
+    }}
+    """)
+    def spread(rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), shares: wp.array(dtype=Lane)):
+        """shares[cell] += weight · S of all coarse cells in a row of each receiver."""
+        ...
+
+    @wp.func
+    def look(
+        rows: Rows, of_rays: int, index: int, bits: wp.array2d(dtype=wp.uint32), words: wp.array2d(dtype=wp.uint32)
+    ):
+        """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
+        share = Lane()
+        for lane in range(lanes):
+            if of_rays == 1:
+                share[lane] = float(int((bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
+            else:
+                word = words[rows[lane], index // _WORD]
+                byte = (word >> wp.uint32(8 * (index % _WORD))) & wp.uint32(255)
+                share[lane] = float(int(byte)) * (1.0 / 255.0)
+        return share
+
+    return _ProbeFunctions(load_probes, spread, look)
+
+
+@functools.cache
+def _make_gather(lanes: int) -> wp.Kernel:
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    load_probes, spread, look = _make_probe_functions(lanes)
+    find_block, load, store_columns = fn.find_block, fn.load, fn.store_columns
+    dot_direction, is_any_above = fn.dot_direction, fn.is_any_above
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def gather(
+        first_row: int,
+        worker: int,
+        # in
+        normals: wp.array2d(dtype=wp.vec3),
+        rows: wp.array2d(dtype=wp.vec3i),
+        place_weights: wp.array2d(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        looks_at_rays: wp.array(dtype=wp.int32),
+        all_counts: wp.array2d(dtype=wp.int32),
+        all_indices: wp.array3d(dtype=wp.int32),
+        all_weights: wp.array3d(dtype=wp.float32),
+        bits: wp.array2d(dtype=wp.uint32),
+        words: wp.array2d(dtype=wp.uint32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        own: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers."""
+        item = first_row + wp.tid()
+        batch, group = find_block(item, own.shape[1])
+        normal = load(normals[instance_in(batch, normals.shape[0])], group)
+        probes = load_probes(rows, place_weights, batch, group)
+        turn = instance_in(batch, all_counts.shape[0])
+        shares = scratch[scratch_place(worker, item), 0]
+        columns = scratch[scratch_place(worker, item), 1]
+        if wp.static(lanes > 1):
+            for cell in range(shares.shape[0]):
+                shares[cell] = Lane(0.0)
+            for corner in range(probes.corner_count):
+                spread(probes.rows[corner], probes.weights[corner], words, shares)
+        for q in range(directions.shape[0]):
+            passing = Lane(0.0)
+            cosine = dot_direction(directions[q], normal)
+            if is_any_above(cosine, 0.0):
+                indices = all_indices[turn, q]
+                weights = all_weights[turn, q]
+                of_rays = looks_at_rays[q]
+                if wp.static(lanes == 1) or of_rays == 1:
+                    for k in range(all_counts[turn, q]):
+                        for corner in range(probes.corner_count):
+                            share = look(probes.rows[corner], of_rays, indices[k], bits, words)
+                            passing += weights[k] * wp.cw_mul(probes.weights[corner], share)
+                else:
+                    for k in range(all_counts[turn, q]):
+                        passing += weights[k] * shares[indices[k]]
+            for lane in range(lanes):
+                passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
+            if wp.static(lanes == 1):
+                own[batch, group, q] = passing[0]
+            else:
+                columns[q] = passing
+        if wp.static(lanes > 1):
+            store_columns(columns, 0, directions.shape[0], group, own[batch])
+
+    return gather
+
+
+@functools.cache
+def _make_gather_adjoint(lanes: int) -> wp.Kernel:
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    load_probes, spread, look = _make_probe_functions(lanes)
+    find_block, load, dot_direction, is_any_above, total = (
+        fn.find_block,
+        fn.load,
+        fn.dot_direction,
+        fn.is_any_above,
+        fn.total,
+    )
+    Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+
+    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    def gather_adjoint(
+        first_row: int,
+        worker: int,
+        # in
+        normals: wp.array2d(dtype=wp.vec3),
+        rows: wp.array2d(dtype=wp.vec3i),
+        place_weights: wp.array2d(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        looks_at_rays: wp.array(dtype=wp.int32),
+        all_counts: wp.array2d(dtype=wp.int32),
+        all_indices: wp.array3d(dtype=wp.int32),
+        all_weights: wp.array3d(dtype=wp.float32),
+        bits: wp.array2d(dtype=wp.uint32),
+        words: wp.array2d(dtype=wp.uint32),
+        adj_own: wp.array3d(dtype=wp.float32),
+        # scratch
+        scratch: wp.array3d(dtype=Lane),
+        # out
+        adj_place_weights: wp.array2d(dtype=wp.vec3),
+        adj_all_weights: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a group of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
+
+        The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
+        """
+        item = first_row + wp.tid()
+        batch, group = find_block(item, adj_own.shape[1])
+        normal = load(normals[instance_in(batch, normals.shape[0])], group)
+        probes = load_probes(rows, place_weights, batch, group)
+        turn = instance_in(batch, all_counts.shape[0])
+        place = scratch_place(worker, item)
+        shares = scratch[place, 0]
+        adj_shares = scratch[place, 1]
+        if wp.static(lanes > 1):
+            for cell in range(shares.shape[0]):
+                shares[cell] = Lane(0.0)
+                adj_shares[cell] = Lane(0.0)
+            for corner in range(probes.corner_count):
+                spread(probes.rows[corner], probes.weights[corner], words, shares)
+        receiver_count = wp.min(lanes, adj_own.shape[1] - group * lanes)
+        adj_place = Weights()
+        for q in range(directions.shape[0]):
+            cosine = dot_direction(directions[q], normal)
+            if is_any_above(cosine, 0.0):
+                adj = Lane()
+                for lane in range(receiver_count):
+                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, group * lanes + lane, q], 0.0)
+                indices = all_indices[turn, q]
+                weights = all_weights[turn, q]
+                of_rays = looks_at_rays[q]
+                if wp.static(lanes == 1) or of_rays == 1:
+                    for k in range(all_counts[turn, q]):
+                        for corner in range(probes.corner_count):
+                            pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], bits, words))
+                            adj_place[corner] += weights[k] * pull
+                            if adj_all_weights:
+                                adj_weight = total(wp.cw_mul(probes.weights[corner], pull))
+                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                else:
+                    for k in range(all_counts[turn, q]):
+                        adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
+                        if adj_all_weights:
+                            wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
+        if adj_place_weights:
+            for corner in range(probes.corner_count):
+                adj_corner = adj_place[corner]
+                if wp.static(lanes > 1):
+                    for cell in range(shares.shape[0]):
+                        shares[cell] = Lane(0.0)
+                    spread(probes.rows[corner], Lane(1.0), words, shares)
+                    for cell in range(shares.shape[0]):
+                        adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
+                for lane in range(receiver_count):
+                    receiver = group * lanes + lane
+                    gained = wp.vec3()
+                    gained[corner] = adj_corner[lane]
+                    adj_place_weights[batch, receiver] = adj_place_weights[batch, receiver] + gained
+
+    return gather_adjoint
+
+
+def _as_words(cells: wp.array) -> wp.array:
+    """View rows of bytes as rows of words."""
+    row_count, count = cells.shape
+    words = wp.array(ptr=cells.ptr, dtype=wp.uint32, shape=(row_count, count // _WORD), device=cells.device)
+    words.viewed = cells  # the memory stays while the view does
+    return words
+
+
+def gather_self_transmittance(
+    normals: wp.array, places: ProbeWeights, lookup: ResamplingWeights, kernels: ResamplingKernels, rows: VisibilityRows
+) -> wp.array:
+    """Gather the self-visibility of a body's receivers.
+
+    Args:
+        normals: Unit normals of the receivers, vec3 of shape [batch, receiver].
+        places: Where they lie on the body.
+        lookup: Lookups of the cells of directions.
+        kernels: From which the lookup is.
+        rows: Visibility of the probes.
+
+    Returns:
+        Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
+
+    Differentiable: weights of places and of the lookup. Not: normals (they only cut off directions below the horizon).
+    """
+    count = common_batch({"normals": normals, "places": places.rows, "rotations": lookup.counts})
+    direction_count = kernels.directions.size
+    shape = count, normals.shape[1], direction_count
+    if places.weights.requires_grad:
+        places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
+    lanes = lane_count(normals.device)
+    words = _as_words(rows.cells)
+    inputs = [normals, *places, kernels.directions, kernels.looks_at_rays, *lookup, rows.bits, words]
+    row_count = count * block_count(shape[1], lanes)
+    cell_count = max(_WORD * words.shape[1], direction_count) if lanes > 1 else 1
+    scratch = [Scratch((2, cell_count), lane_type(lanes))]
+    cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
+    return differentiable(
+        lambda own: launch(_make_gather(lanes), row_count, inputs=inputs, scratch=scratch, outputs=[own], cost=cost),
+        lambda adj_own: launch(
+            _make_gather_adjoint(lanes),
+            row_count,
+            inputs=[*inputs, adj_own],
+            scratch=scratch,
+            outputs=[places.weights.grad],
+            sums=[lookup.weights.grad],
+            cost=2 * cost,
+        ),
+        result=wp.empty(shape, dtype=wp.float32, device=normals.device),
+        variables=[places.weights, lookup.weights],
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _add_products(
+    # in
+    factors: wp.array3d(dtype=Chunk),
+    values: wp.array3d(dtype=Chunk),
+    # out
+    products: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver, to whose products it adds."""
+    batch, receiver = wp.tid()
+    for chunk in range(products.shape[2]):
+        products[batch, receiver, chunk] = products[batch, receiver, chunk] + wp.cw_mul(
+            factors[batch, receiver, chunk], values[batch, receiver, chunk]
+        )
+
+
+def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
+    """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
+    if own.device.is_cpu:
+        use_vector_registers(__name__)
+
+    def add_product(first: wp.array, second: wp.array, total: wp.array) -> None:
+        launch(
+            _add_products,
+            own.shape[:2],
+            inputs=[as_chunks(first), as_chunks(second)],
+            outputs=[as_chunks(total)],
+        )
+
+    def adjoint(adj: wp.array) -> None:
+        for factor, other in ((own, others), (others, own)):
+            if factor.requires_grad:
+                add_product(other, adj, factor.grad)
+
+    return differentiable(
+        lambda product: add_product(own, others, product),
+        adjoint,
+        result=wp.zeros(own.shape, dtype=wp.float32, device=own.device),
+        variables=[own, others],
+    )

@@ -1,0 +1,227 @@
+"""Lookups: which rays or cells of a body, turned by R, lie under each cell of directions of the world.
+
+World direction ω is direction d = Rᵀω / |Rᵀω| of the body. It reads the rays or coarse cells within an angle h of d:
+
+    T_self = Σ_k w_k S_k,  w_k ∝ x_k²,  x_k = max(0, (c_k·d − cos h) / (1 − cos h)),  Σ w_k = 1,
+
+c_k the directions of rays or coarse cells, and S_k whether they are open. The weights are C¹ in R.
+
+h follows the light. Weights have a mean squared angle of h²/4, and the cells under them have ρ²/2, where ρ = 2/√C is
+the radius of one of C cells; an evenly bright cap of half-angle s has s²/2. So h² = 2 (s² − ρ²). A cell with a sun so
+looks at few rays, an evenly bright one at some 6 coarse cells. h is at least 2.2 ρ, so that something is always near.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.stages.self_visibility.trace import RUN
+
+_LEAST_REACH = 2.2
+"""Least h, in radii of the coarse cells."""
+
+_MOST_RAYS = 32
+"""Rays that a cell looks up on average at most; a wider one looks up coarse cells."""
+
+_CELL_COST = 1000.0
+"""Nanoseconds that a cell takes. Instances are shared by threads."""
+
+
+class ResamplingKernels(NamedTuple):
+    """Where each cell of directions looks.
+
+    Args:
+        directions: Unit vectors ω, vec3 of shape [direction].
+        reaches: cos h, float32 of shape [direction].
+        looks_at_rays: Whether it looks at rays, 1, or at coarse cells, 0: int32 of shape [direction].
+        rays, cells: Directions of rays and of coarse cells in the body's frame, vec3.
+        most: Lookups of a cell at most.
+    """
+
+    directions: wp.array
+    reaches: wp.array
+    looks_at_rays: wp.array
+    rays: wp.array
+    cells: wp.array
+    most: int
+
+
+def find_resampling_kernels(
+    directions: np.ndarray, spreads: np.ndarray | None, ray_count: int, device: wp.Device
+) -> ResamplingKernels:
+    """Choose where cells look.
+
+    Args:
+        directions: Unit vectors ω [direction, 3].
+        spreads: Half-angles s of where their light comes from [radians], [direction]; None for even cells.
+        ray_count: Rays of a probe.
+        device: Where lookups are made.
+    """
+    count, cell_count = len(directions), ray_count // RUN
+    spreads = np.full(count, cell_radius(count)) if spreads is None else np.minimum(spreads, cell_radius(count))
+    of_rays, of_cells = (
+        np.maximum(np.sqrt(2 * np.maximum(spreads**2 - radius**2, 0)), _LEAST_REACH * radius)
+        for radius in map(cell_radius, (ray_count, cell_count))
+    )
+    looks_at_rays = ray_count * (1 - np.cos(of_rays)) / 2 <= _MOST_RAYS
+    reaches = np.cos(np.where(looks_at_rays, of_rays, of_cells))
+    counts = np.where(looks_at_rays, ray_count, cell_count) * (1 - reaches) / 2
+    rays = fibonacci(ray_count)
+    cells = rays.reshape(cell_count, RUN, 3).sum(axis=1)
+    cells /= np.linalg.norm(cells, axis=1, keepdims=True)
+    return ResamplingKernels(
+        constant(np.asarray(directions), wp.vec3, device),
+        constant(reaches, wp.float32, device),
+        constant(looks_at_rays.astype(np.int32), wp.int32, device),
+        constant(rays, wp.vec3, device),
+        constant(cells, wp.vec3, device),
+        int(1.4 * counts.max() + 8),
+    )
+
+
+class ResamplingWeights(NamedTuple):
+    """Resampling weights of each cell of directions under a rotation.
+
+    Args:
+        counts: Number of lookups, int32 of shape [batch, direction].
+        indices: Rays or coarse cells, int32 of shape [batch, direction, most].
+        weights: Their weights, float32 of shape [batch, direction, most]; 0 after the last.
+    """
+
+    counts: wp.array
+    indices: wp.array
+    weights: wp.array
+
+
+@wp.func
+def _body_direction(rotation: wp.mat33, direction: wp.vec3):
+    """Find d·|Rᵀω|."""
+    return wp.transpose(rotation) * direction
+
+
+@wp.func
+def _height(cosine: float, reach: float):
+    """Find x_k."""
+    return wp.max(0.0, (cosine - reach) / (1.0 - reach))
+
+
+@wp.kernel(enable_backward=False)
+def _find_lookups(
+    first_row: int,
+    worker: int,
+    # in
+    rotations: wp.array2d(dtype=wp.mat33),
+    body: int,
+    directions: wp.array(dtype=wp.vec3),
+    reaches: wp.array(dtype=wp.float32),
+    looks_at_rays: wp.array(dtype=wp.int32),
+    rays: wp.array(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.vec3),
+    # out
+    counts: wp.array2d(dtype=wp.int32),
+    indices: wp.array3d(dtype=wp.int32),
+    weights: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a cell of directions of an instance."""
+    row, direction = wp.tid()
+    batch = first_row + row
+    toward = wp.normalize(_body_direction(rotations[batch, body], directions[direction]))
+    reach = reaches[direction]
+    candidates = cells
+    if looks_at_rays[direction] == 1:
+        candidates = rays
+    count = int(0)
+    total = float(0.0)
+    for candidate in range(candidates.shape[0]):
+        height = _height(wp.dot(candidates[candidate], toward), reach)
+        if height > 0.0 and count < weights.shape[2]:
+            indices[batch, direction, count] = candidate
+            weights[batch, direction, count] = height * height
+            total += height * height
+            count += 1
+    counts[batch, direction] = count
+    for k in range(weights.shape[2]):
+        if k < count:
+            weights[batch, direction, k] = weights[batch, direction, k] / total
+        else:
+            indices[batch, direction, k] = 0
+            weights[batch, direction, k] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def _find_lookups_adjoint(
+    # in
+    rotations: wp.array2d(dtype=wp.mat33),
+    body: int,
+    directions: wp.array(dtype=wp.vec3),
+    reaches: wp.array(dtype=wp.float32),
+    looks_at_rays: wp.array(dtype=wp.int32),
+    rays: wp.array(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.vec3),
+    counts: wp.array2d(dtype=wp.int32),
+    indices: wp.array3d(dtype=wp.int32),
+    weights: wp.array3d(dtype=wp.float32),
+    adj_weights: wp.array3d(dtype=wp.float32),
+    # out
+    adj_rotations: wp.array2d(dtype=wp.mat33),
+):
+    """A thread owns a cell of directions of an instance.
+
+    With v = Rᵀω and S = Σ x²:  x̄_k = 2 x_k (w̄_k − Σ w̄ w) / S,  d̄ = Σ x̄_k c_k / (1 − cos h),
+    v̄ = (d̄ − d d·d̄) / |v|,  R̄ += ω v̄ᵀ
+    """
+    batch, direction = wp.tid()
+    body_direction = _body_direction(rotations[batch, body], directions[direction])
+    toward = wp.normalize(body_direction)
+    reach = reaches[direction]
+    candidates = cells
+    if looks_at_rays[direction] == 1:
+        candidates = rays
+    total = float(0.0)
+    mean = float(0.0)
+    for k in range(counts[batch, direction]):
+        height = _height(wp.dot(candidates[indices[batch, direction, k]], toward), reach)
+        total += height * height
+        mean += adj_weights[batch, direction, k] * weights[batch, direction, k]
+    adj_toward = wp.vec3()
+    for k in range(counts[batch, direction]):
+        candidate = candidates[indices[batch, direction, k]]
+        height = _height(wp.dot(candidate, toward), reach)
+        adj_toward += 2.0 * height * (adj_weights[batch, direction, k] - mean) / total / (1.0 - reach) * candidate
+    adj_along = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(body_direction)
+    wp.atomic_add(adj_rotations, batch, body, wp.outer(directions[direction], adj_along))
+
+
+def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingKernels) -> ResamplingWeights:
+    """Find the resampling weights of cells of directions.
+
+    Args:
+        rotations: R of each body, mat33 of shape [batch, body].
+        body: Whose is meant.
+        kernels: Where cells look.
+
+    Differentiable: rotations.
+    """
+    shape = len(rotations), kernels.directions.size
+    device = rotations.device
+    counts = wp.empty(shape, dtype=wp.int32, device=device)
+    indices = wp.empty((*shape, kernels.most), dtype=wp.int32, device=device)
+    inputs = [rotations, body, *kernels[:5]]
+    weights = differentiable(
+        lambda weights: launch(
+            _find_lookups, shape, inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
+        ),
+        lambda adj_weights: launch(
+            _find_lookups_adjoint,
+            shape,
+            inputs=[*inputs, counts, indices, weights, adj_weights],
+            outputs=[rotations.grad],
+        ),
+        result=wp.empty((*shape, kernels.most), dtype=wp.float32, device=device),
+        variables=[rotations],
+    )
+    return ResamplingWeights(counts, indices, weights)

@@ -1,0 +1,170 @@
+"""Sun cells: self-visibility of receivers in the brightest cells, by rays from each.
+
+Between probes the sharp edge of a sun's shadow is interpolated, and has teeth. With ``self_shadows = "rays"`` each
+receiver at a pixel, which then has no gradient to a rotation, sends 16 rays ω_r, drawn from the light of the cell, as a
+packet in the frame of the body:
+
+    T_self = Σ_r V_r max(n·ω_r, 0) / Σ_r max(n·ω_r, 0)
+
+A receiver is put where the corners of its piece interpolate it to, in the frame of the body.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
+from warpshadow.maths.directions import CHUNK
+from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
+from warpshadow.stages.self_visibility.probes import ProbeWeights
+
+_PACKET_COST = 2000.0
+"""Nanoseconds that a packet takes."""
+
+_BRIGHT = 0.05
+"""Share of all light that a sun cell has at least."""
+
+
+class SunCells(NamedTuple):
+    """The brightest cells.
+
+    Args:
+        directions: Rays to their light, unit vectors of shape [16, 16, 3], with the rays of some cells repeated.
+        places: Index of each cell among them, −1 for cells that are not bright: [direction].
+    """
+
+    directions: np.ndarray
+    places: np.ndarray
+
+
+def find_sun_cells(power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]) -> SunCells | None:
+    """Find the sun cells of a light, at most 16; None where it is even.
+
+    Args:
+        power: Light of each cell [direction].
+        draw: Draws directions from the light of some cells, of their numbers and how many of each: unit vectors [cell,
+            count, 3].
+    """
+    bright = np.flatnonzero(power > _BRIGHT * power.sum())
+    bright = np.sort(bright[np.argsort(-power[bright], kind="stable")[:CHUNK]])
+    if not len(bright):
+        return None
+    repeated = np.arange(CHUNK) * len(bright) // CHUNK
+    places = np.full(len(power), -1, np.int32)
+    places[bright] = np.searchsorted(repeated, np.arange(len(bright)))
+    return SunCells(draw(bright, PACKET)[repeated], places)
+
+
+class RayProbes(NamedTuple):
+    """Where the rays of a body start.
+
+    Args:
+        tree: Its faces, in its own frame.
+        points, normals: Of its probes, and then of their backs, vec3 of shape [row].
+    """
+
+    tree: FaceTree
+    points: wp.array
+    normals: wp.array
+
+
+@functools.cache
+def _make_trace() -> wp.Kernel:
+    Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
+    find_open, dot_direction, bits_above = make_find_open(), fn.dot_direction, fn.bits_above
+
+    @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+    def trace_sun(
+        first_row: int,
+        worker: int,
+        # in
+        tree: FaceTree,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        all_rows: wp.array2d(dtype=wp.vec3i),
+        all_weights: wp.array2d(dtype=wp.vec3),
+        rotations: wp.array2d(dtype=wp.mat33),
+        body: int,
+        directions: wp.array2d(dtype=Lane),
+        firsts: wp.array(dtype=wp.int32),
+        # out
+        passing: wp.array3d(dtype=wp.float32),
+    ):
+        """A thread owns a receiver. A cell's first place has its rays, and the others copy it."""
+        batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
+        rows = all_rows[instance_in(batch, all_rows.shape[0]), receiver]
+        weights = all_weights[instance_in(batch, all_weights.shape[0]), receiver]
+        point = wp.vec3()
+        normal = wp.vec3()
+        for corner in range(3):
+            point += weights[corner] * points[rows[corner]]
+            normal += weights[corner] * normals[rows[corner]]
+        normal = wp.normalize(normal)
+        rotation = rotations[instance_in(batch, rotations.shape[0]), body]
+        axes = wp.matrix_from_rows(
+            wp.normalize(rotation[:, 0]), wp.normalize(rotation[:, 1]), wp.normalize(rotation[:, 2])
+        )
+        last = int(-1)
+        for place in range(firsts.shape[0]):
+            if firsts[place] < place:
+                passing[batch, receiver, place] = passing[batch, receiver, firsts[place]]
+            else:
+                world = Vectors(directions[place, 0], directions[place, 1], directions[place, 2])
+                toward = Vectors(
+                    dot_direction(axes[0], world), dot_direction(axes[1], world), dot_direction(axes[2], world)
+                )
+                cosine = dot_direction(normal, toward)
+                facing_rays = bits_above(cosine, 0.0)
+                result = find_open(
+                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                )
+                last = result[1]
+                total = float(0.0)
+                left = float(0.0)
+                for lane in range(PACKET):
+                    total += wp.max(cosine[lane], 0.0)
+                    if (result[0] >> lane) % 2 == 1:
+                        left += cosine[lane]
+                passing[batch, receiver, place] = wp.where(total > 0.0, left / total, 1.0)
+
+    return trace_sun
+
+
+def trace_sun_cells(
+    probes: RayProbes, places: ProbeWeights, rotations: wp.array, body: int, cells: SunCells
+) -> wp.array:
+    """Trace the self-visibility of a body's receivers in sun cells.
+
+    Args:
+        probes: Of the body.
+        places: Where the receivers lie among them.
+        rotations: R of each body, mat33 of shape [batch, body].
+        body: Whose is meant.
+        cells: The sun cells.
+
+    Returns:
+        Transmittance in [0, 1], float32 of shape [batch, receiver, 16].
+
+    Differentiable: no.
+    """
+    device, cell_count = rotations.device, int((cells.places >= 0).sum())
+    count = common_batch({"places": places.rows, "rotations": rotations})
+    passing = wp.empty((count, places.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device)
+    lanes = constant(cells.directions.swapaxes(1, 2), lane_type(PACKET), device)
+    starts = np.sort(cells.places[cells.places >= 0])
+    firsts = constant(starts[np.searchsorted(starts, np.arange(CHUNK), side="right") - 1], wp.int32, device)
+    launch(
+        _make_trace(),
+        count * passing.shape[1],
+        inputs=[*probes, *places, rotations, body, lanes, firsts],
+        outputs=[passing],
+        cost=_PACKET_COST * cell_count,
+    )
+    return passing

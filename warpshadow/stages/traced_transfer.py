@@ -1,0 +1,102 @@
+"""Transfer vectors by rays: what a mesh lets through of light in a basis, exactly but for sampling."""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.launch import launch
+from warpshadow.maths.directions import CHUNK, fibonacci
+from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
+from warpshadow.stages.ray_tracing import parts
+
+_RAY_COST = 60.0
+"""Nanoseconds that a ray takes."""
+
+
+@functools.cache
+def _make_trace_cosines() -> wp.Kernel:
+    Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
+    find_open, dot_direction, bits_above = make_find_open(), fn.dot_direction, fn.bits_above
+
+    @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+    def trace_cosines(
+        first_row: int,
+        worker: int,
+        # in
+        tree: FaceTree,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        directions: wp.array2d(dtype=Lane),
+        # out
+        cosines: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a receiver: its cosines of the rays that escape, 0 of the others."""
+        receiver = first_row + wp.tid()
+        point = points[receiver]
+        normal = normals[receiver]
+        last = int(-1)
+        for packet in range(directions.shape[0]):
+            toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            cosine = dot_direction(normal, toward)
+            facing_rays = bits_above(cosine, 0.0)
+            escaping = int(0)
+            if facing_rays != 0:
+                result = find_open(
+                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                )
+                escaping = result[0]
+                last = result[1]
+            for lane in range(PACKET):
+                is_open = ((escaping & facing_rays) >> lane) & 1
+                cosines[receiver, PACKET * packet + lane] = wp.where(is_open == 1, cosine[lane], 0.0)
+
+    return trace_cosines
+
+
+def _tree(mesh: wp.Mesh | None, device: wp.Device) -> FaceTree:
+    """The hierarchy of a mesh's faces; of none, where nothing blocks the light."""
+    if mesh is None:
+        return build_face_tree(np.zeros((0, 3)), np.zeros((0, 3), np.int32), device)
+    return build_face_tree(mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3), device)
+
+
+def trace_transfer(
+    mesh: wp.Mesh | None,
+    points: wp.array,
+    normals: wp.array,
+    functions: Callable[[np.ndarray], np.ndarray],
+    count: int,
+    *,
+    progress: bool = False,
+) -> wp.array:
+    """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
+
+    Args:
+        mesh: The blockers, None for none.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
+            coefficient].
+        count: Number of directions, evenly over the sphere.
+        progress: Show a progress bar where it takes longer than a second.
+
+    Returns:
+        Transfer vectors, float32 of shape [receiver, coefficient].
+
+    Differentiable: no.
+    """
+    directions = fibonacci(-(-count // CHUNK) * CHUNK)
+    packets = wp.array(packets_of(directions), dtype=lane_type(PACKET), device=points.device)
+    values = (4 / len(directions) * functions(directions)).astype(np.float32)
+    transfer = np.empty((points.shape[0], values.shape[1]), np.float32)
+    tree = _tree(mesh, points.device)
+    for part in parts(points.shape[0], 2**22 // len(directions), progress):
+        shape = part.stop - part.start, len(directions)
+        cosines = wp.empty(shape, dtype=wp.float32, device=points.device)
+        inputs = [tree, points[part], normals[part], packets]
+        launch(_make_trace_cosines(), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1])
+        transfer[part] = cosines.numpy() @ values
+    return wp.array(transfer, device=points.device)

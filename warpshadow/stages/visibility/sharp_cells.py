@@ -1,0 +1,141 @@
+"""Sharp cells: cells whose light comes from a spot much smaller than they are, as a sun's.
+
+Where nothing is known of the light in a cell, the soft edge of a shadow, w = κρ, is as wide as cells ask for. A spot of
+half-angle s has a penumbra of ±s. So a sharp cell gets the edge of cells of radius ρ = 2.4 s: at κ = 0.35 it is ±0.84
+s, a smoothstep about as steep as that penumbra. κ scales it as it does all edges. The transmittance of sharp cells is
+found by itself, and overwrites their first value.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import split_row
+from warpshadow.maths.directions import CHUNK, LEAST_WIDTH, cell_radius
+from warpshadow.stages.visibility.directional import SOFTNESS
+
+_RADII = 2.4
+"""Radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot."""
+
+_LEAST_SHARE = 0.1
+"""Share of all light that sharp cells have at least: less is not worth their time."""
+
+WIDEST_PAST_PLANES = 1.7
+"""Radius up to which cells are sharp where planes block them, in radii of all cells: their edges are 0.6 times as wide
+at κ = 0.35."""
+
+_LEAST_RADIUS = cell_radius(2048)
+"""Radius [rad] down to which cells are sharp: an edge of ±0.9° at κ = 0.35, sharper than shadows of spheres are."""
+
+_CELL_COST = 5.0
+"""Nanoseconds that a sharp cell takes."""
+
+
+class SharpCells(NamedTuple):
+    """Sharp cells.
+
+    Args:
+        directions: Unit vectors to where their light comes from, some repeated: [16, 3].
+        places: Index of each cell among them, −1 for cells that are not sharp: [direction].
+        scale: Radius of the cells that their edges go by, in radii of one of 16 cells.
+    """
+
+    directions: np.ndarray
+    places: np.ndarray
+    scale: float
+
+
+def find_sharp_cells(
+    power: np.ndarray,
+    directions: np.ndarray,
+    spreads: np.ndarray,
+    softness: float = SOFTNESS,
+    widest: float = 1.0,
+) -> SharpCells | None:
+    """Find the sharp cells of a light, at most the brightest 16; None where they have too little of it.
+
+    Args:
+        power: Light of each cell [direction].
+        directions: Unit vectors to where it comes from [direction, 3].
+        spreads: Half-angles s of the spots it comes from [radians], [direction].
+        softness: κ, by which edges become no narrower than a falloff may be.
+        widest: Radius up to which cells are sharp, in radii of all cells.
+    """
+    radii = np.maximum(_RADII * spreads, max(_LEAST_RADIUS, 1.001 * LEAST_WIDTH / softness))
+    result = np.flatnonzero((radii < widest * cell_radius(len(power))) & (power > 0))
+    result = np.sort(result[np.argsort(-power[result], kind="stable")[:CHUNK]])
+    if power[result].sum() <= _LEAST_SHARE * power.sum():
+        return None
+    repeated = np.arange(CHUNK) * len(result) // CHUNK
+    places = np.full(len(power), -1, np.int32)
+    places[result] = np.searchsorted(repeated, np.arange(len(result)))
+    radius = np.sqrt(np.average(radii[result] ** 2, weights=power[result]))
+    return SharpCells(directions[result[repeated]], places, float(radius / cell_radius(CHUNK)))
+
+
+@wp.kernel(enable_backward=False)
+def _overwrite_sharp_cells(
+    first_row: int,
+    worker: int,
+    # in
+    sharp_cells: wp.array3d(dtype=wp.float32),
+    pairs: wp.array(dtype=wp.vec2i),
+    # out
+    passing: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver; a pair is a sharp cell and its place."""
+    batch, receiver = split_row(first_row + wp.tid(), passing.shape[1])
+    for i in range(pairs.shape[0]):
+        passing[batch, receiver, pairs[i][0]] = sharp_cells[batch, receiver, pairs[i][1]]
+
+
+@wp.kernel(enable_backward=False)
+def _overwrite_sharp_cells_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    pairs: wp.array(dtype=wp.vec2i),
+    # out
+    adj_passing: wp.array3d(dtype=wp.float32),
+    adj_sharp: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver: a cell's previous value is overwritten."""
+    batch, receiver = split_row(first_row + wp.tid(), adj_passing.shape[1])
+    for i in range(pairs.shape[0]):
+        cell = pairs[i][0]
+        place = pairs[i][1]
+        adj_sharp[batch, receiver, place] = adj_sharp[batch, receiver, place] + adj_passing[batch, receiver, cell]
+        adj_passing[batch, receiver, cell] = 0.0
+
+
+def overwrite_sharp_cells(passing: wp.array, sharp_cells: wp.array, places: np.ndarray) -> wp.array:
+    """Overwrite sharp cells in place; call before anything reads them.
+
+    A copy of all cells would take as long as to shade them.
+
+    Args:
+        passing: Transmittance of all cells, float32 of shape [batch, receiver, direction]; it is changed.
+        sharp_cells: That of :attr:`SharpCells.directions`, float32 of shape [batch, receiver, 16].
+        places: Of :class:`SharpCells`.
+
+    Returns:
+        ``passing``.
+
+    Differentiable: passing, sharp_cells.
+    """
+    device, row_count = passing.device, passing.shape[0] * passing.shape[1]
+    cells = np.flatnonzero(places >= 0)
+    pairs, cost = constant(np.stack([cells, places[cells]], axis=1), wp.vec2i, device), _CELL_COST * len(cells)
+    return differentiable(
+        lambda result: launch(
+            _overwrite_sharp_cells, row_count, inputs=[sharp_cells, pairs], outputs=[result], cost=cost
+        ),
+        lambda adj: launch(
+            _overwrite_sharp_cells_adjoint, row_count, inputs=[pairs], outputs=[adj, sharp_cells.grad], cost=cost
+        ),
+        result=passing,
+        variables=[passing, sharp_cells],
+    )

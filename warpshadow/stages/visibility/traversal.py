@@ -1,0 +1,277 @@
+"""The traversal of spheres: a group of receivers visits the spheres that it can see, many at once left out.
+
+Four spheres that follow each other make up a quad, which has a sphere of its own for receivers far away
+(:mod:`warpshadow.stages.visibility.merging`), and four quads a run. Runs are culled as a whole; then quads; then
+spheres are visited. A method supplies culling and a visit; the traversal is generated around them, forward and adjoint.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.device.launch import launch
+from warpshadow.stages.visibility.cones import TINY_RADIUS, cone_type, make_cone
+from warpshadow.stages.visibility.merging import (
+    ITEMS,
+    QUAD,
+    ClusterNodes,
+    Gradients,
+    SphereClusters,
+    make_add_to_node,
+    make_merged,
+    make_merged_adjoint,
+    merge_where_far,
+    within,
+)
+
+QUADS = 4
+"""Quads of a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
+
+ALL = -1
+"""The number of candidates where all there is are: for runs."""
+
+
+@wp.func
+def find_node(quad: int, item: int, sphere_count: int, node_count: int):
+    """Node of an item of a quad: its four spheres and then its own; −1 where there is none."""
+    node = quad * QUAD + item
+    last = sphere_count
+    if item == QUAD:
+        node = sphere_count + quad
+        last = node_count
+    if node >= last:
+        node = -1
+    return node
+
+
+@wp.kernel(enable_backward=False)
+def _bound(
+    # in
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
+    sphere_count: int,
+    quad_count: int,
+    # out
+    bounds: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a run of quads: center and radius of a sphere around all of theirs, negative for none."""
+    batch, run = wp.tid()
+    low = wp.vec3(wp.inf)
+    high = wp.vec3(-wp.inf)
+    for k in range(quad_count * ITEMS):
+        node = find_node(run * quad_count + k // ITEMS, k % ITEMS, sphere_count, radii.shape[1])
+        if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
+            extent = wp.vec3(radii[batch, node])
+            low = wp.min(low, centers[batch, node] - extent)
+            high = wp.max(high, centers[batch, node] + extent)
+    middle = 0.5 * (low + high)
+    reach = float(-1.0)
+    for k in range(quad_count * ITEMS):
+        node = find_node(run * quad_count + k // ITEMS, k % ITEMS, sphere_count, radii.shape[1])
+        if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
+            reach = wp.max(reach, wp.length(centers[batch, node] - middle) + radii[batch, node])
+    if reach < 0.0:
+        middle = wp.vec3(0.0)
+    bounds[batch, run] = wp.vec4(middle[0], middle[1], middle[2], reach)
+
+
+class ClusterTree(NamedTuple):
+    """Spheres with their quads and the bounds of these, which serve any receivers."""
+
+    nodes: ClusterNodes
+    bounds_of_quads: wp.array
+    bounds_of_runs: wp.array
+
+
+def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> ClusterTree:
+    """Merge spheres where there are enough of them, and bound their quads and runs.
+
+    Args:
+        centers, radii: Spheres, [batch, sphere].
+        merging: τ, 0 for never.
+
+    Differentiable: centers, radii to the nodes.
+    """
+    nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
+    return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, QUADS))
+
+
+def make_spheres(
+    centers: wp.array,
+    radii: wp.array,
+    merging: float,
+    cell: float,
+    skip: tuple[int, int] = (0, 0),
+    clusters: ClusterTree | None = None,
+) -> tuple[ClusterNodes, SphereClusters]:
+    """Put spheres together with their clusters.
+
+    Args:
+        centers, radii: Spheres, [batch, sphere].
+        merging: τ in cell radii, 0 for never.
+        cell: Radius of a cell [rad].
+        skip: Spheres that are left out: the first, and the one after the last.
+        clusters: Of these spheres, where they are found already.
+
+    Returns:
+        The spheres as arrays, and as kernels see them.
+
+    Differentiable: centers, radii to the nodes.
+    """
+    count = radii.shape[1]
+    if not 0 <= skip[0] <= skip[1] <= count:
+        raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
+    nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
+    spheres = SphereClusters()
+    spheres.centers, spheres.radii, spheres.extents = nodes
+    spheres.count, spheres.merging_angle = count, merging * cell
+    spheres.skip_begin, spheres.skip_end = skip
+    spheres.bounds_of_quads, spheres.bounds_of_runs = bounds
+    return nodes, spheres
+
+
+def _find_bounds(nodes: ClusterNodes, sphere_count: int, quad_count: int) -> wp.array:
+    """Spheres around runs of quads, vec4 of shape [batch, run]."""
+    shape = nodes.radii.shape[0], -(-sphere_count // (QUAD * quad_count))
+    bounds = wp.empty(shape, dtype=wp.vec4, device=nodes.radii.device)
+    launch(_bound, shape, inputs=[nodes.centers, nodes.radii, sphere_count, quad_count], outputs=[bounds])
+    return bounds
+
+
+@functools.cache
+def receiver_lanes_type(lanes: int) -> Any:
+    """Struct of a group of receivers."""
+    Vectors = vectors_type(lanes)
+
+    @wp.struct
+    class ReceiverLanes:
+        points: Vectors
+        normals: Vectors  # 0 where there is no horizon
+
+    return ReceiverLanes
+
+
+@functools.cache
+def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that loads a group of receivers."""
+    Vectors, ReceiverLanes = vectors_type(lanes), receiver_lanes_type(lanes)
+    load = make_lane_functions(lanes).load
+
+    @wp.func(inline=True)
+    def load_receivers(points: wp.array2d(dtype=wp.vec3), normals: wp.array2d(dtype=wp.vec3), batch: int, group: int):
+        own_normals = Vectors()
+        if wp.static(has_horizon):
+            own_normals = load(normals[batch], group)
+        return ReceiverLanes(load(points[batch], group), own_normals)
+
+    return load_receivers
+
+
+@functools.cache
+def sphere_view_type(lanes: int) -> Any:
+    """Struct of a sphere as a group of receivers sees it."""
+    Lane, Vectors, Cone = lane_type(lanes), vectors_type(lanes), cone_type(lanes)
+
+    @wp.struct
+    class SphereView:
+        place: int  # in the traversal
+        node: int
+        offset: Vectors  # from the receivers to its center
+        curvature: float  # 1/radius
+        cone: Cone  # its weight has the share as a factor
+        share: Lane  # that merging gives the sphere
+
+    return SphereView
+
+
+@functools.cache
+def sphere_adjoint_type(lanes: int) -> Any:
+    """Struct of the adjoints of a sphere's contribution to a group of receivers."""
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+
+    @wp.struct
+    class SphereAdjoint:
+        is_any: bool  # if not, all is 0
+        offset: Vectors
+        radius: Lane
+        weight: Lane  # of the cone
+        normals: Vectors
+
+    return SphereAdjoint
+
+
+@functools.cache
+def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that visits the spheres that a group of receivers can see.
+
+    Args:
+        cull: (receivers, bound, place, among, task) → how many of ``among`` candidates the spheres in a bound may
+            matter to. The first sphere has that place in the traversal; a quad's candidates are the receivers that its
+            run left.
+        visit: (receivers, seen, count, task), called for each sphere with the count of its quad; for an adjoint → Pull.
+        Task: Struct of all else that these two read and write.
+        is_adjoint: Whether to sum the results of the visits.
+        lanes: Receivers of a group.
+    """
+    Lane = lane_type(lanes)
+    ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
+    fn = make_lane_functions(lanes)
+    is_any_above, offset, add, subtract = fn.is_any_above, fn.offset, fn.add, fn.subtract
+    cone, merged = make_cone(lanes), make_merged(lanes)
+    merged_adjoint, add_to_node = make_merged_adjoint(lanes), make_add_to_node(lanes)
+
+    @wp.func(inline=lanes == 1)
+    def traverse(receivers: ReceiverLanes, batch: int, spheres: SphereClusters, gradients: Gradients, task: Task):
+        """Returns the adjoint of the receivers."""
+        adj = ReceiverLanes()
+        for run in range(spheres.bounds_of_runs.shape[1]):
+            begin = run * QUADS
+            end = wp.min(begin + QUADS, spheres.bounds_of_quads.shape[1])
+            run_count = int(0)
+            if not within(begin * QUAD, wp.min(end * QUAD, spheres.count), spheres):
+                run_count = cull(receivers, spheres.bounds_of_runs[batch, run], begin * ITEMS, ALL, task)
+            if run_count == 0:
+                end = begin
+            for quad in range(begin, end):
+                count = cull(receivers, spheres.bounds_of_quads[batch, quad], quad * ITEMS, run_count, task)
+                if count > 0:
+                    quad_share = merged(receivers.points, batch, quad, spheres)
+                    adj_share = Lane(0.0)
+                    for item in range(ITEMS):
+                        node = find_node(quad, item, spheres.count, spheres.centers.shape[1])
+                        share = Lane(1.0) - quad_share
+                        sign = float(-1.0)
+                        if item == QUAD:
+                            share = quad_share
+                            sign = 1.0
+                        radius = float(0.0)
+                        is_left_out = item < QUAD and within(node, node + 1, spheres)
+                        if node >= 0 and not is_left_out and is_any_above(share, 0.0):
+                            radius = spheres.radii[batch, node]
+                        if radius > TINY_RADIUS:
+                            seen = SphereView()
+                            seen.place = quad * ITEMS + item
+                            seen.node = node
+                            seen.offset = offset(spheres.centers[batch, node], receivers.points)
+                            seen.curvature = 1.0 / radius
+                            seen.cone = cone(seen.offset, seen.curvature)
+                            near = seen.cone.weight
+                            seen.cone.weight = wp.cw_mul(near, share)
+                            seen.share = share
+                            if wp.static(is_adjoint):
+                                pull = visit(receivers, seen, count, task)
+                                if pull.is_any:
+                                    adj_share += sign * wp.cw_mul(pull.weight, near)
+                                    adj.points = subtract(adj.points, pull.offset)
+                                    adj.normals = add(adj.normals, pull.normals)
+                                    add_to_node(pull.offset, pull.radius, batch, node, gradients)
+                            else:
+                                visit(receivers, seen, count, task)
+                    if wp.static(is_adjoint):
+                        adj_offset = merged_adjoint(receivers.points, batch, quad, adj_share, spheres, gradients)
+                        adj.points = subtract(adj.points, adj_offset)
+        return adj
+
+    return traverse

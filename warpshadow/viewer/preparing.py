@@ -1,0 +1,118 @@
+"""Preparing in another process: spheres, tables and kernels of a scene, while pages see it by rays.
+
+The process fills the caches on disk, from which this one reads. Should this one end before, the other is interrupted,
+and keeps what it has so far.
+"""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import warp as wp
+
+from warpshadow.device.parallel import ENVIRONMENT_VARIABLE, thread_count
+from warpshadow.device.progress import tell_every
+from warpshadow.device.startup import start_quietly
+from warpshadow.scene.blockers import fitted_counts
+from warpshadow.scene.scene import SPHERE_METHODS, Scene
+from warpshadow.spheres import is_fitted
+from warpshadow.viewer.painter import Painter, own_page
+from warpshadow.viewer.quality import FrameRate, Quality
+from warpshadow.viewer.state import ViewerState
+
+_SECONDS = 1.0
+"""Time between two notes of how far it is."""
+
+_PIXELS = 128**2
+"""Of the images that the process renders, for all that they need."""
+
+_PATIENCE = 10.0
+"""Time that the process has to write what it has, after this one ended [s]."""
+
+
+def has_fitted_spheres(scene: Scene, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether all spheres that a scene needs are in the cache."""
+    if scene.visibility.with_method().method not in SPHERE_METHODS:
+        return True
+    counts = fitted_counts(scene).items()
+    return all(is_fitted(scene.bodies[body].mesh, count, device=device) for body, count in counts)
+
+
+class Preparation:
+    """Another process that fits spheres, traces shadows of bodies on themselves and compiles kernels.
+
+    Args:
+        scene: The scene.
+        device: Warp device.
+        note: Is told how far it is, in words; "" when all is over.
+    """
+
+    def __init__(self, scene: Scene, note: Callable[[str], None], *, device: wp.DeviceLike = "cpu"):
+        self.is_over = False
+        self._note = note
+        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
+        others = {"PYTHONPATH": paths, ENVIRONMENT_VARIABLE: str(max(1, thread_count() - 1))}
+        # no multiprocessing: that would run the user's script again, where it has no guard against it
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import prepare; prepare()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=os.environ | others,
+        )
+        threading.Thread(target=self._follow, args=(pickle.dumps((scene, str(device))),), daemon=True).start()
+
+    def close(self) -> None:
+        """Interrupt it, if it is not over."""
+        self.is_over = True
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+
+    def _follow(self, packed: bytes) -> None:
+        process = self._process
+        assert process.stdin is not None and process.stderr is not None
+        with contextlib.suppress(OSError, ValueError):  # it ended, or was closed
+            process.stdin.write(packed)
+            process.stdin.flush()
+        for line in process.stderr:
+            if not self.is_over:
+                self._note(line.decode(errors="replace").strip())
+        process.wait()
+        if not self.is_over:
+            self.is_over = True
+            self._note("")
+
+
+def prepare() -> None:
+    """Prepare the scene that comes on stdin; the end of stdin interrupts that."""
+    warnings.simplefilter("ignore")  # the viewer warns of the same
+    start_quietly()
+    scene, device = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_viewer, daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(5)
+    tell_every(_SECONDS)
+    with contextlib.suppress(KeyboardInterrupt):
+        painter, viewer_state = Painter(scene, device=device, progress=True), ViewerState.of(scene)
+        page = own_page(scene, painter.page_scale)
+        for quality in (FrameRate().moving(), Quality(_PIXELS, 1 << 16, 1 << 16, 16, is_moving=False)):
+            painter.image(viewer_state, page, replace(quality, pixels=_PIXELS))
+
+
+def _end_with_viewer() -> None:
+    while os.read(0, 1):  # not by sys.stdin, whose lock a process cannot end without
+        pass
+    _thread.interrupt_main()
+    time.sleep(_PATIENCE)
+    os._exit(1)

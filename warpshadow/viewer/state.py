@@ -1,0 +1,187 @@
+"""The state of a viewer that a page may change: checked, so that nothing else reaches a renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpshadow import check
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.maths.directions import check_count
+from warpshadow.scene.files import turned_light
+from warpshadow.scene.scene import (
+    BOUNCING,
+    DEFAULT_METHOD,
+    METHODS,
+    READ_BY,
+    RECEIVERS,
+    SAMPLINGS,
+    Body,
+    Bounces,
+    Scene,
+    Visibility,
+    check_bounces,
+)
+from warpshadow.viewer.quality import Quality
+
+MOST_CELLS, MOST_SPHERES, MOST_BOUNCES, MOST_STOPS = 1024, 512, 8, 20.0
+"""More than these a page may not ask for."""
+
+AS_GIVEN = "as given"
+"""Receivers, and numbers of spheres, as the scene has them."""
+
+PICTURE, ERROR = "picture", "error against rays"
+"""Shown image: the scene, or, once nothing moves, its difference from rays."""
+
+
+@dataclass(frozen=True)
+class BodyPose:
+    """Where a body is: turned by a rotation, then moved.
+
+    Args:
+        rotation: Axis-angle vector [degrees].
+        translation: Offset [scene units].
+    """
+
+    rotation: tuple[float, ...]
+    translation: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check it."""
+        for name in ("rotation", "translation"):
+            values = check.array(name, getattr(self, name), (3,))
+            check.finite(name, values, maximum=1e9, minimum=-1e9)
+            object.__setattr__(self, name, tuple(values.tolist()))
+
+
+@dataclass(frozen=True)
+class ViewerState:
+    """Viewer state.
+
+    Args:
+        turn: Of the light about +y [degrees].
+        scale: Of the light.
+        stops: Exposure of the picture.
+        method: Of visibility.
+        sampling: Of "ray-traced".
+        directions: Cells of "directional".
+        softness: κ of "directional".
+        spheres: For each body that casts shadows, how many; None as the scene has them.
+        receivers: Of all bodies, or :data:`AS_GIVEN`.
+        bounces: Of light; methods that find none leave them out.
+        shows: :data:`PICTURE` or :data:`ERROR`.
+        shows_light: Whether the light itself is behind the bodies.
+        poses: Of the bodies.
+    """
+
+    turn: float
+    scale: float
+    stops: float
+    method: str
+    sampling: str
+    directions: int
+    softness: float
+    spheres: int | None
+    receivers: str
+    bounces: Bounces
+    shows: str
+    shows_light: bool
+    poses: tuple[BodyPose, ...]
+
+    def __post_init__(self) -> None:
+        """Check it."""
+        within("turn", self.turn, -360, 360)
+        within("scale", self.scale, 0, 1000)
+        within("stops", self.stops, -MOST_STOPS, MOST_STOPS)
+        check.choice("method", self.method, METHODS)
+        check.choice("sampling", self.sampling, SAMPLINGS)
+        check_count("directions", self.directions)
+        if self.directions > MOST_CELLS:
+            raise ValueError(f"directions: got {self.directions}, expected at most {MOST_CELLS}")
+        within("softness", self.softness, 0.05, 1.5)
+        if self.spheres is not None:
+            check.whole("spheres", self.spheres, what="spheres")
+            within("spheres", self.spheres, 1, MOST_SPHERES)
+        check.choice("receivers", self.receivers, (AS_GIVEN, *RECEIVERS))
+        check_bounces(self.bounces)
+        if self.bounces != "all":
+            within("bounces", self.bounces, 0, MOST_BOUNCES)
+        check.choice("shows", self.shows, (PICTURE, ERROR))
+        check.flag("shows_light", self.shows_light)
+        for pose in self.poses:
+            check.instance("poses", pose, BodyPose, "a Pose for each body")
+
+    @classmethod
+    def of(cls, scene: Scene, stops: float = 0.0) -> ViewerState:
+        """A scene as it is."""
+        return cls(
+            turn=0.0,
+            scale=1.0,
+            stops=stops,
+            method=scene.visibility.method or DEFAULT_METHOD,
+            sampling=scene.visibility.sampling,
+            directions=min(scene.visibility.directions, MOST_CELLS),
+            softness=scene.visibility.softness,
+            spheres=None,
+            receivers=AS_GIVEN,
+            bounces=scene.bounces if scene.bounces == "all" else min(scene.bounces, MOST_BOUNCES),
+            shows=PICTURE,
+            shows_light=False,
+            poses=tuple(BodyPose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
+        )
+
+    def visibility(self, arguments: Visibility, quality: Quality | None = None) -> Visibility:
+        """The settings of a scene, as they are changed; no better than a quality asks for."""
+        names = "method", "sampling", "directions", "softness"
+        settings = {name: getattr(arguments, name) for name in READ_BY}
+        requested = Visibility.of(settings | {name: getattr(self, name) for name in names})
+        if quality is None:
+            return requested
+        rays = quality.cells if requested.sampling == "shared" else quality.rays
+        bounded = {"directions": min(requested.directions, quality.cells), "samples": min(requested.ray_count, rays)}
+        return Visibility.of(vars(requested) | bounded)
+
+    def bodies(self, arguments: tuple[Body, ...]) -> tuple[Body, ...]:
+        """Bodies with the spheres and receivers that are asked for, where the scene has them."""
+        changed: dict[str, object] = {} if self.receivers == AS_GIVEN else {"receivers": self.receivers}
+        counts = {} if self.spheres is None else {"blockers": self.spheres}
+        return tuple(
+            dataclasses.replace(body, **changed, **(counts if body.casts_shadow else {}))  # type: ignore[arg-type]
+            for body in arguments
+        )
+
+    def light(self, arguments: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
+        """Light as it is turned and scaled."""
+        return turned_light(arguments, self.turn, self.scale)
+
+    def settings(self, scene: Scene, quality: Quality | None = None) -> Scene:
+        """The scene with the settings that are asked for; its bodies where they were, its light as it was."""
+        visibility = self.visibility(scene.visibility, quality)
+        return dataclasses.replace(
+            scene,
+            bodies=self.bodies(scene.bodies),
+            visibility=visibility,
+            bounces=self.bounces if visibility.method in BOUNCING else 0,
+            supersampling=min(scene.supersampling, quality.supersampling if quality else scene.supersampling),
+        )
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scene as it is shown."""
+        settings = self.settings(scene)
+        bodies = tuple(
+            dataclasses.replace(body, rotation=np.array(pose.rotation), translation=np.array(pose.translation))
+            for body, pose in zip(settings.bodies, self.poses, strict=True)
+        )
+        return dataclasses.replace(settings, bodies=bodies, light=self.light(scene.light))
+
+    def has_moved(self, scene: Scene) -> bool:
+        """Whether a body is not where the scene has it."""
+        return self.poses != ViewerState.of(scene).poses
+
+
+def within(name: str, value: object, minimum: float, maximum: float) -> None:
+    """Raise ValueError unless a value is a number in a range."""
+    if not (check.is_number(value) and minimum <= value <= maximum):
+        raise ValueError(f"{name}: got {check.described(value)}, expected a number from {minimum:g} to {maximum:g}")
