@@ -1,17 +1,18 @@
 """What each millisecond buys: error against the time of an image, for all settings and for a path tracer.
 
     python demos/benchmarks/error_vs_time.py [--data FOLDER] [--output FOLDER] [--light direct full] [--quick]
-        [--kinds NAME ...]
+        [--kinds NAME ...] [--one-thread]
 
 Three scenes of 256 × 256 pixels: a body in the sun, one under an overcast sky, and three bodies under a low sun.
 ``--data`` takes meshes (FOLDER/meshes) and environment maps (FOLDER/envmaps) from a folder: the map with the brightest
 spot, the most even one and the one between. Four more are of demos/kinds.py, or as many as ``--kinds`` names.
 
 Time is that of a warm image, forward, with the renderer made: each call places the bodies a hair's breadth elsewhere,
-so that nothing can be kept from the call before: projection, rasterization, visibility, shading and film run anew.
-Figures are medians of calls that take turns, all in one run; the default, and what seems better than it, are timed
-again among themselves. Error is the relative L2 error over wholly covered
-pixels, against rays through the meshes, 4096 a pixel.
+so that nothing can be kept from the call before: projection, rasterization, visibility, shading and film run anew. With
+``--one-thread`` all run on one thread, Mitsuba too, and times are of the processor: other work on the machine changes
+them little. Figures are medians of calls that take turns, all in one run; the default, and what seems better than it,
+are timed again among themselves. Error is the relative L2 error over wholly covered pixels, against rays through the
+meshes, 4096 a pixel.
 
 Also measured: rays at few directions; Mitsuba 3 where it is installed, and how many times as long it needs to come as
 near to its own image of 4096 samples as our default does; whether any setting is both faster and more accurate than
@@ -28,6 +29,7 @@ import importlib.util
 import itertools
 import json
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -345,7 +347,7 @@ def measure(
     paths = paths_of(scene, bounces) if importlib.util.find_spec("mitsuba") else None
     path_counts = PATH_COUNTS if paths else ()
     calls = [(lambda count=count: paths(count, seed=1)) for count in path_counts]
-    times = median_times([*draws, *calls], runs, progress=True)
+    times = median_times([*draws, *calls], runs, clock=clock(), progress=True)
     measured = [
         Measured(setting.family, setting.size, setting.details, milliseconds, error)
         for setting, milliseconds, error in zip(compared, times, errors, strict=False)
@@ -382,19 +384,28 @@ def time_again(measured: list[Measured], draws: Sequence[Callable[[], object]], 
         doubtful = [n for n, each in enumerate(measured) if n not in timed and (n == default or each in better)]
         if not doubtful:
             return
-        for number, milliseconds in zip(doubtful, median_times([draws[n] for n in doubtful], runs), strict=True):
+        for number, milliseconds in zip(
+            doubtful, median_times([draws[n] for n in doubtful], runs, clock=clock()), strict=True
+        ):
             measured[number] = dataclasses.replace(measured[number], milliseconds=milliseconds)
         timed.update(doubtful)
 
 
+def clock() -> Callable[[], float]:
+    """Of the processor where all runs on one thread, else of the wall."""
+    return time.process_time if ws.thread_count() == 1 else time.perf_counter
+
+
 def paths_of(scene: ws.Scene, bounces: int) -> Callable[..., np.ndarray]:
     """Make the function that renders an image in Mitsuba, [height, width, 3], of direct light or with bounces."""
+    import drjit
     import mitsuba as mi
 
     from demos.benchmarks.mitsuba_fits import RayTracer
 
     path = {"type": "path", "max_depth": bounces + 2}  # what is seen, the light, and what lies between
     tracer = RayTracer(scene, path if bounces else {"type": "direct"})
+    drjit.set_thread_count(ws.thread_count())
     return lambda samples, seed: np.array(mi.render(tracer.scene, spp=samples, seed=seed))
 
 
@@ -556,6 +567,9 @@ if __name__ == "__main__":
         "--kinds", nargs="*", choices=SCENES, default=KINDS, help="scenes of all kinds beside the three"
     )
     parser.add_argument("--quick", action="store_true", help="a ball on a ground of few pixels, to try it out")
+    parser.add_argument("--one-thread", action="store_true", help="one thread for all, and its time of the processor")
     arguments = parser.parse_args()
+    if arguments.one_thread:
+        ws.set_thread_count(1)
     kinds = () if arguments.quick else arguments.kinds
     main(arguments.data, arguments.output, arguments.runs, arguments.quick, arguments.light, kinds)
