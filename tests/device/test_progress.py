@@ -32,7 +32,7 @@ def lines(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_can_be_seen", lambda: False)
     monkeypatch.setattr(progress, "_DELAY", 0.02)
     monkeypatch.setattr(progress, "_EVERY", 0.2)
-    monkeypatch.setattr(progress, "_teller", progress._Teller())
+    monkeypatch.setattr(progress, "_reporter", progress._Reporter())
     return lambda: capsys.readouterr().err.splitlines()
 
 

@@ -29,19 +29,18 @@ LONG = 30.0
 """Time of work that is announced, with the way around it [s]."""
 
 
-class _Setting:
-    """Whether bars and lines may show, in all of the process."""
-
-    shows = True
+_bars_show = True
+"""Whether bars and lines may show, in all of the process."""
 
 
 def show_bars(shows: bool) -> None:
     """Show progress bars and lines from now on, or hide all, whatever ``progress`` functions get."""
-    _Setting.shows = shows
+    global _bars_show
+    _bars_show = shows
 
 
-def tell_every(seconds: float) -> None:
-    """Say so often how far a wait is where no bar can show, in place of every ten seconds."""
+def report_every(seconds: float) -> None:
+    """Set the time between progress lines where no bar can show; ten seconds without."""
     global _EVERY
     _EVERY = seconds
 
@@ -67,18 +66,18 @@ def say(text: str) -> None:
         sys.stderr.flush()
 
 
-def announce(work: str, seconds: float, way_out: str, *, shows: bool = True) -> None:
-    """Say before work of more than half a minute how long it takes, and how to leave it out.
+def announce(work: str, seconds: float, alternative: str, *, shows: bool = True) -> None:
+    """Announce work of more than half a minute: its time, and a setting that avoids it.
 
     Args:
         work: What is done, such as "tracing the shadow of a body on itself".
         seconds: How long it takes on one thread [s]; it runs on all.
-        way_out: A setting, and that it needs no such work.
+        alternative: A setting that avoids the work, such as 'method="ray-traced" needs none'.
         shows: Whether to say it.
     """
     seconds /= thread_count()
-    if shows and _Setting.shows and seconds > LONG:
-        say(f"{work} takes about {show_time(seconds)}, {way_out}")
+    if shows and _bars_show and seconds > LONG:
+        say(f"{work} takes about {show_time(seconds)}, {alternative}")
 
 
 def show_time(seconds: float) -> str:
@@ -150,59 +149,59 @@ class Wait:
         return f"{self.what}: {', '.join(parts)}"
 
 
-class _OfThread(threading.local):
-    """Labels of the work that a thread waits for, the innermost last."""
+class _ThreadState(threading.local):
+    """Work that a thread waits for, the innermost last, and whether it is hidden."""
 
     def __init__(self) -> None:
         self.waits: list[Wait] = []
         self.is_hidden = False
 
 
-_mine = _OfThread()
+_this_thread = _ThreadState()
 
 
-class _Teller:
-    """A thread that prints the progress of all threads that wait, while there are any."""
+class _Reporter:
+    """A thread that prints the progress of all waiting threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._of_threads: list[list[Wait]] = []
+        self._waits_of_threads: list[list[Wait]] = []
         self._thread: threading.Thread | None = None
-        self._said = self._ended = -_EVERY
+        self._reported = self._ended = -_EVERY
 
     def begin(self, waits: list[Wait]) -> None:
-        """Tell of the waits of a thread."""
+        """Report the waits of a thread from now on."""
         with self._lock:
             now = time.monotonic()
-            if not self._of_threads and now - self._ended >= _EVERY:
-                self._said = now
-            self._of_threads.append(waits)
+            if not self._waits_of_threads and now - self._ended >= _EVERY:
+                self._reported = now
+            self._waits_of_threads.append(waits)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="warpshadow-progress", daemon=True)
                 self._thread.start()
 
     @contextlib.contextmanager
     def ending(self, waits: list[Wait]) -> Iterator[None]:
-        """Say nothing while the last of the waits of a thread ends."""
+        """Report nothing while the last wait of a thread ends."""
         with self._lock:
             yield
             if not waits:
-                self._of_threads = [others for others in self._of_threads if others is not waits]
+                self._waits_of_threads = [others for others in self._waits_of_threads if others is not waits]
                 self._ended = time.monotonic()
 
     def _run(self) -> None:
         while True:
             time.sleep(min(_DELAY, _EVERY) / 2)
             with self._lock:
-                if not self._of_threads:
+                if not self._waits_of_threads:
                     self._thread = None
                     return
-                shown_waits = [[wait for wait in waits if wait.age >= _DELAY] for waits in self._of_threads]
+                shown_waits = [[wait for wait in waits if wait.age >= _DELAY] for waits in self._waits_of_threads]
                 if _can_be_seen():
                     for waits in shown_waits:
                         _refresh(waits)
-                elif any(shown_waits) and time.monotonic() - self._said >= _EVERY:
-                    self._said = time.monotonic()
+                elif any(shown_waits) and time.monotonic() - self._reported >= _EVERY:
+                    self._reported = time.monotonic()
                     for waits in filter(None, shown_waits):
                         say("; ".join(wait.line() for wait in waits))
 
@@ -216,9 +215,9 @@ def _refresh(waits: list[Wait]) -> None:
         bar.refresh()
 
 
-_teller = _Teller()
+_reporter = _Reporter()
 if hasattr(os, "register_at_fork"):  # a child has its lock, but not its thread
-    os.register_at_fork(after_in_child=_teller.__init__)  # type: ignore[misc]
+    os.register_at_fork(after_in_child=_reporter.__init__)  # type: ignore[misc]
 
 
 @contextlib.contextmanager
@@ -229,15 +228,15 @@ def waiting(what: str, *, shows: bool = True) -> Iterator[None]:
         what: Label of the work, such as "rendering".
         shows: Whether to say anything, of compiled kernels too.
     """
-    if _mine.waits or _mine.is_hidden:
+    if _this_thread.waits or _this_thread.is_hidden:
         yield
         return
-    _mine.is_hidden = not shows
+    _this_thread.is_hidden = not shows
     try:
         with _within(Wait(what), shows=shows):
             yield
     finally:
-        _mine.is_hidden = False
+        _this_thread.is_hidden = False
 
 
 @contextlib.contextmanager
@@ -260,9 +259,9 @@ def progress_bar(
         On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """
     wait = Wait(what, total, unit, done)
-    shows = shows and _Setting.shows
+    shows = shows and _bars_show
     if shows and _can_be_seen():
-        wait.outer_bar = next((outer.bar for outer in _mine.waits if outer.bar is not None), None)
+        wait.outer_bar = next((outer.bar for outer in _this_thread.waits if outer.bar is not None), None)
         if wait.outer_bar is None:
             with warnings.catch_warnings():  # of a notebook without ipywidgets, whose bars are text then
                 warnings.filterwarnings("ignore", "IProgress not found")
@@ -277,19 +276,19 @@ def progress_bar(
 
 @contextlib.contextmanager
 def _within(wait: Wait, *, shows: bool) -> Iterator[None]:
-    """Tell of a wait while a block runs."""
-    if not (shows and _Setting.shows):
+    """Report a wait while a block runs."""
+    if not (shows and _bars_show):
         yield
         return
     outer_bar = wait.outer_bar
-    _mine.waits.append(wait)
-    if len(_mine.waits) == 1:
-        _teller.begin(_mine.waits)
+    _this_thread.waits.append(wait)
+    if len(_this_thread.waits) == 1:
+        _reporter.begin(_this_thread.waits)
     try:
         yield
     finally:
-        with _teller.ending(_mine.waits):
-            _mine.waits.pop()
+        with _reporter.ending(_this_thread.waits):
+            _this_thread.waits.pop()
             if wait.bar is not None:
                 wait.bar.close()
         if outer_bar is not None:
@@ -302,7 +301,7 @@ _module_numbers = itertools.count(1)
 def _compiling(folder: str) -> contextlib.AbstractContextManager:
     """Say that kernels are compiled, and of which module of this process."""
     what = f"compiling kernels, module {next(_module_numbers)}"
-    return progress_bar(None, what, "", shows=not _mine.is_hidden)
+    return progress_bar(None, what, "", shows=not _this_thread.is_hidden)
 
 
 around_compilation(_compiling)

@@ -21,7 +21,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.parallel import ENVIRONMENT_VARIABLE, thread_count
-from warpshadow.device.progress import tell_every
+from warpshadow.device.progress import report_every
 from warpshadow.device.startup import start_quietly
 from warpshadow.scene.blockers import fitted_counts
 from warpshadow.scene.scene import SPHERE_METHODS, Scene
@@ -102,7 +102,7 @@ def prepare() -> None:
     threading.Thread(target=_end_with_viewer, daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(5)
-    tell_every(_SECONDS)
+    report_every(_SECONDS)
     with contextlib.suppress(KeyboardInterrupt):
         painter, viewer_state = Painter(scene, device=device, progress=True), ViewerState.of(scene)
         page = own_page(scene, painter.page_scale)
