@@ -112,7 +112,6 @@ def load_or_compute(
         make: Makes it anew, from where an interrupt left it.
         arrays: The arrays that are kept of it.
         what: Noun for warnings, such as "fit".
-
     Raises:
         KeyboardInterrupt: at an interrupt; it says how much is kept.
     """

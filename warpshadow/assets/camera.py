@@ -169,7 +169,6 @@ class Camera:
             margin: Fraction of the image that stays free around the framed bodies, 0 or more and below 1; leave some
                 for shadows.
             near: Distance of the near plane [scene units]; by default 1% of the distance to the framed bodies.
-
         Raises:
             ValueError: when up is parallel to the direction, or all that is shown is one point.
         """
@@ -300,8 +299,7 @@ class Camera:
                 welcome. Either order of the two will do: only one of them can be a projection.
             fov_y: In place of ``projection``: vertical field of view [degrees].
             size: Width and height [pixels].
-            near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with
-                ``fov_y``.
+            near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with ``fov_y``.
         Raises:
             ValueError: when the view is not rigid or the projection not a perspective.
         """

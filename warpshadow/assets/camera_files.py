@@ -29,11 +29,9 @@ def load_cameras(
         up: Which axis of the file's world points up, "y" or "z", as in NeRF's Blender scenes; a world of "z" is turned
             so that y is up here.
         near: Distance of the near plane [scene units].
-
     Returns:
         The cameras by their images' paths, in the file's order; paths of a JSON file are relative to it, COLMAP's as
         they stand in its file.
-
     Raises:
         ValueError: for lenses with distortion, and for a mistake in the file.
     """

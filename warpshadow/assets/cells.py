@@ -94,7 +94,6 @@ def spread_in_cells(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
     Args:
         radiance: Mean radiance L_q, as in a :class:`CellLight`; shape [direction, 3].
         directions: Unit vectors, shape [direction, 3].
-
     Returns:
         Radiance of a map in which no pixel is split, float64 of shape [height, 2·height, 3].
     """
@@ -113,7 +112,6 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
         radiance, directions: As for :func:`gather_cells`.
         cells: Numbers of the cells, none of which is dark.
         count: Directions that are drawn of each.
-
     Returns:
         Unit vectors, shape [cell, count, 3].
     """

@@ -36,10 +36,8 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
         path: A .exr, .hdr, .pic, .png, .jpg or .jpeg file.
         part: Name or index of the part of a multi-part OpenEXR file; the first by default.
         max_pixels: Refuse larger pictures, judged by the header before any pixel is read.
-
     Returns:
         float32 [height, width, channel] with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGB, alpha) channels.
-
     Raises:
         ImageError: for a file of another format, truncated, deep or too large, or with other channels.
         FileNotFoundError: when the file does not exist.
@@ -74,7 +72,6 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
             a :class:`Picture` at its automatic exposure; others keep their values, clipped to [0, 1]. Or a Picture.
         layers: Further channels of an .exr file by their names, each of shape [height, width]:
             ``Renderer(scene).layers().channels()``.
-
     Raises:
         ImageError: for another extension or shape, or NaN in a PNG or JPEG.
         OSError: where the file cannot be written.
@@ -137,7 +134,6 @@ def png_codes(content: bytes) -> np.ndarray:
 
     Returns:
         uint8 of shape [height, width, 1, 3 or 4], or uint16 of shape [height, width, 1].
-
     Raises:
         ImageError: for a file of another format, or a truncated one.
     """

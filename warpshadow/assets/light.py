@@ -55,7 +55,6 @@ class EnvironmentMap:
 
     Args:
         radiance: Linear RGB, 0 to 1e18, float32, shape [height, 2·height, 3].
-
     Raises:
         ImageError: for another shape or aspect, or NaN, Inf, negative values or values beyond 1e18.
     """
@@ -101,7 +100,6 @@ class EnvironmentMap:
                 "mitsuba", "openexr" and "usd" (DomeLight): +z, then -x;
                 "blender" (exported with y up) and "three.js": +x, then +z;
                 "debevec" (light probe gallery, HDRShop): -z, then +x.
-
         Raises:
             ImageError: for a file that is not a usable map; cube maps are named as such.
         """
@@ -170,7 +168,6 @@ class EnvironmentMap:
 
         Args:
             directions: Unit vectors, shape [..., 3].
-
         Returns:
             Linear RGB, float64 of shape [..., 3].
         """
@@ -199,7 +196,6 @@ class EnvironmentMap:
 
         Args:
             order: Number of bands n.
-
         Returns:
             Coefficients, index l² + l + m, float32, shape [order², 3], not writable.
         """
@@ -217,7 +213,6 @@ class EnvironmentMap:
 
         Args:
             directions: Unit vectors, shape [direction, 3].
-
         Returns:
             The cells; the arrays are not writable.
         """

@@ -1,8 +1,7 @@
 """Triangle meshes: files, primitives, topology, unwrapping and vertex normals.
 
-Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals.
-Vertices keep the order they have in the file. Texture coordinates have their origin at the lower left of the
-image, v up.
+Position topology and uv topology stay apart: a seam of the texture gives a vertex two uvs, never two normals. Vertices
+keep the order they have in the file. Texture coordinates have their origin at the lower left of the image, v up.
 """
 
 from __future__ import annotations
@@ -57,11 +56,9 @@ class Mesh:
 
     Of faces that are listed again, with either winding, as in "double-sided" exports, the first alone is kept, with its
     uvs: rays would meet the others in the same place, and normals of both would cancel. Vertices keep their numbers.
-
     Raises:
         MeshError: when the mesh is empty, holds NaN or Inf, or an index is out of range.
         ValueError: for colors or origins of another shape, and colors out of range.
-
     Warns:
         Of the faces that are dropped.
     """
@@ -176,7 +173,6 @@ class Mesh:
             rotation: Matrix that multiplies column vectors, shape [3, 3]; the identity by default.
             translation: Offset [scene units], shape [3]; none by default.
             scale: One factor, or one for each axis, shape [3].
-
         Returns:
             A new mesh with the same uvs and name.
         """

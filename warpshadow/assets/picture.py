@@ -35,12 +35,10 @@ class Picture:
         background: Shown where the image covers nothing: None for transparent; a color of the picture, linear RGB [3]
             or as CSS names it, "white" or "#ffcc00"; or an image of radiance, [height, width, 3], which is exposed like
             the rest: ``scene.background()`` is the light itself.
-
     Attributes:
         pixels: uint8 of shape [height, width, 3], [height, width, 4] with straight alpha where it is transparent, or
             [height, width, 1] of gray; ``PIL.Image.fromarray`` takes them.
         exposure: In stops.
-
     Raises:
         ValueError: for NaN, and for a background behind an image that has no coverage.
     """

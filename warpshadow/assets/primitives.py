@@ -17,7 +17,6 @@ def plane(size: float | tuple[float, float] = 2.0, segments: int | tuple[int, in
     Args:
         size: Edge length along x and z [scene units], one for both or a pair.
         segments: Quads along x and z, one count for both or a pair; each quad is two triangles.
-
     Returns:
         The mesh; u runs along +x, v along -z, both from 0 to 1.
     """

@@ -17,10 +17,8 @@ def read_radiance(path: Path, check_size: Callable[[int, int], None]) -> np.ndar
     Args:
         path: The file.
         check_size: Raises for a width and height that are too large, before any pixel is read.
-
     Returns:
         Linear RGB with row 0 at the top and the exposure divided out, float32 [height, width, 3].
-
     Raises:
         ValueError: for a file of another format, or a truncated one; the message leaves the path out.
     """

@@ -21,7 +21,6 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
         faces: Indices of positions, shape [face, 3]: faces are joined where edges share positions, whatever the uvs.
         positions: Vertices, shape [vertex, 3]; when given, vertices at the same place count as one, as a mesh needs
             whose faces have vertices of their own.
-
     Returns:
         Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
         than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
@@ -78,7 +77,6 @@ def part_at_creases(
         surface: How they are joined.
         positions: Vertices, shape [vertex, 3].
         angle: Edges are sharp where the normals of their faces differ by more [degrees]; borders are, too.
-
     Returns:
         The faces by new vertices, int32 of shape [face, 3]; and the vertex that each new one is a copy of, int32 of
         shape [vertex]: the old ones are the first, in their order.

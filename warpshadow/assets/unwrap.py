@@ -21,10 +21,8 @@ def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
         mesh: The mesh; uvs that it has are replaced.
         size: Width and height of the texture that the uvs are meant for [texels].
         padding: Least distance between charts [texels]: half of it is how far a filter may reach beyond its chart.
-
     Returns:
         The mesh with uvs from 0 to 1.
-
     Raises:
         ImportError: when xatlas, the extra ``unwrap``, is not installed.
     """

@@ -13,8 +13,7 @@ from warpshadow.assets import files
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 
-_STEPS = {".gif": 10, ".webp": 1}
-"""Unit of a frame's duration [ms]."""
+_STEPS = {".gif": 10, ".webp": 1}  # unit of a frame's duration [ms]
 
 _FASTEST = {".mp4": 1000, ".gif": 50, ".webp": 90}
 """Most frames a second; browsers show frames of 10 ms and less, of .gif and .webp, for 100 ms."""
@@ -35,7 +34,6 @@ def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: f
             exposure of the first. Transparent pixels become white.
         fps: Frames a second, 0.1 to 1000; up to 90 of .webp, and 50 of .gif, whose frames last 10 ms, 20 ms and so on:
             the next is shown when its time is nearest.
-
     Raises:
         ImportError: for an .mp4 file without ``imageio-ffmpeg``.
     """

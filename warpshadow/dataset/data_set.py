@@ -27,11 +27,8 @@ Item = TypeVar("Item")
 _MAP_SUFFIXES = (".exr", ".hdr", ".pic")
 
 _KEPT_BODIES = 64
-_KEPT_MAPS = 16
-"""How many files a process keeps in memory; it reads others again when a scene has them."""
-
-_SAID_FAULTS = 10
-"""Files that an error names at most."""
+_KEPT_MAPS = 16  # how many files a process keeps in memory; it reads others again when a scene has them
+_SAID_FAULTS = 10  # files that an error names at most
 
 
 class Stock(NamedTuple):
@@ -54,13 +51,11 @@ class DataSet:
         recipe: Its recipe.
         device: Where spheres are fitted and images rendered.
         progress: Show progress where something takes longer than a second.
-
     Attributes:
         recipe: Its recipe.
         device: Name of the device.
         stocks: The assets of each split, by its name.
         hashes: Of each mesh and map, by ``meshes`` and ``maps`` and then by names.
-
     Raises:
         RecipeError: for meshes and maps that cannot be used, all named, and for a split without any.
     """
@@ -170,10 +165,8 @@ class _ReadWhenAsked(Sequence[Item], Generic[Item]):
 class _Read(NamedTuple):
     """A mesh as it was read."""
 
-    body: Body
-    """With its spheres, creased if that is wanted."""
-    content_hash: str
-    """Hash the file's content, with its colors and texture, but not how it is creased."""
+    body: Body  # with its spheres, creased if that is wanted
+    content_hash: str  # hash the file's content, with its colors and texture, but not how it is creased
 
 
 @functools.lru_cache(_KEPT_BODIES)

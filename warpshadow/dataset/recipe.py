@@ -20,8 +20,7 @@ from warpshadow.scene.toml_tables import Table
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
 """Values that JSON has."""
 
-_LAYERS = (*LAYERS, "spheres", "light")
-"""Parts of each scene that may be written."""
+_LAYERS = (*LAYERS, "spheres", "light")  # parts of each scene that may be written
 
 FORMATS = ("exr", "png")
 """File formats of layers."""
@@ -127,7 +126,6 @@ def load_recipe(path: AnyPath) -> Recipe:
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
-
     Raises:
         RecipeError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file or folder that is not there.

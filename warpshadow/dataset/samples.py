@@ -145,7 +145,6 @@ def read_shard(path: AnyPath) -> Iterator[Sample]:
 
     Args:
         path: A .tar file that :func:`warpshadow.dataset.write_shards` wrote.
-
     Raises:
         ValueError: for a file that is no shard, or is damaged.
         FileNotFoundError: for a file that is not there.

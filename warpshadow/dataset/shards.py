@@ -63,10 +63,8 @@ def write_shards(
         workers: Processes that render, which share the threads; by default one for each thread, on a GPU one. 1 is this
             process, on all threads.
         progress: Show progress.
-
     Returns:
         All shards, including the ones already there.
-
     Raises:
         FileExistsError: for a folder of another data set, and for one into which another process writes.
         ChildProcessError: for an image that a worker could not render; finished shards stay.
@@ -100,8 +98,7 @@ def _worker_count(data_set: DataSet, workers: int | None) -> int:
 class _Rendered(NamedTuple):
     """A rendered image, and the warnings it gave."""
 
-    files: dict[str, bytes]
-    """By the ends of their names."""
+    files: dict[str, bytes]  # by the ends of their names
     warnings: list[str]
 
 

@@ -59,7 +59,6 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
         parts: Arrays of one dtype, shape [batch, count], or [batch, 1] where one item serves them all.
         counts: Items of each part.
         instances: Length of the batch, by default the parts' own.
-
     Differentiable: parts.
     """
     if instances is None:

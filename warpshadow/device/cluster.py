@@ -16,8 +16,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _NO_TOKEN = "it asks for a token: set RAY_AUTH_MODE=token here, too, and have the same ~/.ray/auth_token as there"
-_PATIENCE = 20.0
-"""How long the head of a cluster may be away [s]; after 60 Ray ends this process, at once."""
+_PATIENCE = 20.0  # how long the head of a cluster may be away [s]; after 60 Ray ends this process, at once
 
 
 def run_on_ray(
@@ -38,10 +37,8 @@ def run_on_ray(
         workers: How many tasks at a time, at most; by default one for each of the cluster's cores.
         attempts: How often a task is begun whose process or machine dies.
         is_on_gpu: Whether each task needs a GPU.
-
     Yields:
         The tasks that are over, as they end.
-
     Raises:
         ImportError: where Ray is not installed.
         ConnectionError: where there is no such cluster, where it wants a token that this process does not give, or once

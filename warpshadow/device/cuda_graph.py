@@ -49,7 +49,6 @@ class Captured(Generic[Result]):
     Args:
         function: The function to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
         device: Where it launches.
-
     Raises:
         RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
             synchronizes or copies from the host while it is captured. It is then captured anew at the next call.
@@ -90,7 +89,6 @@ def with_gradients(loss: Callable[[], wp.array], variables: Sequence[wp.array]) 
     Args:
         loss: Evaluates to a float32 array of one item, by launches that a tape records.
         variables: Arrays that require a gradient; their gradients are overwritten.
-
     Returns:
         A function that returns the loss, as an array on its device.
     """

@@ -12,11 +12,8 @@ from collections.abc import Callable
 
 import warp as wp
 
-_HUGE = 2**21
-"""Bytes of a huge page."""
-
-_LEAST = 2 * _HUGE
-"""Bytes of an array that is worth asking."""
+_HUGE = 2**21  # bytes of a huge page
+_LEAST = 2 * _HUGE  # bytes of an array that is worth asking
 
 
 @functools.cache

@@ -26,17 +26,10 @@ from warpshadow.device.warp_internals import resized_launch
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
-_LEAST_WORK = 4.0e5
-"""Minimum work of a slice [ns]: waking a thread and fetching its inputs take a tenth of that."""
-
-_SLICES_PER_THREAD = 4
-"""Rows differ in cost; threads that finish early take the remaining slices."""
-
-_SUMMED_SLICES = 16
-"""Most slices of a launch whose sums are its slices' own."""
-
-_SUMMED_SIZE = 100_000
-"""Items that the sums of all slices have at most, beyond two slices: they are to be added up."""
+_LEAST_WORK = 4.0e5  # minimum work of a slice [ns]: waking a thread and fetching its inputs take a tenth of that
+_SLICES_PER_THREAD = 4  # rows differ in cost; threads that finish early take the remaining slices
+_SUMMED_SLICES = 16  # most slices of a launch whose sums are its slices' own
+_SUMMED_SIZE = 100_000  # items that the sums of all slices have at most, beyond two slices: they are to be added up
 
 _thread_count: int | None = None
 
@@ -58,7 +51,6 @@ def set_thread_count(count: int | None) -> None:
 
     Args:
         count: Positive; None for the environment variable WARPSHADOW_NUM_THREADS, or all cores.
-
     Raises:
         ValueError: for another count.
     """

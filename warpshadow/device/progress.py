@@ -19,11 +19,8 @@ from typing import Any
 from warpshadow.device.parallel import thread_count
 from warpshadow.device.warp_internals import around_compilation
 
-_DELAY = 1.0
-"""Time before a bar shows, and between its states where nothing is done [s]."""
-
-_EVERY = 10.0
-"""Time between lines [s]."""
+_DELAY = 1.0  # time before a bar shows, and between its states where nothing is done [s]
+_EVERY = 10.0  # time between lines [s]
 
 LONG = 30.0
 """Time of work that is announced, with the way around it [s]."""
@@ -254,7 +251,6 @@ def progress_bar(
         done: Units that were done before.
         shows: Whether to show it.
         stays: Whether it shows at once, and the full bar stays on the terminal.
-
     Returns:
         On it the block calls ``update(count)``, and ``expect(left)`` where it ends early.
     """

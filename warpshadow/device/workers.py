@@ -86,10 +86,8 @@ def run_tasks(
         threads: Threads that kernels and NumPy have in each process; by default an even share of all.
         attempts: How often a task is begun whose process dies: it may have been killed because another process ran out
             of memory.
-
     Yields:
         The tasks that are over, as they end.
-
     Raises:
         ChildProcessError: where no process can start.
     """

@@ -47,8 +47,7 @@ TABLE = "table.csv"
 _FIT_FILE = "fit.toml"  # pattern of fit files in a folder
 _RECORD = "ending.json"
 _ATTEMPTS = 4  # begins of a fit whose workers are killed
-_PATIENCE = 60.0
-"""How long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]."""
+_PATIENCE = 60.0  # how long a worker waits for another that is at the same fit, such as one that Ray believed dead [s]
 
 
 @dataclass(frozen=True)
@@ -114,11 +113,9 @@ def fit_many(
         device: Where to compute.
         checkpoint_seconds: Time between checkpoints [s].
         progress: Show progress.
-
     Returns:
         How each ended, in the order of ``fits``. One that fails, diverges, or whose workers are killed four times costs
         only itself.
-
     Raises:
         CheckpointError: while other fits are written into the folder.
         FileExistsError: for the folder of a single fit.
@@ -351,10 +348,8 @@ def find_fits(where: AnyPath | Sequence[AnyPath]) -> dict[str, Path]:
     Args:
         where: A pattern, such as "photos/*/fit.toml" or "fits/**/*.toml"; a folder, which is searched for files called
             fit.toml; a list, a .txt file with a path on each line, relative to it; or several files.
-
     Returns:
         Files by name, sorted by name; a list keeps its own order.
-
     Raises:
         FileNotFoundError: where there are none.
         ValueError: where the results of two would be in one folder.

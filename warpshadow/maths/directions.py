@@ -40,7 +40,6 @@ def fibonacci(count: int) -> np.ndarray:
 
     Args:
         count: Number of directions Q, a multiple of 16.
-
     Returns:
         Unit vectors, float64 of shape [Q, 3], not writable.
     """

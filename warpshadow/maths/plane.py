@@ -2,8 +2,7 @@
 
 import numpy as np
 
-_FLATNESS = 1e-4
-"""Relative thickness below which a mesh counts as flat."""
+_FLATNESS = 1e-4  # relative thickness below which a mesh counts as flat
 
 
 def plane_normal(corners: np.ndarray) -> np.ndarray | None:
@@ -11,7 +10,6 @@ def plane_normal(corners: np.ndarray) -> np.ndarray | None:
 
     Args:
         corners: Float64 of shape [face, 3, 3].
-
     Returns:
         Unit normal, their mean by area, shape [3]; None where they do not lie in one plane, or have no mean.
     """

@@ -56,7 +56,6 @@ def evaluate(order: int, directions: np.ndarray) -> np.ndarray:
     Args:
         order: Number of bands n, 1 or more.
         directions: Unit vectors, shape [..., 3].
-
     Returns:
         y_lm at every direction, shape [..., order²], float64.
     """
@@ -128,7 +127,6 @@ def project_map(pixels: np.ndarray, order: int) -> np.ndarray:
     Args:
         pixels: Map, shape [height, 2·height, channel].
         order: Number of bands n.
-
     Returns:
         Coefficients, shape [order², channel], float64.
     """
@@ -159,7 +157,6 @@ def reconstruct_map(coefficients: np.ndarray, height: int) -> np.ndarray:
     Args:
         coefficients: Shape [order², channel].
         height: Rows of the map, which has twice as many columns.
-
     Returns:
         Pixels, shape [height, 2·height, channel], float64; band-limited, so it may be negative.
     """
@@ -198,7 +195,6 @@ def rotation_matrix(order: int, rotation: np.ndarray) -> np.ndarray:
     Args:
         order: Number of bands n.
         rotation: Orthogonal matrix R, shape [3, 3].
-
     Returns:
         Shape [order², order²]: if f' = M f, then f'(R d) = f(d).
     """
@@ -215,7 +211,6 @@ def rotation_generators(order: int) -> np.ndarray:
 
     Args:
         order: Number of bands n.
-
     Returns:
         Shape [3, order², order²].
     """

@@ -8,7 +8,6 @@ def solid_angles(corners: np.ndarray) -> np.ndarray:
 
     Args:
         corners: float64 of shape [triangle, 3, 3].
-
     Returns:
         Of each triangle, −2π to 2π, positive where its back is seen; shape [triangle]. The solid angles of a closed
         mesh that faces outwards add up to 4π inside and to 0 outside.

@@ -9,7 +9,6 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
     Args:
         points: Shape [point, 3].
         runs: Lengths of the runs that are to be compact, each a multiple of the next.
-
     Returns:
         Indices [point]: as they follow each other, the points of every run are near each other; the last run of a
         length may be short.
@@ -30,7 +29,6 @@ def z_order(points: np.ndarray) -> np.ndarray:
 
     Args:
         points: Shape [point, 3].
-
     Returns:
         Indices [point].
     """

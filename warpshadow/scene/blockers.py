@@ -15,9 +15,8 @@ from warpshadow.spheres.fit import fit_seconds, is_fitted
 def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
     """Find the spheres of each body, in its own space, fitting the wanted ones.
 
-    A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it
-    from behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets
-    none.
+    A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it from
+    behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets none.
     """
     if scene.visibility.with_method().method not in SPHERE_METHODS:
         return [Spheres.concatenate([])] * len(scene.bodies)

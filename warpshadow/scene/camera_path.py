@@ -145,7 +145,6 @@ class CameraPath:
         Args:
             like: Has their size, near plane, principal point and shape of pixels; and field of view, where keyframes
                 say none.
-
         Raises:
             ValueError: where a camera between keyframes is none: it is where it looks, or looks along ``up``.
         """

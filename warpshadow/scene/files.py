@@ -69,7 +69,6 @@ def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: obj
         bounces: How often light bounces, in place of the file's.
         settings: Settings of visibility in place of the file's, such as ``method="log-sh"``. A file may hold settings
             for several methods; settings that the method does not read are left out.
-
     Raises:
         SceneError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file that is not there.
@@ -239,7 +238,6 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
         folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
             body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex, and
             where it has a texture body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.
-
     Returns:
         The files.
     """

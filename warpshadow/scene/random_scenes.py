@@ -191,7 +191,6 @@ class RandomScenes:
 
         Args:
             index: Its number; negative ones count from the end.
-
         Raises:
             IndexError: for a number out of range.
         """

@@ -27,8 +27,7 @@ EDGE = 0.25
 SAMPLES = 32
 """Points of each sphere whose distance to the mesh tells how much of it is outside."""
 
-_QUERY_COST = 2000.0
-"""Nanoseconds that a signed distance takes."""
+_QUERY_COST = 2000.0  # nanoseconds that a signed distance takes
 
 SURFACE_POINTS = 1024
 RATE = 0.003
@@ -167,7 +166,6 @@ def cover_energy(
         spheres: Centers and radii [diagonals], shape [sphere, 4].
         samples: Points evenly in the unit ball, shape [sample, 3].
         points: Points evenly on the surface, shape [point, 3].
-
     Returns:
         The energy, and its gradient by centers and logarithms of radii, shape [sphere, 4].
     """

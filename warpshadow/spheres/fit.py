@@ -109,10 +109,8 @@ def fit_spheres(
         cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
             folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
         progress: Show a progress bar when it takes longer than a second.
-
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
-
     Warns: Once for each mesh, where 64 or more spheres cast a ragged shadow, as on thin legs.
     """
     check.instance("mesh", mesh, Mesh, "a Mesh; load_mesh(path) reads one")

@@ -16,8 +16,7 @@ ENCLOSED = 0.9
 """Of the points that an open mesh winds around, the share that sees next to nothing but the mesh if it is a solid with
 holes. Of a scan with holes in its foot it is 0.95, of a box without its front 0.1, of half a ball 0."""
 
-_RAYS = 32
-"""Rays that tell whether a point sees next to nothing but the mesh: all but one meet it."""
+_RAYS = 32  # rays that tell whether a point sees next to nothing but the mesh: all but one meet it
 
 
 @wp.func

@@ -11,8 +11,7 @@ from warpshadow.stages.visibility.cones import BLEND, make_cone
 _cone = make_cone(1)
 _Lane, _Vectors = lane_type(1), vectors_type(1)
 
-_TEST_COST = 2.0
-"""Nanoseconds that a sphere costs for a ray."""
+_TEST_COST = 2.0  # nanoseconds that a sphere costs for a ray
 
 
 @wp.kernel(enable_backward=False)
@@ -61,13 +60,10 @@ def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, r
         directions: Unit directions toward the light, vec3, shape [direction].
         centers: Sphere centers [scene units], vec3, shape [batch, sphere].
         radii: Sphere radii [scene units], float32, shape [batch, sphere].
-
     Returns:
         1 where a sphere blocks the ray, else 0; uint8, shape [batch, vertex, direction].
-
     Raises:
         ValueError: for shapes that do not fit.
-
     Differentiable: no.
     """
     check.shape("points", points.shape, ("batch", "vertex"))

@@ -26,7 +26,6 @@ def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:
         mesh: The mesh, y up.
         spheres: Spheres in the mesh's coordinates.
         path: Image file to write; the format follows its suffix.
-
     Raises:
         ImportError: when matplotlib, the extra ``plot``, is not installed.
     """

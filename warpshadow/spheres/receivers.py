@@ -17,8 +17,7 @@ FIT_BUNDLE = 16
 LEAST_LIGHT = 0.01
 """Lights of the metric that count less than this, next to the strongest, are left out: 28 of 128 are in."""
 
-_RAY_COST = 500.0
-"""Nanoseconds that a ray takes."""
+_RAY_COST = 500.0  # nanoseconds that a ray takes
 
 
 @wp.kernel(enable_backward=False)

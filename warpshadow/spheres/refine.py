@@ -38,16 +38,12 @@ TOUCH = 0.8
 PULLED = 5
 """Steps after which spheres that are farther off are pulled back."""
 
-_SPHERE_COST = 10.0
-"""Nanoseconds that it takes to see a sphere from a receiver."""
-
-_PAIR_COST = 0.1
-"""Nanoseconds that a sphere costs for a receiver and a direction."""
+_SPHERE_COST = 10.0  # nanoseconds that it takes to see a sphere from a receiver
+_PAIR_COST = 0.1  # nanoseconds that a sphere costs for a receiver and a direction
 
 _Bundle = lane_type(FIT_BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
-_PLACE = 12
-"""Numbers that say where a receiver is: its point, and the rows of its frame."""
+_PLACE = 12  # numbers that say where a receiver is: its point, and the rows of its frame
 
 # ------------------------------------------------------------------------------------------------- cones
 

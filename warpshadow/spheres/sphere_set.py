@@ -81,10 +81,8 @@ class Spheres:
             rotation: Rotation matrix R, shape [3, 3]; None for no rotation.
             translation: Vector t [scene units], shape [3].
             scale: Factor of lengths, positive.
-
         Returns:
             New spheres.
-
         Raises:
             ValueError: when the matrix is no rotation, or a number is not finite or the scale not positive.
         """

@@ -11,8 +11,7 @@ from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
 TINY_VOLUME = 1.0e-36
 """Below this the volumes of a face are subnormal numbers, which have no reciprocal in float32."""
 
-_COST, _ADJOINT_COST = 5.0, 15.0
-"""Nanoseconds that a sample takes."""
+_COST, _ADJOINT_COST = 5.0, 15.0  # nanoseconds that a sample takes
 
 
 @wp.func
@@ -138,14 +137,11 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
         face_ids: Visible face or -1, int32, shape [batch, height, width].
         faces: Vertex indices, vec3i, shape [face].
         clip_positions: Vertices in clip space, vec4, shape [batch, vertex].
-
     Returns:
         Perspective-correct weights of the face's three vertices, vec3, shape [batch, height, width], zero where there
         is no face.
-
     Raises:
         ValueError: when the batches differ.
-
     Differentiable: clip_positions. Not: face_ids.
     """
     check.shape("clip_positions", clip_positions.shape, (face_ids.shape[0], "vertex"))

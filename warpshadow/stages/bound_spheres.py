@@ -144,10 +144,8 @@ class SphereBinding:
             rest_centers: The spheres there [scene units], vec3 of shape [batch, sphere].
             rest_radii: Their radii [scene units], float32 of shape [batch, sphere].
                 Batches of 1 serve every instance of the others.
-
         Returns:
             Centers, vec3 of shape [batch, sphere], and radii, float32 of shape [batch, sphere].
-
         Differentiable: all.
         """
         arguments = {"positions": positions, "rest": rest_positions, "centers": rest_centers, "radii": rest_radii}

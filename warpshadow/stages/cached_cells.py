@@ -64,10 +64,8 @@ def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     Args:
         transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
         cached: Irradiance from each cell of directions, shadowed by static bodies, [row, 3, direction].
-
     Returns:
         Shading, vec3 of shape [batch, receiver].
-
     Differentiable: transmittance.
     """
     device = transmittance.device
@@ -110,10 +108,8 @@ def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
     Args:
         transmittance: Of the spheres of moving bodies, float32 of shape [batch, receiver, direction].
         cached: Transfer vectors with static bodies alone, [row, 1, direction].
-
     Returns:
         Transfer vectors, float32 of shape [batch, receiver, direction].
-
     Differentiable: transmittance.
     """
     device = transmittance.device

@@ -112,7 +112,6 @@ class DeformationGraph:
             count: Nodes that carry a point; d_max is the distance of the next one. Nodes are neighbors where one is
                 among the ``count`` nearest to the other, or where they carry the same points.
             device: Where the graph lives.
-
         Raises:
             ValueError: when there are too few nodes.
         """
@@ -153,10 +152,8 @@ class DeformationGraph:
         Args:
             matrices: Of the nodes, mat33 of shape [batch, node]: rotations, or free matrices with :meth:`shear`.
             translations: Of the nodes [scene units], vec3 of shape [batch, node].
-
         Returns:
             vec3 of shape [batch, point].
-
         Differentiable: matrices, translations.
         """
         self._check(matrices, translations)
@@ -180,7 +177,6 @@ class DeformationGraph:
 
         Returns:
             float32 of shape [batch] [scene units²].
-
         Differentiable: matrices, translations.
         """
         self._check(matrices, translations)

@@ -9,8 +9,7 @@ from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.rasterize import Fragments
 
-_COST = 5.0
-"""Nanoseconds that a sample takes."""
+_COST = 5.0  # nanoseconds that a sample takes
 
 
 @wp.kernel
@@ -52,10 +51,8 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
             Any batch, that of the fragments included, may be 1 and then serves every instance.
-
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
-
     Differentiable: shading, albedo, barycentrics of the fragments.
     """
     _, height, width = fragments.face_ids.shape
@@ -97,10 +94,8 @@ def average(samples: wp.array, supersampling: int) -> wp.array:
     Args:
         samples: vec4 of shape [batch, height·across, width·across].
         supersampling: Samples of a pixel across and down.
-
     Returns:
         vec4 of shape [batch, height, width].
-
     Differentiable: samples.
     """
     if supersampling == 1:

@@ -16,8 +16,7 @@ from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.rasterize import Fragments
 
-_COST = 5.0
-"""Nanoseconds that a sample takes."""
+_COST = 5.0  # nanoseconds that a sample takes
 
 
 @wp.func

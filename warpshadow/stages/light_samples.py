@@ -17,17 +17,10 @@ SET_COUNT = 16
 
 _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
 
-_SUN = 30.0
-"""Times as bright as all on average is a sun …"""
-
-_SUN_SHARE = 0.35
-"""… and suns get so much of shared directions at most."""
-
-_UNSEEN_SHARE = 0.3
-"""Of the importance of light, which stays where receivers do not see it."""
-
-_LEAST_ROWS, _MOST_ROWS = 64, 512
-"""Of a map that is cut."""
+_SUN = 30.0  # times as bright as all on average is a sun …
+_SUN_SHARE = 0.35  # … and suns get so much of shared directions at most
+_UNSEEN_SHARE = 0.3  # of the importance of light, which stays where receivers do not see it
+_LEAST_ROWS, _MOST_ROWS = 64, 512  # of a map that is cut
 
 
 class LightSamples(NamedTuple):

@@ -55,10 +55,8 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
 
     Args:
         matrices: M, mat33 of shape [batch, body], each near to one rotation alone.
-
     Returns:
         Rotations, mat33 of shape [batch, body].
-
     Differentiable: matrices.
     """
     # the caller may overwrite the gradients that it gets

@@ -10,8 +10,7 @@ from warpshadow.device.launch import differentiable, launch
 _THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
 _SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
 
-_FACE_COST, _VERTEX_COST = 15.0, 6.0
-"""Nanoseconds that a face and a vertex take. Instances are shared by threads."""
+_FACE_COST, _VERTEX_COST = 15.0, 6.0  # nanoseconds that a face and a vertex take. Instances are shared by threads
 
 
 @wp.func
@@ -123,13 +122,10 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     Args:
         positions: Vertex positions [scene units], vec3, shape [batch, vertex].
         faces: Vertex indices, counter-clockwise seen from outside, vec3i, shape [face].
-
     Returns:
         Normals, vec3, shape [batch, vertex]; zero where the faces have no area or the vertex has no face.
-
     Raises:
         ValueError: for NaN, Inf and positions beyond 1e18.
-
     Differentiable: positions (with a zero gradient where the normal is zero). Not: faces.
     """
     check.finite_arrays({"positions": positions})

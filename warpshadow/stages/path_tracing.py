@@ -171,10 +171,8 @@ def trace_bounces(
         bounces: Most bounces of a path, 1 or more.
         paths: Number of paths from each receiver.
         progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         The bounced light that white surfaces send back, vec3 of shape [receiver].
-
     Differentiable: no.
     """
     device = points.device

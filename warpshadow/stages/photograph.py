@@ -90,7 +90,6 @@ def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array,
             Any batch may be 1 and then serves every instance.
 
     It waits for the device, since the host finds ε, and so cannot be captured in a CUDA graph.
-
     Differentiable: reflected, unshadowed (but for ε).
     """
     count = common_batch({"face_ids": face_ids, "reflected": reflected, "unshadowed": unshadowed})
@@ -148,7 +147,6 @@ def over_nothing(drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
 
     Args:
         drawn, caught, rest: As for :func:`compose`.
-
     Returns:
         Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]. Not differentiable.
     """
@@ -165,12 +163,9 @@ def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.ar
         photograph: Linear RGB, vec3 of shape [batch, height, width].
         drawn: The film of the reflected light, vec4 of shape [batch, height, width].
         caught: The film of ``inverse`` times the light at the samples, likewise.
-        rest: That of ``rest``, likewise.
-            Any batch may be 1 and then serves every instance.
-
+        rest: That of ``rest``, likewise. Any batch may be 1 and then serves every instance.
     Returns:
         Linear RGB, vec3 of shape [batch, height, width].
-
     Differentiable: all.
     """
     count = common_batch({"photograph": photograph, "drawn": drawn, "caught": caught, "rest": rest})

@@ -86,7 +86,6 @@ class Poses:
             identity by 0.05.
         translations: Offsets [scene units], vec3 of shape [batch, body].
         scales: Factors, float32 of shape [batch, body].
-
     Raises:
         ValueError: where the shapes differ, and for matrices that are no rotations. (Reading them waits for a GPU.
             While a CUDA graph is captured that cannot be, and nothing is checked.)
@@ -108,7 +107,6 @@ class Poses:
 
         Args:
             pivots: A point of each body in its own space, vec3 of shape [batch, body]; either batch may be 1.
-
         Differentiable: pivots, rotations, translations, scales.
         """
         return self._shifted(pivots, -1.0)
@@ -133,10 +131,8 @@ class Poses:
             rest: Vertices or centers at rest [scene units], vec3 of shape [batch, point]; rest or poses may have a
                 batch of 1, which then serves every instance of the other.
             bodies: Body of each point, int32 of shape [point].
-
         Returns:
             vec3 of shape [batch, point].
-
         Differentiable: rest, rotations, translations, scales.
         """
         posed = wp.empty(self._shape(rest, bodies), dtype=wp.vec3, device=rest.device)

@@ -21,8 +21,7 @@ from warpshadow.stages.ray_tracing import RAISE, ROUNDING, UPRIGHT
 PACKET = CHUNK
 """Rays of a packet."""
 
-_LEAF = 4
-"""Faces of a leaf at most."""
+_LEAF = 4  # faces of a leaf at most
 
 _SLACK = 2.0**-20
 """How far leaves reach beyond their faces, as a part of their largest coordinate: points lie on faces to rounding.
@@ -221,7 +220,6 @@ def make_find_open() -> wp.Function:
             toward: Directions of the rays.
             facing_rays: Bits of the rays to trace, which are above the horizon.
             last: A face that is likely to block them, −1 for none.
-
         Returns:
             Bits of the rays that escape; and a face that blocked some, or ``last``.
         """

@@ -189,13 +189,10 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
         points: Receiver positions [scene units], vec3, shape [batch, vertex].
         normals: Unit normals of the receivers, vec3, shape [batch, vertex].
         directions: Unit directions toward the light, vec3, shape [direction].
-
     Returns:
         1 where the ray escapes, else 0; uint8, shape [batch, vertex, direction].
-
     Raises:
         ValueError: naming the argument whose shape or value does not fit.
-
     Differentiable: no.
     """
     check.shape("points", points.shape, ("batch", "vertex"))
@@ -250,10 +247,8 @@ def trace_shading(
         normals: Unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light.
         progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         Shading, vec3 of shape [receiver].
-
     Differentiable: no.
     """
     device = points.device
@@ -320,10 +315,8 @@ def trace_cells(
         numbers: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any company.
         samples: Directions drawn from the light.
         progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         ∫ L V max(n·ω, 0) dω / π over each cell, float32 of shape [receiver, channel, cell].
-
     Differentiable: no.
     """
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count

@@ -184,11 +184,9 @@ def find_receivers(
             share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         shares_surfaces: Whether those that see different faces of one smooth surface share a receiver, too.
-
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
         sample has room for one.
-
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
@@ -257,7 +255,6 @@ def receivers_on_faces(
         barycentrics: Where on them, shape [receiver, 3].
         bodies: Body of each, −1 for receivers that need not be told apart, shape [receiver], runs of the same one after
             another. None where all share their blockers.
-
     Differentiable: positions, normals.
     """
     device = positions.device
@@ -286,7 +283,6 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`, whose edges have colors of their
             own.
         vertex_count: Number of vertices.
-
     Returns:
         bool of shape [1, vertex], or [2, vertex] where fragments have sides: the union over all instances, so that all
         have as many receivers.

@@ -100,16 +100,13 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
         parameters: Shape [batch, body]; the dtype decides their meaning: vec4, quaternions (x, y, z, w) of any length
             from 1e-18 on; vec3, axis-angle vectors [radians], smooth at 0; :data:`Vec6`, the first two columns, of
             which Gram–Schmidt makes a rotation (Zhou et al. 2019); mat33, any matrix, whose nearest rotation is taken.
-
     Returns:
         Rotations, mat33 of shape [batch, body].
-
     Raises:
         ValueError: for another dtype, for NaN, Inf and numbers beyond 1e18, and for parameters without a rotation:
             quaternions and columns of length 0, parallel columns, and matrices that are as near to several rotations,
             as matrices of rank 1 and mirrored rotations are. (Reading them waits for a GPU. While a CUDA graph is
             captured that cannot be, and nothing is checked.)
-
     Differentiable: parameters.
     """
     if parameters.dtype not in (*_ROTATION_KERNELS, wp.mat33):

@@ -334,7 +334,6 @@ def find_sample_receivers(
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: What samples see, of one instance, where those of a pixel share a receiver that see different faces
             of one smooth surface, too; None where they do not.
-
     Differentiable: barycentrics, where receivers see them.
     """
     shape, device = fragments.face_ids.shape, fragments.face_ids.device
@@ -424,7 +423,6 @@ def _in_rooms(view: np.ndarray, room: np.ndarray, view_count: int, room_count: i
     Args:
         view, room: Of each item.
         view_count, room_count: Numbers of them.
-
     Returns:
         The place of each; and where the rooms begin, and the last ends.
     """

@@ -15,11 +15,8 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, check_count
 from warpshadow.stages.transfer import are_up, cosines
 
-_SLAB = 256
-"""Receivers whose gradients to light a thread sums before it adds them to the others'."""
-
-_COEFFICIENT_COST = 0.4
-"""Nanoseconds that a coefficient of a receiver takes."""
+_SLAB = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
+_COEFFICIENT_COST = 0.4  # nanoseconds that a coefficient of a receiver takes
 
 
 wp.set_module_options({"max_unroll": 1})
@@ -178,10 +175,8 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
             Either batch may be 1 and then serves every instance of the other.
         maximum: Largest magnitude of a coefficient.
-
     Returns:
         Shading, vec3 of shape [batch, vertex].
-
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))
@@ -314,10 +309,8 @@ def shade_cells(
         directions: Unit vectors ω, NumPy of shape [direction, 3].
         light: L, linear RGB, vec3 of shape [batch, direction]; its batch may be 1.
         maximum: Largest magnitude of light.
-
     Returns:
         Shading, vec3 of shape [batch, receiver].
-
     Differentiable: transmittance, normals. Not: light.
     """
     count, device = len(directions), normals.device

@@ -16,8 +16,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.rasterize import Fragments
 
-_FACE_RUN = 1024
-"""Faces that a thread owns on a CPU, so that it finds the camera's eye once for all of them."""
+_FACE_RUN = 1024  # faces that a thread owns on a CPU, so that it finds the camera's eye once for all of them
 
 
 @wp.func
@@ -110,9 +109,7 @@ def find_sides(
         faces: Vertex indices, vec3i of shape [face].
         two_sided: The faces of which both sides can be seen, int32 of shape [item].
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
-        clip_matrices: Cameras, mat44 of shape [batch].
-            Either of these batches may be 1 and then serves every instance.
-
+        clip_matrices: Cameras, mat44 of shape [batch]. Either of these batches may be 1 and then serves every instance.
     Returns:
         Fragments with sides; the same as before if no sample sees a back. (That is read back, which waits for the
         device. While a CUDA graph is captured nothing is, and there always are sides.)

@@ -41,8 +41,7 @@ from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, edge_li
 LEAST_DISTANCE = 0.02
 """Distance of an edge [samples] below which rounding outweighs how color changes on the way to it."""
 
-_COST = 20.0
-"""Nanoseconds that a sample takes."""
+_COST = 20.0  # nanoseconds that a sample takes
 
 
 @wp.func
@@ -169,11 +168,9 @@ def moving_radiance(
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
-
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
-
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
     samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points.
     """

@@ -16,11 +16,8 @@ from warpshadow.device.parallel import split_row
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix, sparray, spmatrix
 
-_ENTRY_COST, _ROW_COST = 2.5, 4.0
-"""Nanoseconds that an entry takes, and a row beside."""
-
-_RUN = 32
-"""Rows that a thread owns on a CPU, where starting one takes longer than a row of a few entries."""
+_ENTRY_COST, _ROW_COST = 2.5, 4.0  # nanoseconds that an entry takes, and a row beside
+_RUN = 32  # rows that a thread owns on a CPU, where starting one takes longer than a row of a few entries
 
 
 class Entries(NamedTuple):
@@ -105,10 +102,8 @@ def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = 
         values: vec3 of shape [batch, column].
         plus: Added to the product, vec3 of shape [batch, row].
             Either batch may be 1 and then serves every instance of the other.
-
     Returns:
         vec3 of shape [batch, row].
-
     Differentiable: values, plus. Exact, being linear. Not: the matrix.
     """
     check.shape("values", values.shape, ("batch", matrix.shape[1]))

@@ -12,8 +12,7 @@ from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
 
-_RAY_COST = 60.0
-"""Nanoseconds that a ray takes."""
+_RAY_COST = 60.0  # nanoseconds that a ray takes
 
 
 @functools.cache
@@ -82,10 +81,8 @@ def trace_transfer(
             coefficient].
         count: Number of directions, evenly over the sphere.
         progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         Transfer vectors, float32 of shape [receiver, coefficient].
-
     Differentiable: no.
     """
     directions = fibonacci(-(-count // CHUNK) * CHUNK)

@@ -37,8 +37,7 @@ from warpshadow.stages.sh_kernels import (
     zonal_type,
 )
 
-_CELL_COST = 0.3
-"""Nanoseconds that a cell of a receiver takes."""
+_CELL_COST = 0.3  # nanoseconds that a cell of a receiver takes
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -156,10 +155,8 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         normals: Unit normals, vec3 of shape [batch, vertex].
         order: Number of SH bands, 2 to 8.
         bands: Number of bands that the light has, all of them by default; of others no product is computed.
-
     Returns:
         Transfer vectors, float32 of shape [batch, vertex, bands²].
-
     Differentiable: visibility, normals.
     """
     sh.check_order(order)
@@ -244,10 +241,8 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
         lobes: K, float32 of shape [batch, vertex, order²].
         order: Number of SH bands, 2 to 8.
         bands: As for :func:`sh_transfer`.
-
     Returns:
         Transfer vectors, float32 of shape [batch, vertex, bands²].
-
     Differentiable: visibility, lobes.
     """
     sh.check_order(order)
@@ -357,10 +352,8 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         transmittance: Float32 of shape [batch, vertex, direction].
         normals: Unit normals, vec3 of shape [batch, vertex].
         directions: Unit vectors ω, NumPy of shape [direction, 3].
-
     Returns:
         Transfer vectors, float32 of shape [batch, vertex, direction].
-
     Differentiable: transmittance, normals.
     """
     count = len(directions)

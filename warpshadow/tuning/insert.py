@@ -16,8 +16,7 @@ from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.scene.scene import SCENE, Scene
 from warpshadow.tuning.renderer import Renderer
 
-_MOSTLY = 0.5
-"""Part of a pixel that bodies cover, above which it is theirs."""
+_MOSTLY = 0.5  # part of a pixel that bodies cover, above which it is theirs
 
 _TENTH = 0.1
 """Share of white pixels, more among the inserted bodies than in the photograph, above which a remark is made."""
@@ -44,14 +43,11 @@ def insert(
         exposure: Factor of the bodies' radiance in the photograph, in stops.
         device: Warp device.
         progress: Show progress where something takes longer than a second.
-
     Warns:
         Where more of the bodies is brighter than white, 1, than of the photograph, by a tenth: how much, and the
         exposure with which 1% is.
-
     Returns:
         Linear RGB, float32 of the photograph's shape; :func:`warpshadow.write_image` writes it as a picture.
-
     Raises:
         ValueError: for a photograph of other proportions than the camera's, and a scene without a catcher.
     """

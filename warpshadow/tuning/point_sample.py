@@ -46,10 +46,8 @@ class PointSample:
         seed: Of the choice of points.
         device: Where to compute.
         progress: Show progress where something takes longer than a second.
-
     Attributes:
         bodies: Body of each point, shape [point].
-
     Raises:
         ValueError: where the camera sees nothing, or no light falls on the visible surfaces.
     """
@@ -164,7 +162,6 @@ def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarra
     Args:
         view: The view.
         chosen: Flat indices of samples that see a face, shape [point].
-
     Returns:
         Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered
         likewise, [point, 3]; and barycentric coordinates, [point, 3].
@@ -184,7 +181,6 @@ def places_of_receivers(
     Args:
         vertices, barycentrics: Of the points, from :func:`seen_on_faces`.
         is_own: Points that are receivers themselves, bool of shape [point].
-
     Returns:
         A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
         of each point, shape [point, 3].

@@ -68,7 +68,6 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
         scene: The scene.
         device: Warp device.
         progress: Show progress where something takes longer than a second.
-
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """

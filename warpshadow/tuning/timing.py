@@ -35,7 +35,6 @@ def image_times(
         runs: Timed calls of each, in turns.
         device: Where to render.
         progress: Show progress.
-
     Returns:
         Milliseconds of each scene's image, forward.
     """

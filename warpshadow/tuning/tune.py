@@ -215,13 +215,10 @@ def tune(
             number is, and others where fits are kept already.
         device: Where to render.
         progress: Show progress, and all errors before anything is timed.
-
     Returns:
         The choice, and all trials. If no setting reaches the target, it is the nearest.
-
     Raises:
         ValueError: where the camera sees nothing.
-
     Warns:
         Where the machine is busy already: its load average is above its number of cores.
     """
@@ -326,7 +323,6 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
         scene: The scene. One with another method is returned as it is, and "directional" if it names none.
         device: Where to render.
         progress: Show progress.
-
     Returns:
         The scene, "auto" replaced. It is the same object each time, so that the choice is made once for a scene.
     """

@@ -43,7 +43,6 @@ class ViewerApp:
         device: Warp device.
         progress: Show progress where something takes longer than a second.
         path: The scene's file, which is saved with the changes in it; None where it has none.
-
     Attributes:
         painter: Paints pictures.
         loop: Renders for pages.

@@ -26,7 +26,6 @@ class FitPage:
     Args:
         host: Address to serve at; others than this machine's own let everybody in who can reach it.
         port: Port, or the next that is free.
-
     Attributes:
         url: Where it is.
     """

@@ -49,7 +49,6 @@ class Loop:
         paint: Paints a picture.
         viewer_state: Initial viewer state.
         rest: So long after the last request all rests [s].
-
     Attributes:
         viewer_state: The viewer state.
         depth: Whether pages are sent how far away everything is.
@@ -97,7 +96,6 @@ class Loop:
 
         Args:
             changes: Fields of :class:`ViewerState`.
-
         Raises:
             ValueError: for an invalid state; then nothing changes.
         """

@@ -18,7 +18,6 @@ def loss_plot(stages: Sequence[Sequence[Sequence[float]]]) -> str:
     Args:
         stages: Losses of the iterations of each descent of each stage; values that are not above 0, or not finite, are
             left out.
-
     Returns:
         An <svg>; nothing where there is no loss to draw.
     """

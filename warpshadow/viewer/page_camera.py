@@ -31,7 +31,6 @@ class PageCamera:
         fov_y: Vertical field of view [degrees].
         width: Of the canvas [pixels].
         height: Of the canvas [pixels].
-
     Raises:
         ValueError: for numbers that are not finite, or larger than any page is.
     """

@@ -67,7 +67,6 @@ class Painter:
         scene: The scene; a method "auto" has been replaced.
         device: Warp device.
         progress: Show progress where something takes longer than a second.
-
     Attributes:
         scene: The scene.
         page_scale: Units of a page in a unit of the scene.
@@ -248,7 +247,6 @@ def picture(image: np.ndarray, stops: float, behind: np.ndarray) -> np.ndarray:
         stops: Exposure.
         behind: Linear RGB of the background: a color of the picture [3], or radiance [height, width, 3], which is
             exposed like the rest.
-
     Returns:
         uint8 of shape [height, width, 3], but for a code the same.
     """
@@ -277,7 +275,6 @@ def error_picture(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     Args:
         image: Linear RGB and coverage, shape [height, width, 4].
         truth: Likewise.
-
     Returns:
         uint8 of shape [height, width, 3].
     """
@@ -295,7 +292,6 @@ def distances(renderer: Renderer, view: View) -> np.ndarray:
     Args:
         renderer: Made the view.
         view: The view.
-
     Returns:
         Scene units, shape [height, width].
     """

@@ -62,7 +62,6 @@ class FrameRate:
             last: That of the last image.
             seconds: Its time.
             canvas: Pixels that the page has.
-
         Returns:
             None where no better one can be seen, or would take too long.
         """

@@ -32,7 +32,6 @@ class Server(viser.ViserServer):
     Args:
         host: Address to serve at; others than this machine's own let everybody in who can reach it.
         port: Port, or the next that is free.
-
     Attributes:
         url: Where its page is.
     """

@@ -25,7 +25,6 @@ class Viewer:
     Args:
         url: Where its page is.
         close: Ends it.
-
     Attributes:
         url: Where its page is.
     """
@@ -67,7 +66,6 @@ class FitViewer(Viewer):
         host: Address to serve at. The default is for this machine alone; at others everybody who can reach them sees
             the fit, and can stop it.
         port: Port, or the next one that is free.
-
     Raises:
         ImportError: without viser.
     """
@@ -112,10 +110,8 @@ def view(
         browser: Whether to open a browser; None for yes, unless this is a notebook, which shows the page itself.
         device: Warp device.
         progress: Show progress where something takes longer than a second.
-
     Returns:
         The viewer. A script ends with ``viewer.wait()``, since pages are served only while the process runs.
-
     Raises:
         ImportError: without viser.
     """

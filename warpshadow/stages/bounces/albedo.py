@@ -21,7 +21,6 @@ def mean_over_vertices(patches: Patches, positions: np.ndarray, faces: np.ndarra
         patches: Of a body.
         positions: Its vertices [units of the body], shape [vertex, 3].
         faces: Its faces, shape [face, 3].
-
     Returns:
         Shape [patch, vertex]; rows sum to 1, rows of patches without an area are empty.
     """
@@ -49,7 +48,6 @@ def mean_over_texels(
         uvs: Texture coordinates, shape [uv, 2].
         uv_faces: Indices of them, shape [face, 3].
         size: Height and width of the texture.
-
     Returns:
         Shape [patch, texel]; rows sum to 1, rows of patches without an area are empty.
     """

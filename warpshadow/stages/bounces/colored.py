@@ -16,8 +16,7 @@ from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
 
-_COEFFICIENT_COST, _ROW_COST = 1.0, 8.0
-"""Nanoseconds that a coefficient of a receiver takes, and a receiver beside."""
+_COEFFICIENT_COST, _ROW_COST = 1.0, 8.0  # nanoseconds that a coefficient of a receiver takes, and a receiver beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +87,8 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     Args:
         transfer: Of the receivers.
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
-
     Returns:
         vec3 of shape [batch, receiver].
-
     Differentiable: light. Exact, being linear. Not: transfer.
     """
     check.shape("light", light.shape, ("batch", transfer.columns.shape[0]))

@@ -15,8 +15,7 @@ from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_COUNTED = 1 << 22
-"""Counts that are held at once [receivers × patches]."""
+_COUNTED = 1 << 22  # counts that are held at once [receivers × patches]
 
 GOLDEN = (5**0.5 - 1) / 2
 """Turn from ray to ray, as a part of a full turn."""
@@ -111,10 +110,8 @@ def trace_factors(
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver.
         progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         F, float32 of shape [receiver, patch].
-
     Differentiable: no.
     """
     from scipy.sparse import csr_matrix, vstack

@@ -16,8 +16,7 @@ CACHE_POINT_COUNT = 2048
 
 _NEIGHBORS = 3
 
-_TURN = 0.1
-"""Distance that a difference of normals by 1 counts as, in parts of the receivers' extent."""
+_TURN = 0.1  # distance that a difference of normals by 1 counts as, in parts of the receivers' extent
 
 
 def choose_cache_points(points: np.ndarray, count: int = CACHE_POINT_COUNT) -> np.ndarray:
@@ -42,7 +41,6 @@ def interpolation(points: np.ndarray, normals: np.ndarray, cache_points: np.ndar
         points: Receivers, shape [receiver, 3].
         normals: Their unit normals, shape [receiver, 3].
         cache_points: Which of them are cache points, shape [cache point].
-
     Returns:
         Shape [receiver, cache point]; rows sum to 1.
     """

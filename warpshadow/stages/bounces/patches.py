@@ -45,8 +45,7 @@ _COMPACT = np.repeat([1.0, 10.0], 3)
 once, and leave out spheres below the horizon of all: in a city of 60 boxes and cylinders that saves a fifth of their
 time."""
 
-_COMPACT_RUN = 4
-"""Patches that are best near each other."""
+_COMPACT_RUN = 4  # patches that are best near each other
 
 _LIFT = 1e-4
 """How far above a piece rays start that find out whether it is inside another part, in units of the body's size: where
@@ -54,8 +53,7 @@ two parts touch, each is inside the other."""
 
 _LLOYD_STEPS = 8
 
-_LEARNED = 20_000
-"""Pieces that k-means looks at, at most."""
+_LEARNED = 20_000  # pieces that k-means looks at, at most
 
 
 class Pieces(NamedTuple):
@@ -139,7 +137,6 @@ def find_patches(
         count: Number of patches, at most. A body of few faces has fewer.
         sources: Number of sources of each, at most.
         device: Where rays find out what is inside.
-
     Returns:
         Patches; none where no face has an area.
     """
@@ -194,10 +191,8 @@ def find_plane_patches(
         is_two_sided: Whether the back sends light, too.
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
-
     Returns:
         Patches, row by row: texels off the mesh have no area and no source.
-
     Raises:
         ValueError: for a body that does not lie in a plane.
     """

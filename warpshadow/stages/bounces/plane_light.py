@@ -53,11 +53,8 @@ from warpshadow.stages.planes.cells import (
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import multiply
 
-_CELL_COST = 15.0
-"""Mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not."""
-
-_LEAST = wp.constant(1.0e-30)
-"""The least Σ s."""
+_CELL_COST = 15.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
+_LEAST = wp.constant(1.0e-30)  # the least Σ s
 
 # Scratch of a receiver, vec3. Its position relative to each plane f, whose gradients have the same places:
 #     4 f        where it is along both axes, and its height
@@ -477,10 +474,8 @@ def plane_light(
         fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
             :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
-
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-
     Differentiable: points, normals, transmittance, frames, radiosity, fronts.
     """
     check_planes(planes, points, frames, directions, skip)

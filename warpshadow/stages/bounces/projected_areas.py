@@ -104,10 +104,8 @@ def turn_from_planes(
             :func:`.fronts.find_fronts`.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
         planes: The planes. Planes that cast no shadow do not count.
-
     Returns:
         n′, vec3 of shape [batch, source]. Any batch may be 1.
-
     Differentiable: points, normals, radii, fronts, frames.
     """
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
@@ -166,10 +164,8 @@ def find_projected_areas(
         transmittance: T, self-transmittance of each source, float32 of shape [batch, source, direction].
         mean: The matrix w, [patch, source], from :func:`.radiosity.mean_over_sources`.
         directions: Unit vectors ω of the cells, from a receiver towards the patch, NumPy of shape [direction, 3].
-
     Returns:
         g, float32 of shape [batch, patch, direction]. Any batch may be 1.
-
     Differentiable: normals, transmittance.
     """
     check_directions(directions)

@@ -19,8 +19,7 @@ from warpshadow.device.launch import launch
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_BELOW = wp.constant(0.5)
-"""How far below its patch a center is, in radii."""
+_BELOW = wp.constant(0.5)  # how far below its patch a center is, in radii
 
 
 @wp.kernel
@@ -57,10 +56,8 @@ def place_proxies(
         blocker_radii: Radii of the spheres that block light [scene units], float32 of shape [batch, sphere].
         numbers: One of them beside each patch, −1 for patches that nothing stands in for, shape [patch].
         ratios: Radius of each proxy in radii of that sphere, shape [patch].
-
     Returns:
         Centers, vec3 of shape [batch, patch], and radii, float32 of the same shape.
-
     Differentiable: points and normals of the sources, blocker_radii.
     """
     check.shape("numbers", numbers.shape, (mean.shape[0],))

@@ -25,8 +25,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
-_HIDDEN = wp.constant(0.01)
-"""Part of its area that a patch counts for where it shows none."""
+_HIDDEN = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
 
 _SHOWN = 0.25
 """Part of its area that a convex body shows on average: the weight of spheres without patches, which are black."""
@@ -42,7 +41,6 @@ def patches_of_clusters(
         nearest: Patch nearest to each sphere, which a sphere that has none takes; −1 if its body is black, as the
             sphere then is. Shape [sphere].
         merging: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-
     Returns:
         Where the patches of each node begin, and the end, int32 of shape [node + 1]; and these patches, int32.
     """
@@ -99,10 +97,8 @@ def find_proxy_radiance(
             :func:`.projected_areas.find_projected_areas`.
         areas: Of patches [scene units²], not negative, float32 of shape [patch].
         starts, numbers: Patches of each node, from :func:`patches_of_clusters`.
-
     Returns:
         Σ A (g + 0.01) B / Σ A and Σ A (g + 0.01) / Σ A, vec4 of shape [batch, node, direction].
-
     Differentiable: radiosity, shown.
     """
     batch_count = common_batch({"radiosity": radiosity, "shown": shown})

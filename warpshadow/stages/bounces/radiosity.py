@@ -49,10 +49,8 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp
         albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
         light: Light that each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
         mean: The weights w, from :func:`mean_over_sources`.
-
     Returns:
         vec3 of shape [batch, patch]; the batch of albedo or light may be 1, and then serves every instance.
-
     Differentiable: albedo, light.
     """
     check.shape("albedo", albedo.shape, ("batch", mean.shape[0]))

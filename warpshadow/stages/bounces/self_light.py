@@ -35,10 +35,8 @@ def self_light(factors: SparseMatrix, radiosity: wp.array, rows: wp.array, weigh
         radiosity: Of the body's patches, vec3 of shape [batch, patch].
         rows: Probes around each receiver, vec3i of shape [batch, receiver].
         weights: Their weights, vec3 of shape [batch, receiver].
-
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver].
-
     Differentiable: radiosity, weights. Not: factors, rows.
     """
     check.shape("weights", weights.shape, rows.shape)

@@ -58,17 +58,13 @@ from warpshadow.stages.visibility.traversal import (
     sphere_view_type,
 )
 
-_CORE = 0.25
-"""Radii within which a sphere's weight hardly grows any more."""
+_CORE = 0.25  # radii within which a sphere's weight hardly grows any more
 
 _NEAREST2 = 1.0e-12
 """The least d² + (r/4)², in squares of the radius of the largest run of spheres: so √w is at most 1e12."""
 
-_LEAST = 1.0e-30
-"""The least denominator of R; spheres that block so little of a cell that they have less leave T at F."""
-
-_SUMS = 4
-"""Σ w a L, of three colors, and Σ w a S."""
+_LEAST = 1.0e-30  # the least denominator of R; spheres that block so little of a cell that they have less leave T at F
+_SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 
 @functools.cache
@@ -510,13 +506,10 @@ def sphere_light(
         merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traverse.find_clusters`, where they are found already.
-
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
-
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
-
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, unblocked. (The derivative in T is
     that at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """

@@ -34,14 +34,9 @@ from warpshadow.device.launch import launch
 TERM_COUNT = 5
 """Radiosities from which the tail is found."""
 
-_MOST = wp.constant(wp.float64(50.0))
-"""Length of R in that of D_1, at most."""
-
-_SMALL = wp.constant(wp.float64(1.0e-7))
-"""Added to the diagonal of M."""
-
-_LEAST = wp.constant(wp.float64(1.0e-60))
-"""The least <D, D>: less is darkness."""
+_MOST = wp.constant(wp.float64(50.0))  # length of R in that of D_1, at most
+_SMALL = wp.constant(wp.float64(1.0e-7))  # added to the diagonal of M
+_LEAST = wp.constant(wp.float64(1.0e-60))  # the least <D, D>: less is darkness
 
 
 @wp.func
@@ -154,10 +149,8 @@ def with_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
         radiosities: By direct light, and after one to four bounces, vec3 of shape [batch, patch]; a batch of 1
             serves every instance.
         areas: Of patches [scene units²], not negative, shape [patch].
-
     Returns:
         vec3 of shape [batch, patch].
-
     Differentiable: radiosities.
     """
     if len(radiosities) != TERM_COUNT:

@@ -13,8 +13,7 @@ from warpshadow.stages.ray_tracing import nearest
 from warpshadow.stages.self_visibility.probes import VisibilityProbes
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
-_RAYS = 64
-"""Directions that tell on which side faces are met."""
+_RAYS = 64  # directions that tell on which side faces are met
 
 
 @wp.kernel(enable_backward=False)
@@ -63,7 +62,6 @@ def find_buried(
         normals: Unit normals [row, 3].
         probe_count: Number of probes.
         rows: What they see, where that is known.
-
     Returns:
         Bool of shape [row].
     """
@@ -83,7 +81,6 @@ def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray
     Args:
         probes: The probes.
         is_buried: Bool of shape [row]: the probes, and their backs if they have any.
-
     Returns:
         Numbers of rows, int of shape [row]. A buried row from which no way leads to another kind keeps its own.
     """

@@ -31,14 +31,9 @@ from warpshadow.stages.self_visibility.lookup import ResamplingKernels, Resampli
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
-_LOOKUP_COST = 0.2
-"""Nanoseconds that a lookup takes."""
-
-_MEAN_LOOKUPS = 6
-"""Lookups of a cell, for the cost."""
-
-_WORD = wp.constant(4)
-"""Coarse cells of a word of 32 bits."""
+_LOOKUP_COST = 0.2  # nanoseconds that a lookup takes
+_MEAN_LOOKUPS = 6  # lookups of a cell, for the cost
+_WORD = wp.constant(4)  # coarse cells of a word of 32 bits
 
 
 @functools.cache
@@ -307,10 +302,8 @@ def gather_self_transmittance(
         lookup: Lookups of the cells of directions.
         kernels: From which the lookup is.
         rows: Visibility of the probes.
-
     Returns:
         Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
-
     Differentiable: weights of places and of the lookup. Not: normals (they only cut off directions below the horizon).
     """
     count = common_batch({"normals": normals, "places": places.rows, "rotations": lookup.counts})

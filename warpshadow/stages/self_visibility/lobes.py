@@ -28,11 +28,8 @@ from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, zonal_type
 
-_TURN_COST = 0.5
-"""Nanoseconds that an entry of D takes for a receiver."""
-
-_PART = 1 << 9
-"""Rows that are projected at once."""
+_TURN_COST = 0.5  # nanoseconds that an entry of D takes for a receiver
+_PART = 1 << 9  # rows that are projected at once
 
 
 def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.array:
@@ -42,7 +39,6 @@ def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.ar
         rows: Visibility of the probes past their body.
         normals: Their unit normals in the frame of the body [row, 3]; a zero normal has no lobe.
         order: Number of SH bands n.
-
     Returns:
         L, float32 of shape [row, order²]. Not differentiable.
     """
@@ -252,10 +248,8 @@ def self_visibility_lobes(
         turned: How it is turned.
         order: Number of SH bands n.
         bands: Number of bands to be found; all by default.
-
     Returns:
         K, float32 of shape [batch, receiver, bands²].
-
     Differentiable: rotations, as they turn on; weights of places.
     """
     bands = order if bands is None else bands

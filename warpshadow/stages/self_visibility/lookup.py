@@ -21,14 +21,9 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.trace import RUN
 
-_LEAST_REACH = 2.2
-"""Least h, in radii of the coarse cells."""
-
-_MOST_RAYS = 32
-"""Rays that a cell looks up on average at most; a wider one looks up coarse cells."""
-
-_CELL_COST = 1000.0
-"""Nanoseconds that a cell takes. Instances are shared by threads."""
+_LEAST_REACH = 2.2  # least h, in radii of the coarse cells
+_MOST_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
+_CELL_COST = 1000.0  # nanoseconds that a cell takes. Instances are shared by threads
 
 
 class ResamplingKernels(NamedTuple):
@@ -203,7 +198,6 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
         rotations: R of each body, mat33 of shape [batch, body].
         body: Whose is meant.
         kernels: Where cells look.
-
     Differentiable: rotations.
     """
     shape = len(rotations), kernels.directions.size

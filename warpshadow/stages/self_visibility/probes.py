@@ -21,20 +21,14 @@ _SMALL_FACES = 10_000
 lose 3.5%.
 """
 
-_LONG = 1.2
-"""Longest edge where samples receive, in edges of that even cut."""
+_LONG = 1.2  # longest edge where samples receive, in edges of that even cut
 
 _LONG_BETWEEN_VERTICES = 4.0
 """The same where only vertices receive: probes between them are there for vertices that are buried …"""
 
-_SLENDER = 3.0
-"""… and only on edges that are longer than a third of all edges by such a factor: on edges of slivers."""
-
-_MAX_PROBES = 2**14
-"""Probes of a body at most, as long as it has fewer than half as many vertices."""
-
-_FEWER = 1.3
-"""How much longer edges may be at each try to have fewer probes."""
+_SLENDER = 3.0  # … and only on edges that are longer than a third of all edges by such a factor: on edges of slivers
+_MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices
+_FEWER = 1.3  # how much longer edges may be at each try to have fewer probes
 
 
 class ProbeWeights(NamedTuple):

@@ -25,11 +25,8 @@ from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 
-_PACKET_COST = 2000.0
-"""Nanoseconds that a packet takes."""
-
-_BRIGHT = 0.05
-"""Share of all light that a sun cell has at least."""
+_PACKET_COST = 2000.0  # nanoseconds that a packet takes
+_BRIGHT = 0.05  # share of all light that a sun cell has at least
 
 
 class SunCells(NamedTuple):
@@ -148,10 +145,8 @@ def trace_sun_cells(
         rotations: R of each body, mat33 of shape [batch, body].
         body: Whose is meant.
         cells: The sun cells.
-
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, receiver, 16].
-
     Differentiable: no.
     """
     device, cell_count = rotations.device, int((cells.places >= 0).sum())

@@ -39,14 +39,9 @@ _MIRRORED = 3.5
 _LEVEL = 2.0
 """Angle below the horizon, in radii of a ray's cell, to which mirrored rays are traced: none above may be near."""
 
-_GRID = 128
-"""Rows of the map of directions, each 1.4° high, that has the nearest ray."""
-
-_BLOCK = 2**22
-"""Rays that are traced between two states of a progress bar."""
-
-_RAY_COST = 30.0
-"""Nanoseconds that a ray takes."""
+_GRID = 128  # rows of the map of directions, each 1.4° high, that has the nearest ray
+_BLOCK = 2**22  # rays that are traced between two states of a progress bar
+_RAY_COST = 30.0  # nanoseconds that a ray takes
 
 
 def trace_seconds(row_count: int, face_count: int) -> float:
@@ -210,7 +205,6 @@ def trace_rows(
         before: Bits of the first rows that an interrupted call traced, uint32 of shape [traced row, ray / 32].
         keep: Gets the rows traced so far, after every block of them.
         progress: Show a progress bar where it takes longer than a second.
-
     Differentiable: no.
     """
     device, row_count = tree.corners.device, len(points)

@@ -131,7 +131,6 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: F
         edges: Vertices of the line on each way, vec2i of shape [entry, 4].
         entries: Of each sample, int32 of shape [sample].
         seen: The fragments.
-
     Returns:
         The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
         vec3 of shape [entry, 4], zero where there is no line.

@@ -95,7 +95,6 @@ def find_edge_colors(
         receivers: Receiver of each vertex, −1 for none, int32 of shape [vertex]; where the silhouettes' fragments have
             sides, the backs' receivers follow.
         albedo: Of the samples, vec3 of shape [batch, height, width].
-
     Returns:
         For each way of each entry, the color of its sample's surface at the edge, vec4 of shape [instance, entry, 4],
         for :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes`.

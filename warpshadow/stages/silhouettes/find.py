@@ -48,8 +48,7 @@ LEAST_OPENING = 1e-4
 # Rasterization moves vertices by up to 1/8192 sample: an edge may be this far on the wrong side of a center [samples].
 _SNAP = 1.0 / 2048.0
 
-_FACE_COST = 40.0
-"""Nanoseconds that a face takes, if it is small."""
+_FACE_COST = 40.0  # nanoseconds that a face takes, if it is small
 
 # In place of the silhouette between two samples, which may be none (−1).
 _UNKNOWN = -2
@@ -444,7 +443,6 @@ def find_silhouettes(
             without it there are none, and where bodies intersect they have no gradient.
         creases: Of each face the edges that are creases, 2ᵏ for that opposite to corner k, int32 of shape [face]; None
             where there are none.
-
     Returns:
         Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. While a
         CUDA graph is captured they have one for each sample instead, and nothing is read.

@@ -138,10 +138,8 @@ def smooth_silhouettes(
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
         edge_colors: Of :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`, by which edges pull at
             vertices; by default the colors of samples.
-
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
-
     Differentiable: image, clip_positions. Without edge colors an edge has the colors of the samples beside it: where
     shading changes by δ over a sample there, its gradient is δ/2 off. Excluded are intersections within one surface,
     cuts by the near plane, and surfaces that leave the image: there is no neighbor to take from.

@@ -191,10 +191,8 @@ def find_footprints(
             Any batch may be 1 and then serves every instance.
         texture_of_face: Texture on each face, -1 for none, int32 of shape [face].
         textures: The textures.
-
     Returns:
         Footprints.
-
     Differentiable: clip_positions, barycentrics of the fragments, uvs; the width and the direction of a footprint
     included, which matter: neglected, they were 1% to 15% of the gradient of a textured plane's pose.
     """

@@ -189,11 +189,9 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
             1 and then serves every instance.
         coarsest: Coarsest level that is wanted, 0 for the image itself, if footprints are known and take none beyond;
             by default all.
-
     Returns:
         All levels, except levels beyond the coarsest, which are unwritten or left out. One image without coarser levels
         is not copied.
-
     Differentiable: images.
     """
     if not images:

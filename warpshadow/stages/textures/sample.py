@@ -19,8 +19,7 @@ from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures
 
-_COST = 10.0
-"""Nanoseconds that a sample takes."""
+_COST = 10.0  # nanoseconds that a sample takes
 
 
 @wp.struct
@@ -346,10 +345,8 @@ def sample_albedo(
         textures: The textures.
         footprints: Of the samples, from :func:`warpshadow.stages.textures.footprint.find_footprints`, with textures of
             these sizes. Any batch may be 1 and then serves every instance.
-
     Returns:
         Reflectance, linear RGB, vec3 of shape [batch, height, width], zero where there is no face.
-
     Differentiable: textures, footprints, vertex_albedo, barycentrics of the fragments.
     """
     arrays = {"fragments": fragments.barycentrics, "vertex_albedo": vertex_albedo, "textures": textures.texels}
@@ -392,10 +389,8 @@ def textured_radiance(
         fragments, faces, vertex_albedo, textures, footprints: As for :func:`sample_albedo`.
         white: The samples if every surface were white, of :func:`warpshadow.stages.film.sample_radiance`, vec4 of shape
             [batch, height, width]; a batch of 1 serves every instance.
-
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
-
     Differentiable: textures, vertex_albedo. Not: fragments, footprints, white.
     """
     check.shape("white", white.shape, ("batch", *fragments.face_ids.shape[1:]))

@@ -16,7 +16,6 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     Args:
         textures: The textures; only their sizes matter.
         footprints: Of the samples, from :func:`warpshadow.stages.textures.footprint.find_footprints`.
-
     Returns:
         For each texture the weights of its texels, float32 of shape [batch, height, width]: 0 where none sees the
         texel, and small where it is only seen as a part of a coarser level.
@@ -37,7 +36,6 @@ def fill_unseen(texture: np.ndarray, weights: np.ndarray) -> np.ndarray:
     Args:
         texture: Linear RGB, shape [height, width, 3].
         weights: Weight of each texel in the images (:func:`seen_texels`), shape [height, width].
-
     Returns:
         The texture, filled, shape [height, width, 3]; unchanged where no texel was seen.
     """

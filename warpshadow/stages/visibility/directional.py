@@ -338,14 +338,11 @@ def transmittance(
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
-
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
-
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
-
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
     clusters.
     """

@@ -71,8 +71,7 @@ LOUD = 24.0
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
-_SQUARING_COST = 0.5
-"""Nanoseconds that exponentiation takes for a receiver and a pair of coefficients."""
+_SQUARING_COST = 0.5  # nanoseconds that exponentiation takes for a receiver and a pair of coefficients
 
 _UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
@@ -485,14 +484,11 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             a(|h|) 1 + b(|h|) h with a and b tabulated from caps of all angles.
         threshold: Largest |h|; None for the default of THRESHOLDS[base]. Beyond its limit squaring explodes, so more
             is refused.
-
     Returns:
         SH visibility, float32 of shape [batch, vertex, order²].
-
     Raises:
         ValueError: for NaN, Inf and numbers beyond 1e18. (That waits for the device. While a CUDA graph is captured,
             nothing is checked.)
-
     Differentiable: log_sh.
     """
     check.choice("base", base, THRESHOLDS)

@@ -36,8 +36,7 @@ HORIZON_FADE = 0.5
 """A sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane."""
 
 
-_PAIR_COST = 0.25
-"""Nanoseconds that a sphere costs for a receiver and a coefficient."""
+_PAIR_COST = 0.25  # nanoseconds that a sphere costs for a receiver and a coefficient
 
 
 @functools.cache
@@ -269,14 +268,11 @@ def accumulate(
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
-
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
-
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
-
     Differentiable: points, normals, centers, radii.
     """
     sh.check_order(order)

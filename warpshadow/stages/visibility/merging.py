@@ -130,7 +130,6 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     Args:
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere].
-
     Differentiable: centers, radii.
     """
     batch_count, sphere_count = radii.shape
@@ -149,7 +148,6 @@ def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Clust
 
     Raises:
         ValueError: for ``merging`` out of range.
-
     Differentiable: centers, radii.
     """
     if merged_count(radii.shape[1], merging):

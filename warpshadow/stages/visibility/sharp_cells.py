@@ -17,11 +17,8 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, LEAST_WIDTH, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-_RADII = 2.4
-"""Radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot."""
-
-_LEAST_SHARE = 0.1
-"""Share of all light that sharp cells have at least: less is not worth their time."""
+_RADII = 2.4  # radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot
+_LEAST_SHARE = 0.1  # share of all light that sharp cells have at least: less is not worth their time
 
 WIDEST_PAST_PLANES = 1.7
 """Radius up to which cells are sharp where planes block them, in radii of all cells: their edges are 0.6 times as wide
@@ -30,8 +27,7 @@ at κ = 0.35."""
 _LEAST_RADIUS = cell_radius(2048)
 """Radius [rad] down to which cells are sharp: an edge of ±0.9° at κ = 0.35, sharper than shadows of spheres are."""
 
-_CELL_COST = 5.0
-"""Nanoseconds that a sharp cell takes."""
+_CELL_COST = 5.0  # nanoseconds that a sharp cell takes
 
 
 class SharpCells(NamedTuple):
@@ -120,10 +116,8 @@ def overwrite_sharp_cells(passing: wp.array, sharp_cells: wp.array, places: np.n
         passing: Transmittance of all cells, float32 of shape [batch, receiver, direction]; it is changed.
         sharp_cells: That of :attr:`SharpCells.directions`, float32 of shape [batch, receiver, 16].
         places: Of :class:`SharpCells`.
-
     Returns:
         ``passing``.
-
     Differentiable: passing, sharp_cells.
     """
     device, row_count = passing.device, passing.shape[0] * passing.shape[1]

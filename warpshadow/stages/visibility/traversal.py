@@ -91,7 +91,6 @@ def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Cluster
     Args:
         centers, radii: Spheres, [batch, sphere].
         merging: τ, 0 for never.
-
     Differentiable: centers, radii to the nodes.
     """
     nodes, count = merge_where_far(centers, radii, merging), radii.shape[1]
@@ -114,10 +113,8 @@ def make_spheres(
         cell: Radius of a cell [rad].
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, where they are found already.
-
     Returns:
         The spheres as arrays, and as kernels see them.
-
     Differentiable: centers, radii to the nodes.
     """
     count = radii.shape[1]
