@@ -37,24 +37,17 @@ from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
-from warpshadow.stages.visibility.culling import (
-    DirectionCells,
-    make_cells,
-    make_cull,
-    make_reaches,
-    make_rises,
-    make_widen,
-)
+from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters, merged_count
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    lane_structs,
     make_load_receivers,
     make_spheres,
     make_traversal,
     receiver_lanes_type,
-    sphere_adjoint_type,
     sphere_view_type,
 )
 
@@ -89,6 +82,22 @@ def _task_type(lanes: int) -> Any:
     return LightTask
 
 
+@wp.struct
+class LightInputs:
+    """Inputs of the light that spheres send, and of its adjoint."""
+
+    points: wp.array2d(dtype=wp.vec3)
+    normals: wp.array2d(dtype=wp.vec3)
+    spheres: SphereClusters
+    cells: DirectionCells
+    proxy_radiance: wp.array3d(dtype=wp.vec4)
+    transmittance: wp.array3d(dtype=wp.float32)
+    unblocked: wp.array3d(dtype=wp.float32)
+    factor: float
+    span_count: int
+    stores_sums: bool
+
+
 @functools.cache
 def _make_begin(lanes: int) -> wp.Function:
     """Make the kernel function that finds out which receivers and directions a thread works on."""
@@ -101,52 +110,45 @@ def _make_begin(lanes: int) -> wp.Function:
     def begin(
         row: int,
         span: int,
-        span_count: int,
         worker: int,
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
-        cells: DirectionCells,
-        proxy_radiance: wp.array3d(dtype=wp.vec4),
-        transmittance: wp.array3d(dtype=wp.float32),
-        unblocked: wp.array3d(dtype=wp.float32),
-        stores_sums: bool,
+        inputs: LightInputs,
         scratch: wp.array3d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
         sums: wp.array2d(dtype=Lane),
     ):
-        batch, group = find_block(row, points.shape[1])
-        receivers = load_receivers(points, normals, batch, group)
-        item = row * span_count + span
+        batch, group = find_block(row, inputs.points.shape[1])
+        receivers = load_receivers(inputs.points, inputs.normals, batch, group)
+        item = row * inputs.span_count + span
         place = scratch_place(worker, item)
         task = LightTask()
-        task.cells = cells
+        task.cells = inputs.cells
         task.first_bundle = span * (scratch.shape[2] // BUNDLE)
         task.reached_bundles = reached_bundles[place]
         task.ends = reached_bundles[place, 2]
         task.blocked = scratch[place, 0]
         task.pulls = scratch[place, 1]
-        task.sums = sums[wp.where(stores_sums, item, place)]
-        task.proxy_radiance = proxy_radiance[instance_in(batch, proxy_radiance.shape[0])]
+        task.sums = sums[wp.where(inputs.stores_sums, item, place)]
+        task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         size = float(TINY_RADIUS)
-        for run in range(spheres.bounds_of_runs.shape[1]):
-            size = wp.max(size, spheres.bounds_of_runs[batch, run][3])
+        for run in range(inputs.spheres.bounds_of_runs.shape[1]):
+            size = wp.max(size, inputs.spheres.bounds_of_runs[batch, run][3])
         task.inverse_size = 1.0 / size
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
             at = task.first_bundle + bundle
-            if is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
+            if is_any_above(dot_direction(task.cells.axes[at], receivers.normals), -task.cells.half_angles[at][1]):
                 for i in range(BUNDLE):
                     blocked = Lane()
-                    for lane in range(wp.min(lanes, points.shape[1] - group * lanes)):
+                    for lane in range(wp.min(lanes, inputs.points.shape[1] - group * lanes)):
                         vertex = group * lanes + lane
                         maximum = float(1.0)
-                        if unblocked:
-                            maximum = unblocked[instance_in(batch, unblocked.shape[0]), vertex, at * BUNDLE + i]
-                        blocked[lane] = maximum - transmittance[batch, vertex, at * BUNDLE + i]
+                        if inputs.unblocked:
+                            serving = instance_in(batch, inputs.unblocked.shape[0])
+                            maximum = inputs.unblocked[serving, vertex, at * BUNDLE + i]
+                        blocked[lane] = maximum - inputs.transmittance[batch, vertex, at * BUNDLE + i]
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
-                        task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
+                        task.ends[bundle] = inputs.spheres.bounds_of_quads.shape[1] * ITEMS
         return batch, group, receivers, task
 
     return begin
@@ -177,7 +179,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
     begin, weigh, falloff = _make_begin(lanes), _make_weight(lanes), make_falloff(lanes)
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
+    widen, reaches, rises, soften = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
 
@@ -186,7 +188,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        cap = widen(cone.axis, cone.cosine, sine, cells)
         if rises(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             near = weigh(seen.offset, seen.curvature, task.inverse_size)
@@ -196,10 +198,8 @@ def _make_light(lanes: int) -> wp.Kernel:
                 at = task.first_bundle + bundle
                 if reaches(cap, cells.axes[at], cells.half_angles[at]):
                     for i in range(BUNDLE):
-                        t = wp.cw_mul(dot_direction(cells.directions[at * BUNDLE + i], cap.axis) - cap.cosine, slope)
+                        t, step = soften(cells.directions[at * BUNDLE + i], cap, slope)
                         if is_any_above(t, 0.0):
-                            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                             share = wp.cw_mul(opacity, step)
                             sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
                             place = (bundle * BUNDLE + i) * SUMS
@@ -213,16 +213,7 @@ def _make_light(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
-        cells: DirectionCells,
-        proxy_radiance: wp.array3d(dtype=wp.vec4),
-        transmittance: wp.array3d(dtype=wp.float32),
-        unblocked: wp.array3d(dtype=wp.float32),
-        factor: float,
-        span_count: int,
-        stores_sums: bool,
+        inputs: LightInputs,
         # scratch
         scratch: wp.array3d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
@@ -233,35 +224,19 @@ def _make_light(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers and a span of bundles, and adds to the light."""
         item, span = wp.tid()
-        batch, group, receivers, task = begin(
-            first_row + item,
-            span,
-            span_count,
-            worker,
-            points,
-            normals,
-            spheres,
-            cells,
-            proxy_radiance,
-            transmittance,
-            unblocked,
-            stores_sums,
-            scratch,
-            reached_bundles,
-            sums,
-        )
+        batch, group, receivers, task = begin(first_row + item, span, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
-        traverse(receivers, batch, spheres, Gradients(), task)
+        traverse(receivers, batch, inputs.spheres, Gradients(), task)
         total = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
                     place = bundle * BUNDLE + i
-                    omega = cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
-                    cosine = factor * wp.max(dot_direction(omega, receivers.normals), Lane(0.0))
+                    omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
+                    cosine = inputs.factor * wp.max(dot_direction(omega, receivers.normals), Lane(0.0))
                     part = wp.cw_mul(cosine, task.blocked[place])
                     part = wp.cw_div(part, wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
                     total.x += wp.cw_mul(part, task.sums[place * SUMS])
@@ -274,19 +249,14 @@ def _make_light(lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_light_adjoint(lanes: int) -> wp.Kernel:
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    ReceiverLanes, SphereView, SphereAdjoint, LightTask = (
-        receiver_lanes_type(lanes),
-        sphere_view_type(lanes),
-        sphere_adjoint_type(lanes),
-        _task_type(lanes),
-    )
+    Lane, Vectors, LightTask = lane_type(lanes), vectors_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot_direction, dot, scale = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.dot, fn.scale
     add, load, total, add_vectors = fn.add, fn.load, fn.total, fn.add_vectors
     begin, weigh = _make_begin(lanes), _make_weight(lanes)
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(True, lanes)
+    widen, reaches, rises, soften = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     LEAST = wp.constant(_LEAST)
     CORE2 = wp.constant(_CORE**2)
@@ -303,7 +273,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        cap = widen(cone.axis, cone.cosine, sine, cells)
         if rises(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             near = weigh(seen.offset, seen.curvature, task.inverse_size)
@@ -321,11 +291,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                 if reaches(cap, cells.axes[at], cells.half_angles[at]):
                     for i in range(BUNDLE):
                         omega = cells.directions[at * BUNDLE + i]
-                        t = wp.cw_mul(dot_direction(omega, cap.axis) - cap.cosine, slope)
+                        t, step = soften(omega, cap, slope)
                         if is_any_above(t, 0.0):
                             is_any_met = True
-                            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
                             weighted = wp.cw_mul(weight, task.blocked[bundle * BUNDLE + i])
                             pulled = task.pulls[bundle * BUNDLE + i]
                             sent = task.proxy_radiance[seen.node, at * BUNDLE + i]
@@ -349,17 +317,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                                 )
                                 wp.atomic_add(task.adj_radiance, seen.node, at * BUNDLE + i, adj_sent)
             if is_any_met:
+                sum_omega = Vectors(sum_x, sum_y, sum_z)
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    seen,
-                    sine,
-                    cap.cosine,
-                    cells.cos_width,
-                    cells.sin_width,
-                    slope,
-                    adj_opacity,
-                    sum_,
-                    sum_t,
-                    Vectors(sum_x, sum_y, sum_z),
+                    seen, sine, cap.cosine, cells.cos_width, cells.sin_width, slope, adj_opacity, sum_, sum_t, sum_omega
                 )
                 # w̄ w = Σ a v w = Ā A
                 nearer = (-4.0 * task.inverse_size) * wp.cw_mul(wp.cw_mul(adj_opacity, opacity), near)
@@ -376,16 +336,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
-        cells: DirectionCells,
-        proxy_radiance: wp.array3d(dtype=wp.vec4),
-        transmittance: wp.array3d(dtype=wp.float32),
-        unblocked: wp.array3d(dtype=wp.float32),
-        factor: float,
-        span_count: int,
-        stores_sums: bool,
+        inputs: LightInputs,
         sums: wp.array2d(dtype=Lane),
         adj_light: wp.array2d(dtype=wp.vec3),
         # scratch
@@ -408,45 +359,29 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
         """
         item, span = wp.tid()
-        batch, group, receivers, task = begin(
-            first_row + item,
-            span,
-            span_count,
-            worker,
-            points,
-            normals,
-            spheres,
-            cells,
-            proxy_radiance,
-            transmittance,
-            unblocked,
-            stores_sums,
-            scratch,
-            reached_bundles,
-            sums,
-        )
+        batch, group, receivers, task = begin(first_row + item, span, worker, inputs, scratch, reached_bundles, sums)
         task.adj_light = load(adj_light[batch], group)
         if adj_radiance:
-            task.adj_radiance = adj_radiance[instance_in(batch, proxy_radiance.shape[0])]
+            task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         turned = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for i in range(BUNDLE):
                     place = bundle * BUNDLE + i
                     direction = (task.first_bundle + bundle) * BUNDLE + i
-                    omega = cells.directions[direction]
+                    omega = task.cells.directions[direction]
                     inverse = wp.cw_div(Lane(1.0), wp.max(task.sums[place * SUMS + 3], Lane(LEAST)))
                     mean = Vectors(task.sums[place * SUMS], task.sums[place * SUMS + 1], task.sums[place * SUMS + 2])
                     pulled = wp.cw_mul(inverse, dot(task.adj_light, mean))
                     cosine = dot_direction(omega, receivers.normals)
                     is_up = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-                    adj_cosine = factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], pulled))
+                    adj_cosine = inputs.factor * wp.cw_mul(is_up, wp.cw_mul(task.blocked[place], pulled))
                     turned.x += omega[0] * adj_cosine
                     turned.y += omega[1] * adj_cosine
                     turned.z += omega[2] * adj_cosine
-                    facing = factor * wp.max(cosine, Lane(0.0))
+                    facing = inputs.factor * wp.max(cosine, Lane(0.0))
                     adj_blocked = wp.cw_mul(facing, pulled)
-                    for lane in range(wp.min(lanes, points.shape[1] - group * lanes)):
+                    for lane in range(wp.min(lanes, inputs.points.shape[1] - group * lanes)):
                         vertex = group * lanes + lane
                         if adj_transmittance:
                             adj_transmittance[batch, vertex, direction] = (
@@ -459,11 +394,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                             )
                     task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
                     task.pulls[place] = pulled
-        gradients = Gradients()
-        gradients.centers = adj_centers
-        gradients.radii = adj_radii
-        gradients.extents = adj_extents
-        adj = traverse(receivers, batch, spheres, gradients, task)
+        adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
@@ -533,14 +464,13 @@ def sphere_light(
     dim = batch_count * block_count(vertex_count, lanes), span_count
     variables = [points, normals, *nodes, proxy_radiance, transmittance, unblocked]
     stores_sums = varies(variables)
-    scratch = [
-        Scratch((2, own_count), lane_type(lanes)),
-        Scratch((3, own_count // BUNDLE), wp.int32),
-    ]
+    scratch = [Scratch((2, own_count), lane_type(lanes)), Scratch((3, own_count // BUNDLE), wp.int32)]
     sums = (own_count * _SUMS,), lane_type(lanes)
     cached = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
-    inputs = [points, normals, spheres, cells, proxy_radiance, transmittance, unblocked]
-    inputs += [4 / len(directions), span_count, stores_sums]
+    inputs = LightInputs()
+    inputs.points, inputs.normals, inputs.spheres, inputs.cells = points, normals, spheres, cells
+    inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
+    inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), span_count, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * own_count
     is_shared = unblocked is not None and len(unblocked) < batch_count
 
@@ -550,7 +480,7 @@ def sphere_light(
             _make_light_adjoint(lanes),
             dim,
             cost=2 * cost,
-            inputs=[*inputs, *cached, adj_light],
+            inputs=[inputs, *cached, adj_light],
             scratch=scratch,
             outputs=[points.grad, normals.grad, transmittance.grad, *([] if is_shared else adj_unblocked)],
             sums=[*(adj_unblocked if is_shared else []), proxy_radiance.grad, *(array.grad for array in nodes)],
@@ -561,7 +491,7 @@ def sphere_light(
             _make_light(lanes),
             dim,
             cost=cost,
-            inputs=inputs,
+            inputs=[inputs],
             scratch=scratch if stores_sums else [*scratch, Scratch(*sums)],
             outputs=[*cached, light],
         ),

@@ -6,7 +6,7 @@ best be near each other, spheres as well as receivers (:mod:`warpshadow.maths.sp
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -57,40 +57,32 @@ def cap_type(lanes: int) -> Any:
     return Cap
 
 
+class CapFunctions(NamedTuple):
+    """Kernel functions on caps."""
+
+    widen: wp.Function  # cones by w: axis, cosine and sine of θ, cells → caps
+    reaches: wp.Function  # whether a cap reaches a bundle for any receiver
+    rises: wp.Function  # whether a cap rises above the horizon of any receiver
+    soften: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
+
+
 @functools.cache
-def make_widen(lanes: int) -> wp.Function:
-    """Make the kernel function that widens cones by w: axis, cosine and sine of θ → the cap."""
+def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
+    """Make the kernel functions for a number of lanes."""
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
+    fn = make_lane_functions(lanes)
+    is_any_above, dot, dot_direction = fn.is_any_above, fn.dot, fn.dot_direction
 
     @wp.func(inline=True)
-    def widen(axis: Vectors, cosine: Lane, sine: Lane, cos_width: float, sin_width: float):
-        return Cap(axis, cos_width * cosine - sin_width * sine, sin_width * cosine + cos_width * sine)
-
-    return widen
-
-
-@functools.cache
-def make_reaches(lanes: int) -> wp.Function:
-    """Make the kernel function that says whether a cap reaches a bundle for any receiver."""
-    Cap = cap_type(lanes)
-    fn = make_lane_functions(lanes)
-    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
+    def widen(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
+        low = cells.cos_width * cosine - cells.sin_width * sine
+        return Cap(axis, low, cells.sin_width * cosine + cells.cos_width * sine)
 
     @wp.func(inline=True)
     def reaches(cap: Cap, axis: wp.vec3, half_angle: wp.vec2):
         # u·axis > cos(θ + w + the bundle's half-angle)
         limit = half_angle[0] * cap.cosine - half_angle[1] * cap.sine
         return is_any_above(dot_direction(axis, cap.axis) - limit, 0.0)
-
-    return reaches
-
-
-@functools.cache
-def make_rises(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that says whether a cap rises above the horizon of any receiver."""
-    Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
-    fn = make_lane_functions(lanes)
-    is_any_above, dot = fn.is_any_above, fn.dot
 
     @wp.func(inline=True)
     def rises(cap: Cap, normals: Vectors):
@@ -101,7 +93,13 @@ def make_rises(has_horizon: bool, lanes: int) -> wp.Function:
             is_up = is_any_above(dot(cap.axis, normals) + cap.sine + wide, 0.0)
         return is_up
 
-    return rises
+    @wp.func(inline=True)
+    def soften(direction: wp.vec3, cap: Cap, slope: Lane):
+        t = wp.cw_mul(dot_direction(direction, cap.axis) - cap.cosine, slope)
+        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
+        return t, wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+
+    return CapFunctions(widen, reaches, rises, soften)
 
 
 @functools.cache
@@ -120,7 +118,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
     Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+    widen, reaches, rises, _soften = make_cap_functions(has_horizon, lanes)
 
     @wp.func
     def cull(receivers: ReceiverLanes, bound: wp.vec4, place: int, candidates: int, task: Task):
@@ -135,7 +133,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
             inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(reach)))
             sine = reach * inverse
             cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
-            cap = widen(scale(inverse, away), cosine, sine, cells.cos_width, cells.sin_width)
+            cap = widen(scale(inverse, away), cosine, sine, cells)
             if is_within or rises(cap, receivers.normals):
                 candidate_count = candidates
                 if candidates == ALL:

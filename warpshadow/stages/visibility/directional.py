@@ -28,24 +28,16 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres
-from warpshadow.stages.visibility.culling import (
-    DirectionCells,
-    cap_type,
-    make_cells,
-    make_cull,
-    make_reaches,
-    make_rises,
-    make_widen,
-)
+from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
 from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    lane_structs,
     make_load_receivers,
     make_spheres,
     make_traversal,
     receiver_lanes_type,
-    sphere_adjoint_type,
     sphere_view_type,
 )
 
@@ -105,8 +97,7 @@ def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
 def _make_block(lanes: int) -> wp.Function:
     """Make the kernel function that lets a sphere block its share of a bundle's transmittance."""
     Lane, TransmittanceTask, Cap = lane_type(lanes), _task_type(lanes), cap_type(lanes)
-    fn = make_lane_functions(lanes)
-    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
+    is_any_above, soften = make_lane_functions(lanes).is_any_above, make_cap_functions(False, lanes).soften
 
     @wp.func(inline=True)
     def block(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
@@ -115,9 +106,7 @@ def _make_block(lanes: int) -> wp.Function:
         direction = (task.first_bundle + bundle) * BUNDLE
         place = bundle * BUNDLE
         for i in range(BUNDLE):
-            t = wp.cw_mul(dot_direction(task.cells.directions[direction + i], cap.axis) - cap.cosine, slope)
-            t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-            step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+            _t, step = soften(task.cells.directions[direction + i], cap, slope)
             left = wp.cw_mul(task.passing[place + i], Lane(1.0) - wp.cw_mul(opacity, step))
             maximum = wp.max(maximum, left)
             task.passing[place + i] = left
@@ -128,23 +117,19 @@ def _make_block(lanes: int) -> wp.Function:
 
 @functools.cache
 def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, ReceiverLanes, SphereView, TransmittanceTask = (
-        lane_type(lanes),
-        receiver_lanes_type(lanes),
-        sphere_view_type(lanes),
-        _task_type(lanes),
-    )
+    Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
     store_columns, sqrt, is_any_above, dot_direction = fn.store_columns, fn.sqrt, fn.is_any_above, fn.dot_direction
     begin, falloff, block = _make_begin(has_horizon, lanes), make_falloff(lanes), _make_block(lanes)
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+    widen, reaches, rises, _soften = make_cap_functions(has_horizon, lanes)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        cap = widen(cone.axis, cone.cosine, sine, cells)
         if rises(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             for k in range(count):
@@ -194,17 +179,12 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    ReceiverLanes, SphereView, SphereAdjoint, TransmittanceTask = (
-        receiver_lanes_type(lanes),
-        sphere_view_type(lanes),
-        sphere_adjoint_type(lanes),
-        _task_type(lanes),
-    )
+    Lane, Vectors, TransmittanceTask = lane_type(lanes), vectors_type(lanes), _task_type(lanes)
+    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    load_products, sqrt, dot_direction, add_vectors = fn.load_products, fn.sqrt, fn.dot_direction, fn.add_vectors
+    load_products, sqrt, add_vectors = fn.load_products, fn.sqrt, fn.add_vectors
     begin, falloff, sphere_adjoint = _make_begin(has_horizon, lanes), make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen, reaches, rises = make_widen(lanes), make_reaches(lanes), make_rises(has_horizon, lanes)
+    widen, reaches, rises, soften = make_cap_functions(has_horizon, lanes)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, seen: SphereView, count: int, task: TransmittanceTask):
@@ -216,7 +196,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         cone = seen.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen(cone.axis, cone.cosine, sine, cells.cos_width, cells.sin_width)
+        cap = widen(cone.axis, cone.cosine, sine, cells)
         if rises(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
             is_any_met = bool(False)
@@ -233,9 +213,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                     is_any_met = True
                     for i in range(BUNDLE):
                         omega = cells.directions[at * BUNDLE + i]
-                        t = wp.cw_mul(dot_direction(omega, cap.axis) - cap.cosine, slope)
-                        t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
-                        step = wp.cw_mul(wp.cw_mul(t, t), Lane(3.0) - 2.0 * t)
+                        t, step = soften(omega, cap, slope)
                         left = wp.max(Lane(1.0) - wp.cw_mul(opacity, step), Lane(1.0e-7))
                         adj_blocked = -wp.cw_div(task.passing[bundle * BUNDLE + i], left)
                         adj_opacity += wp.cw_mul(adj_blocked, step)
@@ -247,17 +225,9 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
                         sum_y += omega[1] * adj_t
                         sum_z += omega[2] * adj_t
             if is_any_met:
+                sum_omega = Vectors(sum_x, sum_y, sum_z)
                 adj_offset, adj_radius, adj_weight = sphere_adjoint(
-                    seen,
-                    sine,
-                    cap.cosine,
-                    cells.cos_width,
-                    cells.sin_width,
-                    slope,
-                    adj_opacity,
-                    sum_,
-                    sum_t,
-                    Vectors(sum_x, sum_y, sum_z),
+                    seen, sine, cap.cosine, cells.cos_width, cells.sin_width, slope, adj_opacity, sum_, sum_t, sum_omega
                 )
                 pull.is_any = True
                 pull.offset = adj_offset
@@ -293,19 +263,9 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         batch, group, receivers, task = begin(
             first_row + item, span, worker, points, normals, cells, all_ends, scratch, reached_bundles
         )
-        load_products(
-            transmittance[batch],
-            adj_transmittance[batch],
-            task.first_bundle * BUNDLE,
-            task.ends.shape[0] * BUNDLE,
-            group,
-            task.passing,
-        )
-        gradients = Gradients()
-        gradients.centers = adj_centers
-        gradients.radii = adj_radii
-        gradients.extents = adj_extents
-        adj = traverse(receivers, batch, spheres, gradients, task)
+        begin_column, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
+        load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, group, task.passing)
+        adj = traverse(receivers, batch, spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
 

@@ -14,20 +14,16 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
-from warpshadow.stages.sh_kernels import (
-    make_add_rotated_zonal,
-    make_rotated_zonal_adjoint,
-    zonal_type,
-)
+from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
 from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.merging import MERGING, Gradients, SphereClusters
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    lane_structs,
     make_load_receivers,
     make_spheres,
     make_traversal,
     receiver_lanes_type,
-    sphere_adjoint_type,
     sphere_view_type,
 )
 from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_look_up, zonal_table
@@ -139,11 +135,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal, Band, Cone = lane_type(lanes), zonal_type(order, lanes), band_type(order), cone_type(lanes)
-    ReceiverLanes, SphereView, SphereAdjoint = (
-        receiver_lanes_type(lanes),
-        sphere_view_type(lanes),
-        sphere_adjoint_type(lanes),
-    )
+    ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     LogTask = _task_type(order, lanes)
     fn = make_lane_functions(lanes)
     find_block, load_rows, add_vectors = fn.find_block, fn.load_rows, fn.add_vectors
@@ -227,10 +219,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         row = scratch[scratch_place(worker, thread)]
         load_rows(adj_log_sh[batch], group, row)
         receivers = load_receivers(points, normals, batch, group)
-        gradients = Gradients()
-        gradients.centers = adj_centers
-        gradients.radii = adj_radii
-        gradients.extents = adj_extents
+        gradients = Gradients(adj_centers, adj_radii, adj_extents)
         adj = traverse(receivers, batch, spheres, gradients, LogTask(table, row))
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])

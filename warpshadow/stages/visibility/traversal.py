@@ -199,6 +199,11 @@ def sphere_adjoint_type(lanes: int) -> Any:
     return SphereAdjoint
 
 
+def lane_structs(lanes: int) -> tuple[Any, Any, Any]:
+    """Structs of receivers, of a sphere as they see it, and of its adjoints."""
+    return receiver_lanes_type(lanes), sphere_view_type(lanes), sphere_adjoint_type(lanes)
+
+
 @functools.cache
 def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint: bool, lanes: int) -> wp.Function:
     """Make the kernel function that visits the spheres that a group of receivers can see.
