@@ -1,4 +1,8 @@
-"""warpshadow: differentiable soft shadows on meshes under environment light, in NVIDIA Warp."""
+"""warpshadow: differentiable soft shadows on meshes under environment light, in NVIDIA Warp.
+
+In all functions ``device`` is Warp's device to compute on, and ``progress`` shows a bar where something takes longer
+than a second.
+"""
 
 from warpshadow import check as _check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis

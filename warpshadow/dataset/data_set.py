@@ -49,11 +49,8 @@ class DataSet:
 
     Args:
         recipe: Its recipe.
-        device: Where spheres are fitted and images rendered.
-        progress: Show progress where something takes longer than a second.
     Attributes:
         recipe: Its recipe.
-        device: Name of the device.
         stocks: The assets of each split, by its name.
         hashes: Of each mesh and map, by ``meshes`` and ``maps`` and then by names.
     Raises:

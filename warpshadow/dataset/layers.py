@@ -17,8 +17,6 @@ class LazyLayers:
     """Lazy layers of one image: each is computed when first asked for, once.
 
     Args:
-        scene: The scene.
-        device: Where it is rendered.
         most_bodies: Number of masks, so that images can be stacked; masks of missing bodies are 0.
     """
 

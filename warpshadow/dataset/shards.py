@@ -62,7 +62,6 @@ def write_shards(
         folder: Made if it is not there. It gets the shards and ``dataset.json``, their index.
         workers: Processes that render, which share the threads; by default one for each thread, on a GPU one. 1 is this
             process, on all threads.
-        progress: Show progress.
     Returns:
         All shards, including the ones already there.
     Raises:

@@ -17,7 +17,6 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
     Args:
         values: The values, of the array's shape and then that of an item.
         dtype: Warp dtype of the items.
-        device: Where the array lives.
     Raises:
         RuntimeError: for new values while a graph is captured: only a replay of the graph would fill the array.
     """

@@ -48,7 +48,6 @@ class Captured(Generic[Result]):
 
     Args:
         function: The function to call. It may read arrays back at the first call only (``device.is_capturing`` tells).
-        device: Where it launches.
     Raises:
         RuntimeError: by a call, for a device without the stream-ordered allocator, and where the function reads back,
             synchronizes or copies from the host while it is captured. It is then captured anew at the next call.

@@ -110,9 +110,7 @@ def fit_many(
         workers: How many fits at a time; on this machine by default one for each of ``ws.thread_count()`` threads,
             which they share, or on a GPU one; with ``ray`` one for each core, or GPU, of the cluster.
         ray: Address of a Ray cluster, "HOST:PORT" or "auto", whose machines see the same files under the same paths.
-        device: Where to compute.
         checkpoint_seconds: Time between checkpoints [s].
-        progress: Show progress.
     Returns:
         How each ended, in the order of ``fits``. One that fails, diverges, or whose workers are killed four times costs
         only itself.

@@ -234,7 +234,6 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
     """Write a scene file and all that it names; :func:`load_scene` reads back the same scene, bit for bit.
 
     Args:
-        scene: The scene.
         folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
             body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex, and
             where it has a texture body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.

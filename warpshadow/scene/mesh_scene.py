@@ -49,7 +49,6 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
     image. A plate may lie and a door may stand, so a thin base does not count. Where nothing decides it is y.
 
     Args:
-        mesh: The mesh.
         suffix: Of its file, in lower case. glTF and USD have y up as they are read; where nothing decides, STL has z.
 
     Of 24 shapes that have y up, one, a knot, is taken for z; turned to z, 16 are found, and of

@@ -101,14 +101,11 @@ def fit_spheres(
         error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
             of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
             comes with a warning.
-        seed: Seed of the random choices.
         refine: Refine the spheres until they cast the mesh's shadows (stage 2). False keeps the spheres of stage 1,
             which cover the mesh, the paper's fit.
         steps: Steps of gradient descent of the refinement.
-        device: Where to fit.
         cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
             folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
-        progress: Show a progress bar when it takes longer than a second.
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.
     Warns: Once for each mesh, where 64 or more spheres cast a ragged shadow, as on thin legs.

@@ -98,7 +98,6 @@ class NormalizedMesh:
     Args:
         positions: Vertex positions [diagonals of the bounding box], float32, shape [vertex, 3].
         faces: Indices of positions, int32, shape [face, 3].
-        device: Where queries run.
     """
 
     def __init__(self, positions: np.ndarray, faces: np.ndarray, device: wp.Device):

@@ -115,7 +115,6 @@ class SphereBinding:
             vertices: The candidates that spheres may follow, shape [candidate].
             centers: Of the spheres [scene units], shape [sphere, 3].
             radii: Of the spheres [scene units], shape [sphere].
-            device: Where the binding lives.
         """
         from scipy.spatial import cKDTree
 

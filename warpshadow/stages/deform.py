@@ -111,7 +111,6 @@ class DeformationGraph:
             nodes: Node positions, such as the centers of spheres, shape [node, 3].
             count: Nodes that carry a point; d_max is the distance of the next one. Nodes are neighbors where one is
                 among the ``count`` nearest to the other, or where they carry the same points.
-            device: Where the graph lives.
         Raises:
             ValueError: when there are too few nodes.
         """

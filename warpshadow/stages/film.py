@@ -46,7 +46,6 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
     Where surfaces move, :func:`warpshadow.stages.slopes.moving_radiance` has the better gradient.
 
     Args:
-        fragments: The fragments of the samples.
         faces: Indices of receivers, vec3i of shape [face].
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].

@@ -85,7 +85,6 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
     """Interpolate an attribute of the vertices over the samples, perspective-correct.
 
     Args:
-        fragments: The fragments of the samples.
         faces: Indices of attributes, vec3i, shape [face]: the rasterized faces, or faces of another topology of the
             same mesh (uv_faces), face by face.
         attributes: float32 or a vector of them (vec2, vec3, ...), shape [batch, attribute].

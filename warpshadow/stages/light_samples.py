@@ -237,7 +237,6 @@ def cell_samples(samples: LightSamples, directions: np.ndarray, *, device: wp.De
     Args:
         samples: Directions drawn from light, whose radiance may have any number of channels.
         directions: Of the cells, unit vectors of shape [direction, 3].
-        device: Where they are wanted.
     """
     return CellSamples(
         wp.array(samples.directions, dtype=wp.vec3, device=device),

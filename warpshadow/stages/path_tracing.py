@@ -170,7 +170,6 @@ def trace_bounces(
         samples: Directions drawn from the light; each hit takes one of all the sets.
         bounces: Most bounces of a path, 1 or more.
         paths: Number of paths from each receiver.
-        progress: Show a progress bar where it takes longer than a second.
     Returns:
         The bounced light that white surfaces send back, vec3 of shape [receiver].
     Differentiable: no.

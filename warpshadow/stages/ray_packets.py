@@ -45,7 +45,6 @@ def build_face_tree(positions: np.ndarray, faces: np.ndarray, device: wp.DeviceL
     Args:
         positions: Vertices [vertex, 3].
         faces: Indices of vertices [face, 3].
-        device: Where rays are traced.
     """
     corners = np.asarray(positions, np.float32)[np.asarray(faces)]
     face_count, depth = len(corners), max(int(np.ceil(np.log2(max(len(corners), 1) / _LEAF))), 0)

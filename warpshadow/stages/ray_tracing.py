@@ -246,7 +246,6 @@ def trace_shading(
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light.
-        progress: Show a progress bar where it takes longer than a second.
     Returns:
         Shading, vec3 of shape [receiver].
     Differentiable: no.
@@ -314,7 +313,6 @@ def trace_cells(
         normals: Unit normals, vec3 of shape [receiver].
         numbers: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any company.
         samples: Directions drawn from the light.
-        progress: Show a progress bar where it takes longer than a second.
     Returns:
         ∫ L V max(n·ω, 0) dω / π over each cell, float32 of shape [receiver, channel, cell].
     Differentiable: no.

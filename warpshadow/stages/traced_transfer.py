@@ -80,7 +80,6 @@ def trace_transfer(
         functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
             coefficient].
         count: Number of directions, evenly over the sphere.
-        progress: Show a progress bar where it takes longer than a second.
     Returns:
         Transfer vectors, float32 of shape [receiver, coefficient].
     Differentiable: no.

@@ -41,8 +41,6 @@ def insert(
             becomes that of the photograph.
         photograph: Linear RGB of shape [height, width, 3], or a file that :func:`warpshadow.read_image` reads.
         exposure: Factor of the bodies' radiance in the photograph, in stops.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
     Warns:
         Where more of the bodies is brighter than white, 1, than of the photograph, by a tenth: how much, and the
         exposure with which 1% is.

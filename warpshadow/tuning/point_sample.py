@@ -44,8 +44,6 @@ class PointSample:
         direction_count: Rays of each point, drawn in proportion to light.
         bounces: How often light bounces in the truth, by default as in the scene.
         seed: Of the choice of points.
-        device: Where to compute.
-        progress: Show progress where something takes longer than a second.
     Attributes:
         bodies: Body of each point, shape [point].
     Raises:
@@ -160,7 +158,6 @@ def seen_on_faces(view: View, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Where samples of the first image of a view lie on faces.
 
     Args:
-        view: The view.
         chosen: Flat indices of samples that see a face, shape [point].
     Returns:
         Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered

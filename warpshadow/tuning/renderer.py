@@ -21,7 +21,6 @@ class Renderer(renderer.SceneRenderer):
     top, and the background is 0. :meth:`render` returns one as NumPy's array, ``draw`` a batch as Warp's.
 
     Args:
-        scene: The scene.
         cameras, device, basis, progress: As there.
     """
 
@@ -64,10 +63,6 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     is the image to compare with its others. With ``Body(…, receivers="pixel")`` and ``Visibility(self_shadows="rays")``
     both are the same.
 
-    Args:
-        scene: The scene.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """

@@ -33,8 +33,6 @@ def image_times(
     Args:
         scenes: Variants of a scene, which differ in visibility, spheres and receivers.
         runs: Timed calls of each, in turns.
-        device: Where to render.
-        progress: Show progress.
     Returns:
         Milliseconds of each scene's image, forward.
     """

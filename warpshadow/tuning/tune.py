@@ -213,7 +213,6 @@ def tune(
             too, as far as there are so many, and "all". By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
             number is, and others where fits are kept already.
-        device: Where to render.
         progress: Show progress, and all errors before anything is timed.
     Returns:
         The choice, and all trials. If no setting reaches the target, it is the nearest.
@@ -321,8 +320,6 @@ def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = Fa
 
     Args:
         scene: The scene. One with another method is returned as it is, and "directional" if it names none.
-        device: Where to render.
-        progress: Show progress.
     Returns:
         The scene, "auto" replaced. It is the same object each time, so that the choice is made once for a scene.
     """

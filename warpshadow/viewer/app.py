@@ -40,8 +40,6 @@ class ViewerApp:
         scene: The scene; "auto" is replaced by a choice.
         host: Address to serve at; others than this machine's own let everybody in who can reach it.
         port: Port, or the next that is free.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
         path: The scene's file, which is saved with the changes in it; None where it has none.
     Attributes:
         painter: Paints pictures.

@@ -65,10 +65,7 @@ class Painter:
 
     Args:
         scene: The scene; a method "auto" has been replaced.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
     Attributes:
-        scene: The scene.
         page_scale: Units of a page in a unit of the scene.
         coarse_light: The scene's light, as it is used while something moves.
     """
@@ -291,7 +288,6 @@ def distances(renderer: Renderer, view: View) -> np.ndarray:
 
     Args:
         renderer: Made the view.
-        view: The view.
     Returns:
         Scene units, shape [height, width].
     """

@@ -47,8 +47,6 @@ class Preparation:
     """Another process that fits spheres, traces shadows of bodies on themselves and compiles kernels.
 
     Args:
-        scene: The scene.
-        device: Warp device.
         note: Is told how far it is, in words; "" when all is over.
     """
 

@@ -103,13 +103,10 @@ def view(
     Needs viser: ``pip install "warpshadow[viewer]"``.
 
     Args:
-        scene: The scene.
         host: Address to serve at. The default is for this machine alone; at others everybody who can reach them sees
             the scene, and can change it.
         port: Port, or the next one that is free.
         browser: Whether to open a browser; None for yes, unless this is a notebook, which shows the page itself.
-        device: Warp device.
-        progress: Show progress where something takes longer than a second.
     Returns:
         The viewer. A script ends with ``viewer.wait()``, since pages are served only while the process runs.
     Raises:

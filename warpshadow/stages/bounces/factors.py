@@ -73,7 +73,6 @@ def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, de
     Args:
         patches: Has the pieces.
         positions, faces: The mesh that they are pieces of, NumPy.
-        device: Where rays are traced.
     """
     return loose_mesh(patches.pieces.positions(positions, faces), device=device)
 
@@ -109,7 +108,6 @@ def trace_factors(
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver.
-        progress: Show a progress bar where it takes longer than a second.
     Returns:
         F, float32 of shape [receiver, patch].
     Differentiable: no.

@@ -136,7 +136,6 @@ def find_patches(
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most. A body of few faces has fewer.
         sources: Number of sources of each, at most.
-        device: Where rays find out what is inside.
     Returns:
         Patches; none where no face has an area.
     """

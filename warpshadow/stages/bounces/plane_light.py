@@ -469,7 +469,6 @@ def plane_light(
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`.
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch]. A batch of 1 serves all instances here
             and above.
-        planes: The planes.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
             :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.

@@ -16,7 +16,6 @@ def mean_over_sources(patches: np.ndarray, weights: np.ndarray, count: int, *, d
         patches: Patch of each source, shape [source].
         weights: Share of its patch that each source has, shape [source].
         count: Number of patches; one without sources has a mean of 0.
-        device: Where the matrix is used.
     """
     from scipy.sparse import csr_matrix
 

@@ -54,7 +54,6 @@ def find_resampling_kernels(
         directions: Unit vectors ω [direction, 3].
         spreads: Half-angles s of where their light comes from [radians], [direction]; None for even cells.
         ray_count: Rays of a probe.
-        device: Where lookups are made.
     """
     count, cell_count = len(directions), ray_count // RUN
     spreads = np.full(count, cell_radius(count)) if spreads is None else np.minimum(spreads, cell_radius(count))

@@ -204,7 +204,6 @@ def trace_rows(
         count: Rays of a probe, from :func:`ray_count`.
         before: Bits of the first rows that an interrupted call traced, uint32 of shape [traced row, ray / 32].
         keep: Gets the rows traced so far, after every block of them.
-        progress: Show a progress bar where it takes longer than a second.
     Differentiable: no.
     """
     device, row_count = tree.corners.device, len(points)

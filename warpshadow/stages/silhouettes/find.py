@@ -67,7 +67,6 @@ class Silhouettes:
         shares: The area e of the sample that lies beyond each, how much it counts, ω, and whether a surface ends
             there, 1, or has a crease, 0; vec3 of shape [entry, 4].
         entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
-        fragments: The fragments of the samples.
         faces: The rasterized faces, vec3i of shape [face].
     """
 
@@ -435,7 +434,6 @@ def find_silhouettes(
     """Find the edges at which the surfaces in an image end, the lines where they intersect, and creases.
 
     Args:
-        fragments: The fragments of the samples.
         faces: The rasterized faces, vec3i of shape [face].
         neighbors: :func:`warpshadow.assets.topology.edge_neighbors` of the faces, vec3i of shape [face].
         clip_positions: Vertices in clip space, vec4 of shape [batch, vertex].

@@ -183,7 +183,6 @@ def find_footprints(
     occlusions disturb it.
 
     Args:
-        fragments: The fragments of the samples.
         faces: Vertex indices, vec3i of shape [face].
         clip_positions: The rasterized vertices in clip space, vec4 of shape [batch, vertex].
         uvs: Texture coordinates, vec2 of shape [batch, uv].

@@ -339,7 +339,6 @@ def sample_albedo(
     It is a continuous function of the footprint: levels blend, and probes fade in at the ends of their line.
 
     Args:
-        fragments: The fragments of the samples.
         faces: Vertex indices, vec3i of shape [face].
         vertex_albedo: Reflectance of the vertices, vec3 of shape [batch, vertex]; not seen on textured faces.
         textures: The textures.

@@ -70,7 +70,6 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
     Args:
         order: Number of bands n.
         function: The log, "eigen" or "cap".
-        device: Where the table lives.
     """
     from scipy.interpolate import CubicSpline
 
