@@ -249,9 +249,8 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     bands = order if bands is None else bands
     check.choice("bands", bands, range(1, order + 1))
     check.shape("lobes", lobes.shape, visibility.shape)
-    device = visibility.device
+    device, (batch_count, vertex_count, _) = visibility.device, visibility.shape
     lanes = lane_count(device)
-    batch_count, vertex_count, _ = visibility.shape
     row_count = batch_count * block_count(vertex_count, lanes)
 
     def add_product(first: wp.array, second: wp.array, table: ProductTable, total: wp.array) -> None:
