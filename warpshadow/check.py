@@ -19,11 +19,8 @@ import warp as wp
 P = ParamSpec("P")
 T = TypeVar("T")
 
-AnyPath = str | os.PathLike[str]
-"""A path as it may be given."""
-
-LARGEST = 1.0e18
-"""The largest magnitude of any number that is given: its square, summed up, still fits a float32."""
+AnyPath = str | os.PathLike[str]  # a path as it may be given
+LARGEST = 1.0e18  # the largest magnitude of any number that is given: its square, summed up, still fits a float32
 
 _OWN_FOLDER = str(Path(__file__).parent) + os.sep
 
@@ -37,8 +34,7 @@ class _Nothing:
         return "nothing"
 
 
-NOTHING = _Nothing()
-"""Stands for a missing argument, so that its check says what is expected."""
+NOTHING = _Nothing()  # stands for a missing argument, so that its check says what is expected
 
 
 def choice(name: str, value: object, choices: Iterable[object]) -> None:

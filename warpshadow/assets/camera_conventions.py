@@ -16,8 +16,7 @@ _HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 
 _LARGEST_NORMALIZED = 10.0  # numbers of intrinsics up to which they are in parts of the image, and no pixels
 
-Y_DOWN = np.diag([1.0, -1.0, -1.0])
-"""From camera axes of OpenGL and NeRF (x right, y up, z backward) to ours."""
+Y_DOWN = np.diag([1.0, -1.0, -1.0])  # from camera axes of OpenGL and NeRF (x right, y up, z backward) to ours
 
 _LEFT_UP = np.diag([-1.0, -1.0, 1.0])  # from PyTorch3D's camera axes (x left, y up, z forward) to ours
 

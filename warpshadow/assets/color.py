@@ -2,8 +2,7 @@
 
 import numpy as np
 
-GRAY = (0.8, 0.8, 0.8)
-"""Reflectance of a surface of which nothing is said, linear."""
+GRAY = (0.8, 0.8, 0.8)  # reflectance of a surface of which nothing is said, linear
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 

@@ -14,8 +14,7 @@ from warpshadow.assets import files
 from warpshadow.assets.color import auto_exposure, filmic, linear_to_srgb, srgb_to_linear
 from warpshadow.check import AnyPath
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Suffixes of picture files."""
+SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of picture files
 
 MOST_STOPS = 100  # 2 to it is a float32
 

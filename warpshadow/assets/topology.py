@@ -10,8 +10,7 @@ from warpshadow import check
 
 _NOT_MANIFOLD = -2
 
-CREASE = 30.0
-"""Edges whose faces bend by more are sharp [degrees]."""
+CREASE = 30.0  # edges whose faces bend by more are sharp [degrees]
 
 
 def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np.ndarray:

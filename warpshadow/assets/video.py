@@ -20,8 +20,7 @@ _FASTEST = {".mp4": 1000, ".gif": 50, ".webp": 90}
 
 _SLOWEST = 0.1
 
-VIDEO_SUFFIXES = tuple(_FASTEST)
-"""Suffixes of video files."""
+VIDEO_SUFFIXES = tuple(_FASTEST)  # suffixes of video files
 
 
 def write_video(path: AnyPath, frames: Iterable[Picture | np.ndarray], *, fps: float = 24.0) -> None:

@@ -34,10 +34,8 @@ _SAID_FAULTS = 10  # files that an error names at most
 class Stock(NamedTuple):
     """Assets that a split draws from."""
 
-    meshes: tuple[str, ...]
-    """Names of files in the folder of meshes, or of simple shapes."""
-    maps: tuple[str, ...] | None
-    """Names of files in the folder of maps; None where light is drawn."""
+    meshes: tuple[str, ...]  # names of files in the folder of meshes, or of simple shapes
+    maps: tuple[str, ...] | None  # names of files in the folder of maps; None where light is drawn
 
 
 class DataSet:

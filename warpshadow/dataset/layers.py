@@ -57,12 +57,9 @@ def _named(names: Sequence[str], values: np.ndarray) -> Channels:
 class Layer(NamedTuple):
     """A layer of pixels."""
 
-    find: Callable[[LazyLayers], Channels]
-    """Find its channels."""
-    coding: Coding
-    """How PNG has their numbers."""
-    is_apart: bool = False
-    """Whether each channel is a picture of its own."""
+    find: Callable[[LazyLayers], Channels]  # find its channels
+    coding: Coding  # how PNG has their numbers
+    is_apart: bool = False  # whether each channel is a picture of its own
 
     def pictures(self, name: str, channels: Channels) -> dict[str, Channels]:
         """The channels of each PNG file, by the end of its name."""

@@ -23,8 +23,7 @@ from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
 from warpshadow.assets.image import png_codes
 from warpshadow.assets.picture import png_bytes
 
-Channels = dict[str, np.ndarray]
-"""float32 of shape [height, width], by names."""
+Channels = dict[str, np.ndarray]  # float32 of shape [height, width], by names
 
 
 class Coding(Protocol):

@@ -17,13 +17,11 @@ from warpshadow.scene.random_scenes import Ranges
 from warpshadow.scene.scene import AUTO, Bounces, Scene, Visibility, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
 
-Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"
-"""Values that JSON has."""
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"  # values that JSON has
 
 _LAYERS = (*LAYERS, "spheres", "light")  # parts of each scene that may be written
 
-FORMATS = ("exr", "png")
-"""File formats of layers."""
+FORMATS = ("exr", "png")  # file formats of layers
 
 _KEYS = {
     "bodies": ("meshes", "blockers", "creased", "count", "size", "upright", "gap", "albedo", "ground_albedo"),

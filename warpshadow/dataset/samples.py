@@ -31,8 +31,7 @@ from warpshadow.scene.random_scenes import Drawn
 from warpshadow.scene.scene import Body, Scene
 from warpshadow.spheres import Spheres
 
-LIGHT_ORDER = 4
-"""Bands of the coefficients that a sample has of its light."""
+LIGHT_ORDER = 4  # bands of the coefficients that a sample has of its light
 
 
 class Sample(NamedTuple):

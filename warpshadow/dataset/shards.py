@@ -26,8 +26,7 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.device.workers import run_tasks
 from warpshadow.spheres.fit import ALGORITHM_VERSION
 
-INDEX = "dataset.json"
-"""Index file beside the shards."""
+INDEX = "dataset.json"  # index file beside the shards
 
 
 class Shard(NamedTuple):

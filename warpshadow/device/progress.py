@@ -22,8 +22,7 @@ from warpshadow.device.warp_internals import around_compilation
 _DELAY = 1.0  # time before a bar shows, and between its states where nothing is done [s]
 _EVERY = 10.0  # time between lines [s]
 
-LONG = 30.0
-"""Time of work that is announced, with the way around it [s]."""
+LONG = 30.0  # time of work that is announced, with the way around it [s]
 
 
 _bars_show = True

@@ -15,8 +15,7 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
-one_call = threading.RLock()
-"""Held by the thread whose call runs."""
+one_call = threading.RLock()  # held by the thread whose call runs
 
 if hasattr(os, "register_at_fork"):  # a child would wait for ever for a thread that it does not have
     os.register_at_fork(before=one_call.acquire, after_in_parent=one_call.release, after_in_child=one_call.release)

@@ -36,10 +36,8 @@ class TaskResult(NamedTuple, Generic[Task, Result]):
     """A task that is over."""
 
     task: Task
-    result: Result | None
-    """The function's result; None where it failed."""
-    error: Exception | None
-    """The exception it raised, or :class:`WorkerDied`."""
+    result: Result | None  # the function's result; None where it failed
+    error: Exception | None  # the exception it raised, or :class:`WorkerDied`
 
 
 class _Worker(Generic[Task, Result]):

@@ -41,8 +41,7 @@ from warpshadow.inverse.report import Report
 from warpshadow.inverse.schedule import Stage, stages_for
 from warpshadow.scene import toml_tables
 
-TABLE = "table.csv"
-"""The file, in the folder of all results, that says how each fit ended."""
+TABLE = "table.csv"  # the file, in the folder of all results, that says how each fit ended
 
 _FIT_FILE = "fit.toml"  # pattern of fit files in a folder
 _RECORD = "ending.json"

@@ -8,15 +8,11 @@ import numpy as np
 from warpshadow import check
 from warpshadow.maths.spatial_sort import compact_order
 
-CHUNK = 16
-"""Directions that fill a vector register; their number is a multiple of it."""
-
-BUNDLE = 4
-"""Directions that are culled together."""
+CHUNK = 16  # directions that fill a vector register; their number is a multiple of it
+BUNDLE = 4  # directions that are culled together
 
 
-LEAST_WIDTH = 2e-3
-"""Half-width of a falloff [rad] below which float32 has no digits left for it."""
+LEAST_WIDTH = 2e-3  # half-width of a falloff [rad] below which float32 has no digits left for it
 
 
 def check_count(name: str, count: int) -> None:

@@ -17,8 +17,7 @@ import numpy as np
 
 from warpshadow import check
 
-ORDERS = range(2, 9)
-"""Orders (numbers of bands) that the kernels are made for."""
+ORDERS = range(2, 9)  # orders (numbers of bands) that the kernels are made for
 
 
 def check_order(order: int) -> None:

@@ -32,8 +32,7 @@ from warpshadow.scene import toml_tables
 
 _KEYS = ("fps", "loop", "keyframe")
 
-MOST_FRAMES = 100_000
-"""Frames beyond which a path is taken for a mistake, such as times in milliseconds."""
+MOST_FRAMES = 100_000  # frames beyond which a path is taken for a mistake, such as times in milliseconds
 
 
 @dataclass(frozen=True, eq=False, init=False)

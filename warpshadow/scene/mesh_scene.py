@@ -21,8 +21,7 @@ from warpshadow.scene.scene import Body, Scene
 if TYPE_CHECKING:
     from scipy.spatial import ConvexHull
 
-GUESS = "guess"
-"""Ways to point up: the one that :func:`guess_up` finds."""
+GUESS = "guess"  # ways to point up: the one that :func:`guess_up` finds
 
 _AXES = {"y": 1, "z": 2}
 _Y_UP_FORMATS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")  # glTF says so, and USD is turned as it is read

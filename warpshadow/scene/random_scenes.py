@@ -27,8 +27,7 @@ from warpshadow.spheres import Spheres
 GROUND_SIZE = 10.0  # scene units; a body is about one
 SKY_HEIGHT = 64  # rows
 
-Range = tuple[float, float]
-"""Lower and upper bound of an even distribution; equal for a constant."""
+Range = tuple[float, float]  # lower and upper bound of an even distribution; equal for a constant
 
 
 @functools.cache

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-RADIUS_RATE = 10.0
-"""Step of the logarithm of a radius for a step of 1 of a center [1 / diagonals of the bounding box]."""
+RADIUS_RATE = 10.0  # step of the logarithm of a radius for a step of 1 of a center [1 / diagonals of the bounding box]
 
 
 class Adam:

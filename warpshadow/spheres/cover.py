@@ -18,20 +18,17 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
 
-BARE = 1.0
-"""Weight of the volume between the surface and the spheres next to that of spheres outside the mesh."""
+BARE = 1.0  # weight of the volume between the surface and the spheres next to that of spheres outside the mesh
 
 EDGE = 0.25
 """The boundary between in- and outside is soft over this share of a sphere's radius, so that it has a gradient."""
 
-SAMPLES = 32
-"""Points of each sphere whose distance to the mesh tells how much of it is outside."""
+SAMPLES = 32  # points of each sphere whose distance to the mesh tells how much of it is outside
 
 _QUERY_COST = 2000.0  # nanoseconds that a signed distance takes
 
 SURFACE_POINTS = 1024
-RATE = 0.003
-"""First learning rate of the centers of 64 spheres or fewer."""
+RATE = 0.003  # first learning rate of the centers of 64 spheres or fewer
 
 # ------------------------------------------------------------------------------------------------- start
 

@@ -15,11 +15,8 @@ from warpshadow.spheres.occlusion import exact_occlusion
 from warpshadow.spheres.receivers import around
 from warpshadow.stages.ray_tracing import trace_visibility
 
-GROUND, SURFACE, NEARBY = 20, 400, 400
-"""Receivers on a side of the ground's grid, on the surface and in the air."""
-
-DIRECTIONS = 512
-"""Rays from each of them."""
+GROUND, SURFACE, NEARBY = 20, 400, 400  # receivers on a side of the ground's grid, on the surface and in the air
+DIRECTIONS = 512  # rays from each of them
 
 
 @dataclass(frozen=True)

@@ -63,10 +63,8 @@ class FitReceivers:
     """
 
     DIRECTIONS = 128
-    GROUND, SURFACE = 0.55, 0.25
-    """Shares of the receivers on grounds and on the mesh; the others lie around it."""
-    VISIBLE_FLOOR = 0.2
-    """Weight of receivers that nothing can see, next to 1 for receivers in the open."""
+    GROUND, SURFACE = 0.55, 0.25  # shares of the receivers on grounds and on the mesh; the others lie around it
+    VISIBLE_FLOOR = 0.2  # weight of receivers that nothing can see, next to 1 for receivers in the open
     SHEET = 0.05
     """Weight of receivers on a sheet, next to 1 for those on a solid. A sphere in a sheet bulges out of it and darkens
     its surface, so spheres shrank until light came through: with a weight of 1 the shadow that 128 spheres of a tent
@@ -81,8 +79,7 @@ class FitReceivers:
         frames = _frames(normals, rng)
         self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
         """Where they are: points, and the rows of frames, [12, receiver]."""
-        self.directions = hemisphere(self.DIRECTIONS)
-        """Directions in the frame of each receiver [direction, 3]."""
+        self.directions = hemisphere(self.DIRECTIONS)  # directions in the frame of each receiver [direction, 3]
         self.lights = _light_metric(self.directions)
         array = partial(wp.array, device=mesh.device)
         visibility = wp.empty((count, self.DIRECTIONS), dtype=wp.uint8, device=mesh.device)
@@ -99,8 +96,7 @@ class FitReceivers:
         """How much errors at receivers count [receiver, 1]."""
         if mesh.is_sheet:
             self.weights[:surface] *= self.SHEET
-        self.off_surface = np.arange(surface, count)
-        """Receivers that are not on the mesh."""
+        self.off_surface = np.arange(surface, count)  # receivers that are not on the mesh
 
     def __len__(self) -> int:
         """How many."""

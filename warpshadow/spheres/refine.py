@@ -35,8 +35,7 @@ from warpshadow.stages.visibility.traversal import sphere_view_type
 TOUCH = 0.8
 """Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
 
-PULLED = 5
-"""Steps after which spheres that are farther off are pulled back."""
+PULLED = 5  # steps after which spheres that are farther off are pulled back
 
 _SPHERE_COST = 10.0  # nanoseconds that it takes to see a sphere from a receiver
 _PAIR_COST = 0.1  # nanoseconds that a sphere costs for a receiver and a direction
@@ -333,10 +332,8 @@ class Refinement:
     """The loss of spheres against the visibility of receivers around a body, and its descent."""
 
     BATCH = 256
-    WIDTHS = (0.1, 0.04)
-    """Half-width of the cones' falloff [radians], first and last."""
-    RATE = 0.003
-    """Learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii."""
+    WIDTHS = (0.1, 0.04)  # half-width of the cones' falloff [radians], first and last
+    RATE = 0.003  # learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii
 
     def __init__(self, mesh: NormalizedMesh, receivers: FitReceivers, rng: np.random.Generator):
         use_vector_registers(__name__)

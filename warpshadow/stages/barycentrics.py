@@ -8,8 +8,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
 
-TINY_VOLUME = 1.0e-36
-"""Below this the volumes of a face are subnormal numbers, which have no reciprocal in float32."""
+TINY_VOLUME = 1.0e-36  # below this the volumes of a face are subnormal numbers, which have no reciprocal in float32
 
 _COST, _ADJOINT_COST = 5.0, 15.0  # nanoseconds that a sample takes
 

@@ -71,12 +71,9 @@ def _divide(
 class RatioImage(NamedTuple):
     """Light that samples reflect, vec3 of shape [batch, height, width], and the photograph beside that."""
 
-    drawn: wp.array
-    """Where they see a body that is drawn."""
-    inverse: wp.array
-    """r where they see a catcher, 0 elsewhere."""
-    rest: wp.array
-    """1 − S₀ r where they see a catcher, 1 where there is nothing; vec4."""
+    drawn: wp.array  # where they see a body that is drawn
+    inverse: wp.array  # r where they see a catcher, 0 elsewhere
+    rest: wp.array  # 1 − S₀ r where they see a catcher, 1 where there is nothing; vec4
 
 
 def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array, unshadowed: wp.array) -> RatioImage:

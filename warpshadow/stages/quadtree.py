@@ -20,14 +20,9 @@ from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 
-LARGEST = 4
-"""Pixels of the side of the largest squares."""
-
-PROBE = 2
-"""Pixels between probes."""
-
-TOLERANCE = 0.02
-"""Error of interpolation at which a square is cut, as a part of the light where nothing blocks any."""
+LARGEST = 4  # pixels of the side of the largest squares
+PROBE = 2  # pixels between probes
+TOLERANCE = 0.02  # error of interpolation at which a square is cut, as a part of the light where nothing blocks any
 
 
 class Quadtree(NamedTuple):

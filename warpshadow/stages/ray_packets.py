@@ -18,8 +18,7 @@ from warpshadow.device.lanes import vectors_type
 from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.ray_tracing import RAISE, ROUNDING, UPRIGHT
 
-PACKET = CHUNK
-"""Rays of a packet."""
+PACKET = CHUNK  # rays of a packet
 
 _LEAF = 4  # faces of a leaf at most
 

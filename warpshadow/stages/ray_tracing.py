@@ -12,8 +12,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.device.progress import progress_bar
 from warpshadow.stages.light_samples import CellSamples, LightSamples
 
-RAY_COST = 200.0
-"""Nanoseconds that a ray takes."""
+RAY_COST = 200.0  # nanoseconds that a ray takes
 
 ROUNDING = 2.0**-21
 """How far a point interpolated in float32 may lie off its face: a part of the face's largest coordinate, by axis."""
@@ -23,8 +22,7 @@ UPRIGHT = 1.0e-3
 in front of it then, against rounding.
 """
 
-RAISE = 1.0e-4
-"""Height above a face, as a part of its size, from which rays of receivers on it start to meet it."""
+RAISE = 1.0e-4  # height above a face, as a part of its size, from which rays of receivers on it start to meet it
 
 
 @wp.func
@@ -117,12 +115,9 @@ def escapes(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
 class Hit:
     """First hit of a ray."""
 
-    face: int
-    """Number of the face, -1 for none."""
-    weights: wp.vec3
-    """Barycentrics on it."""
-    is_back: bool
-    """Whether it is met from behind."""
+    face: int  # number of the face, -1 for none
+    weights: wp.vec3  # barycentrics on it
+    is_back: bool  # whether it is met from behind
 
 
 @wp.func

@@ -10,11 +10,8 @@ from warpshadow.stages.nearest_rotation import nearest_rotations
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
-SHORTEST = 1.0e-18
-"""Shorter quaternions and columns have no direction: its gradient would be out of float32's range."""
-
-PARALLEL = 1.0e-6
-"""Columns at a smaller angle [radians] are parallel: the angle is rounding."""
+SHORTEST = 1.0e-18  # shorter quaternions and columns have no direction: its gradient would be out of float32's range
+PARALLEL = 1.0e-6  # columns at a smaller angle [radians] are parallel: the angle is rounding
 
 NOT_ORTHONORMAL = 0.05
 """Largest entry of |RᵀR − I| of a matrix that counts as a rotation: a step of 0.01 in all nine numbers stays below."""

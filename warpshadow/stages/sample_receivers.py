@@ -18,15 +18,11 @@ from warpshadow.device.parallel import run_length
 from warpshadow.stages.quadtree import Quadtree, sample_at
 from warpshadow.stages.rasterize import Fragments
 
-TILE = 16
-"""Pixels of a side of the tiles whose receivers follow each other."""
+TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 
 
-ALIKE = 0.9
-"""Cosine between normals of samples of a pixel from which they may share a receiver …"""
-
-LEVEL = 0.3
-"""… where a line from one to the other is not steeper than that: the sine of its angle to the surface."""
+ALIKE = 0.9  # cosine between normals of samples of a pixel from which they may share a receiver …
+LEVEL = 0.3  # … where a line from one to the other is not steeper than that: the sine of its angle to the surface
 
 
 class Span(NamedTuple):

@@ -8,8 +8,7 @@ import warp as wp
 from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.maths.sh import schmidt_recurrence, triple_products
 
-PRODUCT_COST = 0.1
-"""Nanoseconds that a product takes for a receiver and a pair of coefficients."""
+PRODUCT_COST = 0.1  # nanoseconds that a product takes for a receiver and a pair of coefficients
 
 
 @functools.cache

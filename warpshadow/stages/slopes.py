@@ -38,8 +38,7 @@ from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, edge_line, make_fragment_arrays
 
-LEAST_DISTANCE = 0.02
-"""Distance of an edge [samples] below which rounding outweighs how color changes on the way to it."""
+LEAST_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
 _COST = 20.0  # nanoseconds that a sample takes
 

@@ -18,18 +18,12 @@ from warpshadow.stages.normals import vertex_normals
 class PointReceivers(NamedTuple):
     """Receivers from which the shading of points is interpolated."""
 
-    points: np.ndarray
-    """Positions [scene units], float32 of shape [receiver, 3]."""
-    normals: np.ndarray
-    """Unit normals, float32 of shape [receiver, 3]."""
-    sides: np.ndarray
-    """Faces that they lie on, after the last of which backs are numbered, of shape [receiver]."""
-    barycentrics: np.ndarray
-    """And where on them, of shape [receiver, 3]."""
-    corners: np.ndarray
-    """Receivers of each point, of shape [point, 3]."""
-    weights: np.ndarray
-    """Weights of the corners, of shape [point, 3]."""
+    points: np.ndarray  # positions [scene units], float32 of shape [receiver, 3]
+    normals: np.ndarray  # unit normals, float32 of shape [receiver, 3]
+    sides: np.ndarray  # faces that they lie on, after the last of which backs are numbered, of shape [receiver]
+    barycentrics: np.ndarray  # and where on them, of shape [receiver, 3]
+    corners: np.ndarray  # receivers of each point, of shape [point, 3]
+    weights: np.ndarray  # weights of the corners, of shape [point, 3]
 
 
 class PointSample:

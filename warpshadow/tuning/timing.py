@@ -17,8 +17,7 @@ from warpshadow.tuning.point_sample import places_of_receivers, seen_on_faces
 TIMED_RECEIVERS = 2048
 """Receivers on which visibility and shading are timed, in neighborhoods, which are culled together."""
 
-NEIGHBORS = 64
-"""Receivers of a neighborhood."""
+NEIGHBORS = 64  # receivers of a neighborhood
 
 
 def image_times(

@@ -40,11 +40,8 @@ EQUAL = 0.1
 Where none is accurate enough, the same holds of their errors; then the faster is better.
 """
 
-ERROR_STEP = 0.003
-"""Errors that differ by less than this count as equal, too: nobody sees it."""
-
-COARSE = 0.005
-"""Error of interpolation between a body's vertices from which on its pixels are tried as receivers."""
+ERROR_STEP = 0.003  # errors that differ by less than this count as equal, too: nobody sees it
+COARSE = 0.005  # error of interpolation between a body's vertices from which on its pixels are tried as receivers
 
 
 class Trial(NamedTuple):

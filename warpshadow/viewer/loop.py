@@ -18,8 +18,7 @@ from warpshadow.viewer.painter import Frame
 from warpshadow.viewer.quality import FrameRate, Quality
 from warpshadow.viewer.state import ViewerState
 
-REST = 0.2
-"""So long after the last request of any page all rests [s]."""
+REST = 0.2  # so long after the last request of any page all rests [s]
 
 
 class Page(Protocol):

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 
-LARGEST_CANVAS = 1 << 14
-"""Width and height of a canvas [pixels] beyond which a page is not believed."""
+LARGEST_CANVAS = 1 << 14  # width and height of a canvas [pixels] beyond which a page is not believed
 
 PAGE_RADIUS = 3.0  # of scenes, in units of pages
 _NARROWEST, _WIDEST = 0.5, 170.0  # field of view [degrees]

@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-SECONDS = 1 / 24
-"""Time budget of an image while something moves; encoding and sending come on top."""
-
-LONGEST = 1.0
-"""Time budget of an image while nothing moves [s]: a page waits at most so long when it moves again."""
-
-FEWEST, MOST = 160**2, 512**2
-"""Pixels of an image while something moves."""
-
-FULL = 1 << 20
-"""Pixels of an image while all rests."""
+SECONDS = 1 / 24  # time budget of an image while something moves; encoding and sending come on top
+LONGEST = 1.0  # time budget of an image while nothing moves [s]: a page waits at most so long when it moves again
+FEWEST, MOST = 160**2, 512**2  # pixels of an image while something moves
+FULL = 1 << 20  # pixels of an image while all rests
 
 _STEP = 1.3  # of pixels, that is worth another image
 

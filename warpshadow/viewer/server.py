@@ -22,8 +22,7 @@ from viser import _messages as messages
 
 from warpshadow import check
 
-OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Names that only this machine has for itself."""
+OWN_NAMES = ("localhost", "127.0.0.1", "::1")  # names that only this machine has for itself
 
 
 class Server(viser.ViserServer):

@@ -26,11 +26,8 @@ from warpshadow.scene.scene import (
 )
 from warpshadow.viewer.quality import Quality
 
-MOST_CELLS, MOST_SPHERES, MOST_BOUNCES, MOST_STOPS = 1024, 512, 8, 20.0
-"""More than these a page may not ask for."""
-
-AS_GIVEN = "as given"
-"""Receivers, and numbers of spheres, as the scene has them."""
+MOST_CELLS, MOST_SPHERES, MOST_BOUNCES, MOST_STOPS = 1024, 512, 8, 20.0  # more than these a page may not ask for
+AS_GIVEN = "as given"  # receivers, and numbers of spheres, as the scene has them
 
 PICTURE, ERROR = "picture", "error against rays"
 """Shown image: the scene, or, once nothing moves, its difference from rays."""

@@ -15,8 +15,7 @@ from warpshadow import check
 from warpshadow.device.progress import in_ipython
 from warpshadow.scene.scene import SCENE, Scene
 
-HOST, PORT = "127.0.0.1", 8080
-"""Where pages are by default: for this machine alone."""
+HOST, PORT = "127.0.0.1", 8080  # where pages are by default: for this machine alone
 
 
 class Viewer:

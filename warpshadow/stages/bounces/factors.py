@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 _COUNTED = 1 << 22  # counts that are held at once [receivers × patches]
 
-GOLDEN = (5**0.5 - 1) / 2
-"""Turn from ray to ray, as a part of a full turn."""
+GOLDEN = (5**0.5 - 1) / 2  # turn from ray to ray, as a part of a full turn
 
 
 UNLIT = ("black surfaces", "insides of closed bodies")

@@ -11,8 +11,7 @@ from warpshadow.maths.spatial_sort import z_order
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-CACHE_POINT_COUNT = 2048
-"""Cache points of an image: of 256 × 256 pixels one in 32."""
+CACHE_POINT_COUNT = 2048  # cache points of an image: of 256 × 256 pixels one in 32
 
 _NEIGHBORS = 3
 

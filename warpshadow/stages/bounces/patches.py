@@ -22,18 +22,14 @@ LEAST_PATCHES = 128
 """Patches of a body of few faces, which may have as many sides as stairs. With 32 in place of 128 images of stairs with
 all bounces were 7.2 in place of 6.2% off, of nested boxes 7.5 in place of 6.7%; a room's, a corner's the same."""
 
-MOST_PATCHES = 256
-"""Patches of a body."""
-
-PIECES = 8
-"""Pieces of each patch, at least."""
+MOST_PATCHES = 256  # patches of a body
+PIECES = 8  # pieces of each patch, at least
 
 _NEEDLE = 0.01
 """Area of a piece that stays whole however long it is, where pieces should be 1 long: so the number of pieces is
 bounded."""
 
-SOURCES = 4
-"""Sources of a patch, at most."""
+SOURCES = 4  # sources of a patch, at most
 
 _NORMAL_WEIGHT = 1.0
 """How far apart opposite normals are, in units of the body's size: both sides of a thin wall have patches of their own.
@@ -59,10 +55,8 @@ _LEARNED = 20_000  # pieces that k-means looks at, at most
 class Pieces(NamedTuple):
     """Small triangles that faces are cut into; most are whole faces."""
 
-    faces: np.ndarray
-    """The face that each is a part of, int32 of shape [piece]."""
-    corners: np.ndarray
-    """Barycentric coordinates of its corners in that face, float32 of shape [piece, 3, 3]."""
+    faces: np.ndarray  # the face that each is a part of, int32 of shape [piece]
+    corners: np.ndarray  # barycentric coordinates of its corners in that face, float32 of shape [piece, 3, 3]
 
     def positions(self, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Corners of all pieces, float64 of shape [piece, 3, 3]."""
@@ -72,16 +66,11 @@ class Pieces(NamedTuple):
 class PatchSamples(NamedTuple):
     """Points of a mesh at which its patches are lit, consecutive for each patch; a vertex is a special case."""
 
-    faces: np.ndarray
-    """Face that each lies on, int32 of shape [source]."""
-    barycentrics: np.ndarray
-    """And where on it, float32 of shape [source, 3]."""
-    is_back: np.ndarray
-    """Whether it is lit from the face's back, bool of shape [source]."""
-    patches: np.ndarray
-    """Patch that each belongs to, ascending, int32 of shape [source]."""
-    weights: np.ndarray
-    """Share of that patch, which add up to 1 in each, float32 of shape [source]."""
+    faces: np.ndarray  # face that each lies on, int32 of shape [source]
+    barycentrics: np.ndarray  # and where on it, float32 of shape [source, 3]
+    is_back: np.ndarray  # whether it is lit from the face's back, bool of shape [source]
+    patches: np.ndarray  # patch that each belongs to, ascending, int32 of shape [source]
+    weights: np.ndarray  # share of that patch, which add up to 1 in each, float32 of shape [source]
 
 
 @dataclass(frozen=True, eq=False)

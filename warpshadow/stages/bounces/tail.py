@@ -31,8 +31,7 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 
-TERM_COUNT = 5
-"""Radiosities from which the tail is found."""
+TERM_COUNT = 5  # radiosities from which the tail is found
 
 _MOST = wp.constant(wp.float64(50.0))  # length of R in that of D_1, at most
 _SMALL = wp.constant(wp.float64(1.0e-7))  # added to the diagonal of M

@@ -21,17 +21,10 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
 
-RAYS = 4096
-"""Rays of a probe, if memory allows."""
-
-LEAST_RAYS = 256
-"""Rays of a probe, for any amount of memory."""
-
-RUN = 8
-"""Rays of a coarse cell."""
-
-MOST_MEMORY = 2**28
-"""Bytes that the rows of a body take at most, as long as probes have :data:`LEAST_RAYS`."""
+RAYS = 4096  # rays of a probe, if memory allows
+LEAST_RAYS = 256  # rays of a probe, for any amount of memory
+RUN = 8  # rays of a coarse cell
+MOST_MEMORY = 2**28  # bytes that the rows of a body take at most, as long as probes have :data:`LEAST_RAYS`
 
 _MIRRORED = 3.5
 """Angle below the horizon to which rays are mirrored, in radii of a coarse cell: no lookup reaches farther."""

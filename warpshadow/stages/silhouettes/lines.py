@@ -6,8 +6,7 @@ from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import neighbor, plane, relative, sample_center
 
 NOTHING = -1
-INTERSECTION = -2
-"""In place of an edge's vertices, where there is no line, and where there is that of two faces."""
+INTERSECTION = -2  # in place of an edge's vertices, where there is no line, and where there is that of two faces
 
 
 @wp.struct

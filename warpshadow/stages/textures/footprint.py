@@ -24,8 +24,7 @@ REACH = 0.25
 Of 0 to 1, a quarter was nearest to the mean over the footprint, for noise, natural spectra and checkerboards.
 """
 
-MAX_PROBES = 7
-"""Most probes of a footprint, an odd number; where it is longer still, its probes grow wider."""
+MAX_PROBES = 7  # most probes of a footprint, an odd number; where it is longer still, its probes grow wider
 
 # Derivatives of uv are cut off here [texels per sample], so that their fourth powers stay finite.
 _MAX_DERIVATIVE = 1.0e6

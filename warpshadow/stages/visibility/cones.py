@@ -18,14 +18,9 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
-BLEND = 0.01
-"""The exact formula ends at D = (1 + BLEND) r."""
-
-FADE = 0.25
-"""The sphere fades out from D = FADE·r to its center."""
-
-TINY_RADIUS = 1.0e-19
-"""Spheres no larger block nothing: the largest distance, over one that is, is still a float32."""
+BLEND = 0.01  # the exact formula ends at D = (1 + BLEND) r
+FADE = 0.25  # the sphere fades out from D = FADE·r to its center
+TINY_RADIUS = 1.0e-19  # spheres no larger block nothing: the largest distance, over one that is, is still a float32
 
 _NEAREST2 = 1.0e-37  # (D/r)² is kept where its root and the inverse of that are float32
 _FARTHEST2 = 1.0e38

@@ -41,13 +41,11 @@ from warpshadow.stages.visibility.traversal import (
     sphere_view_type,
 )
 
-SOFTNESS = 0.35
-"""κ: half-width of the falloff in cell radii. More gives wider gradients and more bias."""
+SOFTNESS = 0.35  # κ: half-width of the falloff in cell radii. More gives wider gradients and more bias
 
 _OPAQUE = 1.0e-4  # below this transmittance a bundle is not looked at any more
 
-PAIR_COST = 0.15
-"""Nanoseconds that a sphere costs for a receiver and a direction, culling included."""
+PAIR_COST = 0.15  # nanoseconds that a sphere costs for a receiver and a direction, culling included
 
 
 @functools.cache

@@ -56,17 +56,13 @@ THRESHOLDS = {
 3-fold at twice its limit and 200-fold at four times. At the defaults irradiance is within 0.1% (`quadratic`), 0.7%
 (`linear`) and 4% (`optimal_linear`, whose table of single caps fits a sum of many spheres badly) of the converged."""
 
-LEAST_THRESHOLD = 0.01
-"""Squarings amplify float32 rounding 2^p times; below this they cost more digits than they give."""
-
-MOST_SQUARINGS = 20
-"""Limit of the squarings; a log that asks for more is cut down to it."""
+LEAST_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
+MOST_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
 QUIET = 6.0
 """|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
 
-LOUD = 24.0
-"""|f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared."""
+LOUD = 24.0  # |f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared
 
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""

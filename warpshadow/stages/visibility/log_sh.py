@@ -28,8 +28,7 @@ from warpshadow.stages.visibility.traversal import (
 )
 from warpshadow.stages.visibility.zonal_logs import LOGS, band_type, make_look_up, zonal_table
 
-HORIZON_FADE = 0.5
-"""A sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane."""
+HORIZON_FADE = 0.5  # a sphere fades out from (1 − HORIZON_FADE) radii to one radius below the tangent plane
 
 
 _PAIR_COST = 0.25  # nanoseconds that a sphere costs for a receiver and a coefficient

@@ -27,17 +27,10 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 
-QUAD = 4
-"""Spheres that merge, in the order in which they are given: best near each other."""
-
-ITEMS = QUAD + 1
-"""Spheres of a quad, its own included."""
-
-MERGING = 0.75
-"""τ: half-angle in cell radii under which four spheres are seen as one."""
-
-MERGED_FROM = 512
-"""Fewer spheres do not merge: they are so large that hardly a receiver is far enough from them."""
+QUAD = 4  # spheres that merge, in the order in which they are given: best near each other
+ITEMS = QUAD + 1  # spheres of a quad, its own included
+MERGING = 0.75  # τ: half-angle in cell radii under which four spheres are seen as one
+MERGED_FROM = 512  # fewer spheres do not merge: they are so large that hardly a receiver is far enough from them
 
 _BLEND = 0.7  # τ0 / τ
 

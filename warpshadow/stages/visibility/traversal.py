@@ -26,11 +26,8 @@ from warpshadow.stages.visibility.merging import (
     within,
 )
 
-QUADS = 4
-"""Quads of a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors."""
-
-ALL = -1
-"""The number of candidates where all there is are: for runs."""
+QUADS = 4  # quads of a run. Spheres of a run, and then of a quad, are culled together: they had best be neighbors
+ALL = -1  # the number of candidates where all there is are: for runs
 
 
 @wp.func

@@ -15,11 +15,8 @@ from warpshadow.stages.sh_kernels import zonal_type
 
 LOGS = ("eigen", "cap")
 
-CAP_DEPTH = 3.0
-"""ε of the log `cap`: e^−3 ≈ 0.05 of the light passes a single cap."""
-
-EIGENVALUE_FLOOR = 0.05
-"""δ of the log `eigen`: eigenvalues of the product matrix are raised to it before the logarithm."""
+CAP_DEPTH = 3.0  # ε of the log `cap`: e^−3 ≈ 0.05 of the light passes a single cap
+EIGENVALUE_FLOOR = 0.05  # δ of the log `eigen`: eigenvalues of the product matrix are raised to it before the logarithm
 
 _INTERVALS = 2048
 
