@@ -354,26 +354,8 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
             root[lane] = wp.sqrt(value[lane])
         return root
 
-    return LaneFunctions(
-        is_any_above,
-        bits_above,
-        dot,
-        dot_direction,
-        offset,
-        scale,
-        add,
-        subtract,
-        find_block,
-        load,
-        load_products,
-        add_vectors,
-        load_rows,
-        add_rows,
-        store_rows,
-        store_columns,
-        sqrt,
-        total,
-    )
+    made = locals()
+    return LaneFunctions(*(made[name] for name in LaneFunctions._fields))
 
 
 def as_chunks(rows: wp.array | None) -> wp.array | None:

@@ -26,7 +26,7 @@ RAISE = 1.0e-4  # height above a face, as a part of its size, from which rays of
 
 
 @wp.func
-def _seen_from(point: wp.vec3, normal: wp.vec3, corner_a: wp.vec3, corner_b: wp.vec3, corner_c: wp.vec3):
+def _seen_from(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3):
     """A face as a receiver sees it: corners relative to it and their normal, in float64, where they are exact.
 
     A receiver on a face, to float32's rounding, is put slightly above it, on the side of its own normal. It so gets no
@@ -36,6 +36,9 @@ def _seen_from(point: wp.vec3, normal: wp.vec3, corner_a: wp.vec3, corner_b: wp.
     Returns:
         The corners, their normal times twice the area, and whether the receiver lies on the face; not at its foot.
     """
+    corner_a = wp.mesh_get_point(mesh, 3 * face)
+    corner_b = wp.mesh_get_point(mesh, 3 * face + 1)
+    corner_c = wp.mesh_get_point(mesh, 3 * face + 2)
     a = wp.vec3d(corner_a) - wp.vec3d(point)
     b = wp.vec3d(corner_b) - wp.vec3d(point)
     c = wp.vec3d(corner_c) - wp.vec3d(point)
@@ -82,13 +85,7 @@ def _slope(toward: wp.vec3):
 @wp.func
 def is_met(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
     """Whether a ray from a receiver meets a face of a mesh."""
-    a, b, c, face_normal, _lies_on = _seen_from(
-        point,
-        normal,
-        wp.mesh_get_point(mesh, 3 * face),
-        wp.mesh_get_point(mesh, 3 * face + 1),
-        wp.mesh_get_point(mesh, 3 * face + 2),
-    )
+    a, b, c, face_normal, _lies_on = _seen_from(mesh, face, point, normal)
     return _meets(toward, a, face_normal, _volumes(toward, a, b, c))
 
 
@@ -132,13 +129,7 @@ def nearest(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, toward: wp.vec3):
     query = wp.bvh_query_ray(wp.mesh_get_bvh(mesh), point, _slope(toward))
     face = int(0)
     while wp.bvh_query_next(query, face, distance):
-        a, b, c, face_normal, lies_on = _seen_from(
-            point,
-            normal,
-            wp.mesh_get_point(mesh, 3 * face),
-            wp.mesh_get_point(mesh, 3 * face + 1),
-            wp.mesh_get_point(mesh, 3 * face + 2),
-        )
+        a, b, c, face_normal, lies_on = _seen_from(mesh, face, point, normal)
         volumes = _volumes(toward, a, b, c)
         if _meets(toward, a, face_normal, volumes):
             slope = wp.dot(face_normal, wp.vec3d(toward))
@@ -303,9 +294,7 @@ def trace_cells(
     """Trace how much light each cell of directions sends past a mesh: :func:`trace_shading`, apart for each cell.
 
     Args:
-        mesh: The blockers, None for none.
-        points: Receiver positions [scene units], vec3 of shape [receiver].
-        normals: Unit normals, vec3 of shape [receiver].
+        mesh, points, normals: As for :func:`trace_shading`.
         numbers: Identifiers of the receivers, int32 of shape [receiver]: a receiver gets the same rays in any company.
         samples: Directions drawn from the light.
     Returns:

@@ -74,9 +74,7 @@ def trace_transfer(
     """Trace transfer vectors: light of a basis is then shadowed by the mesh itself, exactly but for sampling.
 
     Args:
-        mesh: The blockers, None for none.
-        points: Receiver positions [scene units], vec3 of shape [receiver].
-        normals: Unit normals, vec3 of shape [receiver].
+        mesh, points, normals: As for :func:`warpshadow.stages.ray_tracing.trace_shading`.
         functions: Evaluates the basis functions of the light at unit vectors [direction, 3]: shape [direction,
             coefficient].
         count: Number of directions, evenly over the sphere.

@@ -63,48 +63,43 @@ class Panel:
             if isinstance(self._scene.light, EnvironmentMap):
                 self._map = gui.add_image(self._map_picture(viewer_state), label="middle: +z", format="jpeg")
             turn = gui.add_slider("Turn [°]", -180.0, 180.0, 1.0, viewer_state.turn)
-            self._bind(turn, lambda viewer_state: viewer_state.turn, lambda value: {"turn": value})
+            self._bind(turn, "turn")
             scale = gui.add_slider("Scale [stops]", -6.0, 6.0, 0.1, 0.0)
-            self._bind(
-                scale,
-                lambda viewer_state: float(np.log2(max(viewer_state.scale, 2**-6))),
-                lambda value: {"scale": 2.0**value},
-            )
+            self._bind(scale, "scale", lambda scale: float(np.log2(max(scale, 2**-6))), lambda stops: 2.0**stops)
             if self._map is not None:
                 behind = gui.add_checkbox("Behind the bodies", viewer_state.shows_light)
-                self._bind(behind, lambda viewer_state: viewer_state.shows_light, lambda value: {"shows_light": value})
+                self._bind(behind, "shows_light")
             stops = gui.add_slider(
                 "Exposure [stops]", viewer_state.stops - 6, viewer_state.stops + 6, 0.1, viewer_state.stops
             )
-            self._bind(stops, lambda viewer_state: viewer_state.stops, lambda value: {"stops": value})
+            self._bind(stops, "stops")
 
     def _add_shadows(self) -> None:
         gui, viewer_state = self._server.gui, self._loop.viewer_state
         cells, counts = sorted({*_CELLS, viewer_state.directions}), (AS_GIVEN, *map(str, _SPHERES))
         with gui.add_folder("Shadows"):
             method = gui.add_dropdown("Method", METHODS, initial_value=viewer_state.method)
-            self._bind(method, lambda viewer_state: viewer_state.method, lambda value: {"method": value})
+            self._bind(method, "method")
             directions = gui.add_dropdown(
                 "Directions", tuple(map(str, cells)), initial_value=str(viewer_state.directions)
             )
-            self._bind(
-                directions, lambda viewer_state: str(viewer_state.directions), lambda value: {"directions": int(value)}
-            )
+            self._bind(directions, "directions", str, int)
             softness = gui.add_slider("Softness", 0.05, 1.5, 0.05, viewer_state.softness)
-            self._bind(softness, lambda viewer_state: viewer_state.softness, lambda value: {"softness": value})
+            self._bind(softness, "softness")
             spheres = gui.add_dropdown("Spheres", counts, hint="Other numbers are fitted once, some 20 s a body")
             self._bind(
                 spheres,
-                lambda viewer_state: AS_GIVEN if viewer_state.spheres is None else str(viewer_state.spheres),
-                lambda value: {"spheres": None if value == AS_GIVEN else int(value)},
+                "spheres",
+                lambda count: AS_GIVEN if count is None else str(count),
+                lambda text: None if text == AS_GIVEN else int(text),
             )
             receivers = gui.add_dropdown("Receivers", (AS_GIVEN, *RECEIVERS), initial_value=viewer_state.receivers)
-            self._bind(receivers, lambda viewer_state: viewer_state.receivers, lambda value: {"receivers": value})
+            self._bind(receivers, "receivers")
             if self._scene.bounces and viewer_state.bounces != "all":
                 bounces = gui.add_slider("Bounces", 0, max(4, viewer_state.bounces), 1, viewer_state.bounces)
-                self._bind(bounces, lambda viewer_state: viewer_state.bounces, lambda value: {"bounces": value})
+                self._bind(bounces, "bounces")
             shows = gui.add_dropdown("Show", (PICTURE, ERROR), hint="Red: too bright, by 20% of the mean; blue: dark")
-            self._bind(shows, lambda viewer_state: viewer_state.shows, lambda value: {"shows": value})
+            self._bind(shows, "shows")
 
     def _add_bodies(self) -> None:
         gui = self._server.gui
@@ -131,15 +126,19 @@ class Panel:
     # ------------------------------------------------------------------------------------------ actions
 
     def _bind(
-        self, handle: Any, value_of: Callable[[ViewerState], Any], changes: Callable[[Any], dict[str, Any]]
+        self,
+        handle: Any,
+        field: str,
+        show: Callable[[Any], Any] = lambda value: value,
+        read: Callable[[Any], Any] = lambda value: value,
     ) -> None:
-        """Change the look when a page changes an input; put the input back where that is refused."""
-        self._inputs.append((handle, value_of))
+        """Change a field of the viewer state when a page changes an input; put the input back where that is refused."""
+        self._inputs.append((handle, lambda viewer_state: show(getattr(viewer_state, field))))
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:  # not by ourselves
-                self._guarded(event, lambda: self._changed(**changes(handle.value)))
+                self._guarded(event, lambda: self._changed(**{field: read(handle.value)}))
 
     def _guarded(self, event: viser.GuiEvent, act: Callable[[], None]) -> None:
         """Obey a page's request; report why if it is refused."""

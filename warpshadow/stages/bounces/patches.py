@@ -174,15 +174,9 @@ def find_plane_patches(
     """Find the patches of a body that lies in a plane: the texels of a grid over its smallest rectangle.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
-        is_two_sided: Whether the back sends light, too.
-        others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
-            None for an even grid.
+        positions, faces, is_two_sided, others: As for :func:`warpshadow.stages.planes.grid.find_grid`.
     Returns:
         Patches, row by row: texels off the mesh have no area and no source.
-    Raises:
-        ValueError: for a body that does not lie in a plane.
     """
     grid, covered = find_grid(positions, faces, is_two_sided=is_two_sided, others=others)
     frame, origin = grid.frame, grid.origin
