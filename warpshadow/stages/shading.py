@@ -8,12 +8,11 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.constants import constant
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import split_row
-from warpshadow.maths.directions import CHUNK, check_count
-from warpshadow.stages.transfer import are_up, cosines
+from warpshadow.maths.directions import CHUNK
+from warpshadow.stages.transfer import CellInputs, are_up, cell_inputs, cosines
 
 _SLAB = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
 _COEFFICIENT_COST = 0.4  # nanoseconds that a coefficient of a receiver takes
@@ -229,10 +228,7 @@ def _shade_cells(
     first_row: int,
     worker: int,
     # in
-    transmittance: wp.array3d(dtype=Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=Chunk),
-    weight: float,
+    cells: CellInputs,
     light: wp.array3d(dtype=Chunk),
     # out
     shading: wp.array2d(dtype=wp.vec3),
@@ -240,17 +236,17 @@ def _shade_cells(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
     lit = instance_in(batch, light.shape[0])
-    normal = normals[batch, receiver]
+    normal = cells.normals[batch, receiver]
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
-    for chunk in range(directions.shape[1]):
-        cosine = wp.max(cosines(normal, directions, chunk), Chunk(0.0))
-        transfer = wp.cw_mul(cosine, transmittance[batch, receiver, chunk])
+    for chunk in range(cells.directions.shape[1]):
+        cosine = wp.max(cosines(normal, cells.directions, chunk), Chunk(0.0))
+        transfer = wp.cw_mul(cosine, cells.transmittance[batch, receiver, chunk])
         red += wp.cw_mul(transfer, light[lit, 0, chunk])
         green += wp.cw_mul(transfer, light[lit, 1, chunk])
         blue += wp.cw_mul(transfer, light[lit, 2, chunk])
-    shading[batch, receiver] = weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
+    shading[batch, receiver] = cells.weight * wp.vec3(_sum(red), _sum(green), _sum(blue))
 
 
 @wp.kernel(enable_backward=False)
@@ -258,10 +254,7 @@ def _shade_cells_adjoint(
     first_row: int,
     worker: int,
     # in
-    transmittance: wp.array3d(dtype=Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=Chunk),
-    weight: float,
+    cells: CellInputs,
     light: wp.array3d(dtype=Chunk),
     adj_shading: wp.array2d(dtype=wp.vec3),
     # out
@@ -271,8 +264,9 @@ def _shade_cells_adjoint(
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) L_q·s̄,  n̄ = Σ w T_q (L_q·s̄) ω_q where n·ω_q > 0."""
     batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
     lit = instance_in(batch, light.shape[0])
-    normal = normals[batch, receiver]
-    adj = weight * adj_shading[batch, receiver]
+    normal = cells.normals[batch, receiver]
+    directions = cells.directions
+    adj = cells.weight * adj_shading[batch, receiver]
     x = Chunk(0.0)
     y = Chunk(0.0)
     z = Chunk(0.0)
@@ -283,7 +277,7 @@ def _shade_cells_adjoint(
             adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + wp.cw_mul(
                 pull, wp.max(cosine, Chunk(0.0))
             )
-        pull = wp.cw_mul(wp.cw_mul(pull, transmittance[batch, receiver, chunk]), are_up(cosine))
+        pull = wp.cw_mul(wp.cw_mul(pull, cells.transmittance[batch, receiver, chunk]), are_up(cosine))
         x += wp.cw_mul(pull, directions[0, chunk])
         y += wp.cw_mul(pull, directions[1, chunk])
         z += wp.cw_mul(pull, directions[2, chunk])
@@ -313,18 +307,12 @@ def shade_cells(
         Shading, vec3 of shape [batch, receiver].
     Differentiable: transmittance, normals. Not: light.
     """
-    count, device = len(directions), normals.device
-    check_count("directions", count)
-    check.shape("transmittance", transmittance.shape, (*normals.shape, count))
-    check.shape("light", light.shape, ("batch", count))
+    cells, device = cell_inputs(transmittance, normals, directions), normals.device
+    check.shape("light", light.shape, ("batch", len(directions)))
     check.finite_arrays({"light": light}, maximum=maximum)
-    if not transmittance.is_contiguous:
-        raise ValueError("transmittance: got a strided array, expected a contiguous one")
     if device.is_cpu:
         use_vector_registers(__name__)
-    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
-    inputs = [as_chunks(transmittance), normals, towards, 4.0 / count, as_chunks(_channels(light))]
-    cost = _COEFFICIENT_COST * count
+    inputs, cost = [cells, as_chunks(_channels(light))], _COEFFICIENT_COST * len(directions)
     return differentiable(
         lambda shading: launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost),
         lambda adj_shading: launch(

@@ -290,25 +290,44 @@ def are_up(cosine: Chunk):
     return wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
 
 
+@wp.struct
+class CellInputs:
+    """Transmittance of receivers towards cells, and what a cell sends to a normal."""
+
+    transmittance: wp.array3d(dtype=Chunk)
+    normals: wp.array2d(dtype=wp.vec3)
+    directions: wp.array2d(dtype=Chunk)
+    weight: float  # solid angle over π
+
+
+def cell_inputs(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> CellInputs:
+    """Check transmittance of receivers towards cells and put all together for kernels, which may be on chunks."""
+    count, device = len(directions), normals.device
+    check_count("directions", count)
+    check.shape("transmittance", transmittance.shape, (*normals.shape, count))
+    if transmittance.requires_grad and not transmittance.is_contiguous:
+        raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
+    inputs = CellInputs()
+    inputs.transmittance, inputs.normals = as_chunks(transmittance.contiguous()), normals
+    inputs.directions, inputs.weight = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device), 4.0 / count
+    return inputs
+
+
 @wp.kernel(enable_backward=False)
 def _transfer_directions(
     first_row: int,
     worker: int,
     # in
-    transmittance: wp.array3d(dtype=Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=Chunk),
-    weight: float,
+    cells: CellInputs,
     # out
     transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
-    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
-    n = normals[batch, vertex]
-    for chunk in range(directions.shape[1]):
-        cosine = cosines(n, directions, chunk)
-        cosine = weight * wp.max(cosine, Chunk(0.0))
-        transfer[batch, vertex, chunk] = wp.cw_mul(cosine, transmittance[batch, vertex, chunk])
+    batch, vertex = split_row(first_row + wp.tid(), cells.normals.shape[1])
+    n = cells.normals[batch, vertex]
+    for chunk in range(cells.directions.shape[1]):
+        cosine = cells.weight * wp.max(cosines(n, cells.directions, chunk), Chunk(0.0))
+        transfer[batch, vertex, chunk] = wp.cw_mul(cosine, cells.transmittance[batch, vertex, chunk])
 
 
 @wp.kernel(enable_backward=False)
@@ -316,27 +335,25 @@ def _transfer_directions_adjoint(
     first_row: int,
     worker: int,
     # in
-    transmittance: wp.array3d(dtype=Chunk),
-    normals: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=Chunk),
-    weight: float,
+    cells: CellInputs,
     adj_transfer: wp.array3d(dtype=Chunk),
     # out
     adj_transmittance: wp.array3d(dtype=Chunk),
     adj_normals: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0."""
-    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
-    n = normals[batch, vertex]
+    batch, vertex = split_row(first_row + wp.tid(), cells.normals.shape[1])
+    n = cells.normals[batch, vertex]
+    directions = cells.directions
     total = wp.vec3()
     for chunk in range(directions.shape[1]):
         cosine = cosines(n, directions, chunk)
-        adj = weight * adj_transfer[batch, vertex, chunk]
+        adj = cells.weight * adj_transfer[batch, vertex, chunk]
         if adj_transmittance:
             adj_transmittance[batch, vertex, chunk] = adj_transmittance[batch, vertex, chunk] + wp.cw_mul(
                 adj, wp.max(cosine, Chunk(0.0))
             )
-        adj = wp.cw_mul(wp.cw_mul(adj, transmittance[batch, vertex, chunk]), are_up(cosine))
+        adj = wp.cw_mul(wp.cw_mul(adj, cells.transmittance[batch, vertex, chunk]), are_up(cosine))
         total += wp.vec3(
             wp.dot(adj, directions[0, chunk]), wp.dot(adj, directions[1, chunk]), wp.dot(adj, directions[2, chunk])
         )
@@ -355,25 +372,17 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
         Transfer vectors, float32 of shape [batch, vertex, direction].
     Differentiable: transmittance, normals.
     """
-    count = len(directions)
-    check_count("directions", count)
-    check.shape("transmittance", transmittance.shape, (*normals.shape, count))
-    device = normals.device
-    if transmittance.requires_grad and not transmittance.is_contiguous:
-        raise ValueError("transmittance: got a strided array that requires a gradient, expected a contiguous one")
+    cells, cost, device = cell_inputs(transmittance, normals, directions), _CELL_COST * len(directions), normals.device
     if device.is_cpu:
         use_vector_registers(__name__)
-    towards = constant(directions.T.reshape(3, -1, CHUNK), Chunk, device)
-    inputs = [as_chunks(transmittance.contiguous()), normals, towards, 4.0 / count]
-    cost = _CELL_COST * count
     return differentiable(
         lambda transfer: launch(
-            _transfer_directions, normals.size, inputs=inputs, outputs=[as_chunks(transfer)], cost=cost
+            _transfer_directions, normals.size, inputs=[cells], outputs=[as_chunks(transfer)], cost=cost
         ),
         lambda adj_transfer: launch(
             _transfer_directions_adjoint,
             normals.size,
-            inputs=[*inputs, as_chunks(adj_transfer)],
+            inputs=[cells, as_chunks(adj_transfer)],
             outputs=[as_chunks(transmittance.grad), normals.grad],
             cost=2 * cost,
         ),

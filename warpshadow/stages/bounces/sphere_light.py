@@ -40,12 +40,13 @@ from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters, merged_count
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, merged_count
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    TraversalInputs,
     lane_structs,
+    make_inputs,
     make_load_receivers,
-    make_spheres,
     make_traversal,
     receiver_lanes_type,
     sphere_view_type,
@@ -86,9 +87,7 @@ def _task_type(lanes: int) -> Any:
 class LightInputs:
     """Inputs of the light that spheres send, and of its adjoint."""
 
-    points: wp.array2d(dtype=wp.vec3)
-    normals: wp.array2d(dtype=wp.vec3)
-    spheres: SphereClusters
+    traversed: TraversalInputs
     cells: DirectionCells
     proxy_radiance: wp.array3d(dtype=wp.vec4)
     transmittance: wp.array3d(dtype=wp.float32)
@@ -103,7 +102,7 @@ def _make_begin(lanes: int) -> wp.Function:
     """Make the kernel function that finds out which receivers and directions a thread works on."""
     Lane, LightTask = lane_type(lanes), _task_type(lanes)
     fn = make_lane_functions(lanes)
-    find_block, is_any_above, dot_direction = fn.find_block, fn.is_any_above, fn.dot_direction
+    is_any_above, dot_direction = fn.is_any_above, fn.dot_direction
     load_receivers = make_load_receivers(True, lanes)
 
     @wp.func(inline=lanes == 1)
@@ -116,8 +115,8 @@ def _make_begin(lanes: int) -> wp.Function:
         reached_bundles: wp.array3d(dtype=wp.int32),
         sums: wp.array2d(dtype=Lane),
     ):
-        batch, group = find_block(row, inputs.points.shape[1])
-        receivers = load_receivers(inputs.points, inputs.normals, batch, group)
+        batch, group, receivers = load_receivers(inputs.traversed, row)
+        spheres = inputs.traversed.spheres
         item = row * inputs.span_count + span
         place = scratch_place(worker, item)
         task = LightTask()
@@ -130,8 +129,8 @@ def _make_begin(lanes: int) -> wp.Function:
         task.sums = sums[wp.where(inputs.stores_sums, item, place)]
         task.proxy_radiance = inputs.proxy_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         size = float(TINY_RADIUS)
-        for run in range(inputs.spheres.bounds_of_runs.shape[1]):
-            size = wp.max(size, inputs.spheres.bounds_of_runs[batch, run][3])
+        for run in range(spheres.bounds_of_runs.shape[1]):
+            size = wp.max(size, spheres.bounds_of_runs[batch, run][3])
         task.inverse_size = 1.0 / size
         for bundle in range(task.ends.shape[0]):
             task.ends[bundle] = 0
@@ -139,7 +138,7 @@ def _make_begin(lanes: int) -> wp.Function:
             if is_any_above(dot_direction(task.cells.axes[at], receivers.normals), -task.cells.half_angles[at][1]):
                 for i in range(BUNDLE):
                     blocked = Lane()
-                    for lane in range(wp.min(lanes, inputs.points.shape[1] - group * lanes)):
+                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - group * lanes)):
                         vertex = group * lanes + lane
                         maximum = float(1.0)
                         if inputs.unblocked:
@@ -148,7 +147,7 @@ def _make_begin(lanes: int) -> wp.Function:
                         blocked[lane] = maximum - inputs.transmittance[batch, vertex, at * BUNDLE + i]
                     task.blocked[bundle * BUNDLE + i] = blocked
                     if is_any_above(wp.max(blocked, -blocked), 0.0):
-                        task.ends[bundle] = inputs.spheres.bounds_of_quads.shape[1] * ITEMS
+                        task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
         return batch, group, receivers, task
 
     return begin
@@ -229,7 +228,7 @@ def _make_light(lanes: int) -> wp.Kernel:
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
-        traverse(receivers, batch, inputs.spheres, Gradients(), task)
+        traverse(receivers, batch, inputs.traversed.spheres, Gradients(), task)
         total = Vectors()
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
@@ -381,7 +380,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                     turned.z += omega[2] * adj_cosine
                     facing = inputs.factor * wp.max(cosine, Lane(0.0))
                     adj_blocked = wp.cw_mul(facing, pulled)
-                    for lane in range(wp.min(lanes, inputs.points.shape[1] - group * lanes)):
+                    for lane in range(wp.min(lanes, inputs.traversed.points.shape[1] - group * lanes)):
                         vertex = group * lanes + lane
                         if adj_transmittance:
                             adj_transmittance[batch, vertex, direction] = (
@@ -394,7 +393,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                             )
                     task.blocked[place] = wp.cw_mul(wp.cw_mul(facing, task.blocked[place]), inverse)
                     task.pulls[place] = pulled
-        adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
+        adj = traverse(receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
@@ -456,11 +455,11 @@ def sphere_light(
         check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
     device = points.device
     lanes = lane_count(device)
-    cells = make_cells(directions, width, device)
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     own_count = len(directions) // span_count
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
+    cell = cell_radius(len(directions))
+    nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
     dim = batch_count * block_count(vertex_count, lanes), span_count
     variables = [points, normals, *nodes, proxy_radiance, transmittance, unblocked]
     stores_sums = varies(variables)
@@ -468,7 +467,7 @@ def sphere_light(
     sums = (own_count * _SUMS,), lane_type(lanes)
     cached = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
     inputs = LightInputs()
-    inputs.points, inputs.normals, inputs.spheres, inputs.cells = points, normals, spheres, cells
+    inputs.traversed, inputs.cells = traversed, make_cells(directions, width, device)
     inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), span_count, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * own_count

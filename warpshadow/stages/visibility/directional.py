@@ -30,12 +30,13 @@ from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_direct
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
-from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients, SphereClusters
+from warpshadow.stages.visibility.merging import ITEMS, MERGING, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    TraversalInputs,
     lane_structs,
+    make_inputs,
     make_load_receivers,
-    make_spheres,
     make_traversal,
     receiver_lanes_type,
     sphere_view_type,
@@ -68,25 +69,24 @@ def _task_type(lanes: int) -> Any:
 def _make_begin(has_horizon: bool, lanes: int) -> wp.Function:
     """Make the kernel function that finds out which receivers and directions a thread works on."""
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
-    find_block, load_receivers = make_lane_functions(lanes).find_block, make_load_receivers(has_horizon, lanes)
+    load_receivers = make_load_receivers(has_horizon, lanes)
 
     @wp.func(inline=lanes == 1)
     def begin(
         row: int,
         span: int,
         worker: int,
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
+        inputs: TraversalInputs,
         cells: DirectionCells,
         all_ends: wp.array3d(dtype=wp.int32),
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
-        batch, group = find_block(row, points.shape[1])
+        batch, group, receivers = load_receivers(inputs, row)
         place = scratch_place(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
         task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[place], scratch[place])
-        return batch, group, load_receivers(points, normals, batch, group), task
+        return batch, group, receivers, task
 
     return begin
 
@@ -144,9 +144,7 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
+        inputs: TraversalInputs,
         cells: DirectionCells,
         # scratch
         scratch: wp.array2d(dtype=Lane),
@@ -158,17 +156,17 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
         item, span = wp.tid()
         batch, group, receivers, task = begin(
-            first_row + item, span, worker, points, normals, cells, all_ends, scratch, reached_bundles
+            first_row + item, span, worker, inputs, cells, all_ends, scratch, reached_bundles
         )
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
                 task.passing[bundle * BUNDLE + i] = Lane(1.0)
-            task.ends[bundle] = spheres.bounds_of_quads.shape[1] * ITEMS
+            task.ends[bundle] = inputs.spheres.bounds_of_quads.shape[1] * ITEMS
             if wp.static(has_horizon):
                 at = task.first_bundle + bundle
                 if not is_any_above(dot_direction(cells.axes[at], receivers.normals), -cells.half_angles[at][1]):
                     task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
-        traverse(receivers, batch, spheres, Gradients(), task)
+        traverse(receivers, batch, inputs.spheres, Gradients(), task)
         direction_count = task.ends.shape[0] * BUNDLE
         store_columns(task.passing, task.first_bundle * BUNDLE, direction_count, group, transmittance[batch])
 
@@ -240,9 +238,7 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
+        inputs: TraversalInputs,
         cells: DirectionCells,
         all_ends: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
@@ -259,11 +255,11 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         """A thread owns a group of receivers and a span of bundles."""
         item, span = wp.tid()
         batch, group, receivers, task = begin(
-            first_row + item, span, worker, points, normals, cells, all_ends, scratch, reached_bundles
+            first_row + item, span, worker, inputs, cells, all_ends, scratch, reached_bundles
         )
         begin_column, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
         load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, group, task.passing)
-        adj = traverse(receivers, batch, spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
+        adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
 
@@ -314,7 +310,7 @@ def transmittance(
     # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
     span_count = 1 if device.is_cpu else len(directions) // CHUNK
     bundle_count = len(directions) // (BUNDLE * span_count)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(len(directions)), skip, clusters)
+    nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
     dim = batch_count * block_count(vertex_count, lanes), span_count
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
     ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
@@ -325,7 +321,7 @@ def transmittance(
             _make_transmit(normals is not None, lanes),
             dim,
             cost=cost,
-            inputs=[points, normals, spheres, cells],
+            inputs=[inputs, cells],
             scratch=scratch,
             outputs=[ends, result],
         ),
@@ -333,7 +329,7 @@ def transmittance(
             _make_transmit_adjoint(normals is not None, lanes),
             dim,
             cost=2 * cost,
-            inputs=[points, normals, spheres, cells, ends, result, adj_result],
+            inputs=[inputs, cells, ends, result, adj_result],
             scratch=scratch,
             outputs=[points.grad],
             sums=[array.grad for array in nodes],

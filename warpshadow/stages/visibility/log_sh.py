@@ -16,12 +16,13 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
 from warpshadow.stages.visibility.cones import check_spheres, cone_type, make_cone_adjoint
-from warpshadow.stages.visibility.merging import MERGING, Gradients, SphereClusters
+from warpshadow.stages.visibility.merging import MERGING, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
+    TraversalInputs,
     lane_structs,
+    make_inputs,
     make_load_receivers,
-    make_spheres,
     make_traversal,
     receiver_lanes_type,
     sphere_view_type,
@@ -86,7 +87,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     Lane, Band, LogTask = lane_type(lanes), band_type(order), _task_type(order, lanes)
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
-    find_block, store_rows, is_any_above, dot = fn.find_block, fn.store_rows, fn.is_any_above, fn.dot
+    store_rows, is_any_above, dot = fn.store_rows, fn.is_any_above, fn.dot
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
     look_up, add_rotated_zonal = make_look_up(order, False, lanes), make_add_rotated_zonal(order, lanes)
 
@@ -110,9 +111,7 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
+        inputs: TraversalInputs,
         table: wp.array2d(dtype=Band),
         # scratch
         total: wp.array2d(dtype=Lane),
@@ -121,11 +120,11 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
-        batch, group = find_block(thread, points.shape[1])
+        batch, group, receivers = load_receivers(inputs, thread)
         row = total[scratch_place(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
-        traverse(load_receivers(points, normals, batch, group), batch, spheres, Gradients(), LogTask(table, row))
+        traverse(receivers, batch, inputs.spheres, Gradients(), LogTask(table, row))
         store_rows(row, group, log_sh[batch])
 
     return accumulate_log_sh
@@ -137,7 +136,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     LogTask = _task_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_block, load_rows, add_vectors = fn.find_block, fn.load_rows, fn.add_vectors
+    load_rows, add_vectors = fn.load_rows, fn.add_vectors
     is_any_above, dot, add, scale = fn.is_any_above, fn.dot, fn.add, fn.scale
     cone_adjoint = make_cone_adjoint(lanes)
     load_receivers, horizon = make_load_receivers(has_horizon, lanes), _make_horizon(lanes)
@@ -198,9 +197,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         first_row: int,
         worker: int,
         # in
-        points: wp.array2d(dtype=wp.vec3),
-        normals: wp.array2d(dtype=wp.vec3),
-        spheres: SphereClusters,
+        inputs: TraversalInputs,
         table: wp.array2d(dtype=Band),
         adj_log_sh: wp.array3d(dtype=wp.float32),
         # scratch
@@ -214,12 +211,11 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     ):
         """A thread owns a group of receivers."""
         thread = first_row + wp.tid()
-        batch, group = find_block(thread, points.shape[1])
+        batch, group, receivers = load_receivers(inputs, thread)
         row = scratch[scratch_place(worker, thread)]
         load_rows(adj_log_sh[batch], group, row)
-        receivers = load_receivers(points, normals, batch, group)
         gradients = Gradients(adj_centers, adj_radii, adj_extents)
-        adj = traverse(receivers, batch, spheres, gradients, LogTask(table, row))
+        adj = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
         if adj_points:
             add_vectors(adj.points, group, adj_points[batch])
         if adj_normals:
@@ -270,8 +266,8 @@ def accumulate(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * block_count(vertex_count, lanes)
-    nodes, spheres = make_spheres(centers, radii, merging, cell_radius(order**2), skip, clusters)
-    inputs = [points, normals, spheres, zonal_table(order, log, str(device))]
+    nodes, given = make_inputs(points, normals, centers, radii, merging, cell_radius(order**2), skip, clusters)
+    inputs = [given, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2
     return differentiable(

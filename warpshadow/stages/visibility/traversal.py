@@ -94,24 +94,36 @@ def find_clusters(centers: wp.array, radii: wp.array, merging: float) -> Cluster
     return ClusterTree(nodes, _find_bounds(nodes, count, 1), _find_bounds(nodes, count, QUADS))
 
 
-def make_spheres(
+@wp.struct
+class TraversalInputs:
+    """Receivers, and the spheres that they may see."""
+
+    points: wp.array2d(dtype=wp.vec3)
+    normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
+    spheres: SphereClusters
+
+
+def make_inputs(
+    points: wp.array,
+    normals: wp.array | None,
     centers: wp.array,
     radii: wp.array,
     merging: float,
     cell: float,
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
-) -> tuple[ClusterNodes, SphereClusters]:
-    """Put spheres together with their clusters.
+) -> tuple[ClusterNodes, TraversalInputs]:
+    """Put receivers together with spheres and their clusters.
 
     Args:
+        points, normals: Receivers, [batch, receiver].
         centers, radii: Spheres, [batch, sphere].
         merging: τ in cell radii, 0 for never.
         cell: Radius of a cell [rad].
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, where they are found already.
     Returns:
-        The spheres as arrays, and as kernels see them.
+        The spheres as arrays; and all as kernels see it.
     Differentiable: centers, radii to the nodes.
     """
     count = radii.shape[1]
@@ -123,7 +135,9 @@ def make_spheres(
     spheres.count, spheres.merging_angle = count, merging * cell
     spheres.skip_begin, spheres.skip_end = skip
     spheres.bounds_of_quads, spheres.bounds_of_runs = bounds
-    return nodes, spheres
+    inputs = TraversalInputs()
+    inputs.points, inputs.normals, inputs.spheres = points, normals, spheres
+    return nodes, inputs
 
 
 def _find_bounds(nodes: ClusterNodes, sphere_count: int, quad_count: int) -> wp.array:
@@ -149,16 +163,18 @@ def receiver_lanes_type(lanes: int) -> Any:
 
 @functools.cache
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads a group of receivers."""
+    """Make the kernel function that loads a group of receivers: inputs, row → instance, group, receivers."""
     Vectors, ReceiverLanes = vectors_type(lanes), receiver_lanes_type(lanes)
-    load = make_lane_functions(lanes).load
+    fn = make_lane_functions(lanes)
+    find_block, load = fn.find_block, fn.load
 
     @wp.func(inline=True)
-    def load_receivers(points: wp.array2d(dtype=wp.vec3), normals: wp.array2d(dtype=wp.vec3), batch: int, group: int):
-        own_normals = Vectors()
+    def load_receivers(inputs: TraversalInputs, row: int):
+        batch, group = find_block(row, inputs.points.shape[1])
+        normals = Vectors()
         if wp.static(has_horizon):
-            own_normals = load(normals[batch], group)
-        return ReceiverLanes(load(points[batch], group), own_normals)
+            normals = load(inputs.normals[batch], group)
+        return batch, group, ReceiverLanes(load(inputs.points[batch], group), normals)
 
     return load_receivers
 
