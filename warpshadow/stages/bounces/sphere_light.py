@@ -420,10 +420,7 @@ def sphere_light(
     """Light that spheres send to receivers, through the cells that they block.
 
     Args:
-        points: Receiver positions [scene units], vec3 of shape [batch, receiver].
-        normals: Unit normals, vec3 of shape [batch, receiver].
-        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
-        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+        points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
         proxy_radiance: Light and area that spheres, and the quads that they merge into, show towards cells, vec4 of
             shape [batch, node, direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every
             instance.
@@ -432,10 +429,7 @@ def sphere_light(
         unblocked: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every instance. None
             for 1.
         directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
-        softness: κ, half-width of the falloff in cell radii.
-        merging: τ, the half-angle in cell radii under which four spheres are seen as one; 0 for never.
-        skip: Spheres that are left out: the first, and the one after the last.
-        clusters: Of these spheres, from :func:`.traverse.find_clusters`, where they are found already.
+        softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]. (All sides white and bright, 1.)
     Raises:

@@ -2,18 +2,7 @@
 
 exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
 
-Squarings are *held* where they would explode. Where many spheres overlap, the truncated sum of their logs has lobes
-above 0, and their exponential has no bound: with 10 000 spheres in one direction it leaves float64. A visibility v has
-values from 0 to 1, so the mean of v² over all directions is at most the mean of v. Truncation breaks that rule, and d =
-⟨v²⟩ − ⟨v⟩, which is then above 0, measures by how much. Each squaring is
-
-    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
-
-While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the
-result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the
-squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings. LOUD is four
-times QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v
-changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
+Squarings are *held* where they would explode (:mod:`.held_squares`).
 
 The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with
 it, by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
@@ -37,6 +26,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.stages.sh_kernels import ProductTable, make_multiply, product_table
+from warpshadow.stages.visibility.held_squares import UNIT, make_square, make_square_adjoint
 from warpshadow.stages.visibility.zonal_logs import zonal_eigen_log
 
 
@@ -59,17 +49,11 @@ THRESHOLDS = {
 LEAST_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
 MOST_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
-QUIET = 6.0
-"""|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
-
-LOUD = 24.0  # |f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared
-
 BLENDED = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
 _SQUARING_COST = 0.5  # nanoseconds that exponentiation takes for a receiver and a pair of coefficients
 
-_UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
 _KNOTS = 2048
 
 
@@ -82,7 +66,7 @@ def _optimal_table(order: int, device: str) -> wp.array:
     z, weight = np.polynomial.legendre.leggauss(64)
     basis = sh.zonal_basis(order, z)
     exponential = 2 * np.pi * np.exp(log @ basis.T) * weight @ basis
-    a = exponential[:, 0] / _UNIT
+    a = exponential[:, 0] / UNIT
     b = np.sum(exponential * log, axis=1) / norm**2
     rising = np.argmax(norm)
     knots = np.linspace(0, THRESHOLDS["optimal_linear"].limit, _KNOTS + 1)
@@ -131,7 +115,7 @@ def _make_measure(order: int, lanes: int) -> wp.Function:
             maximum = wp.max(maximum, p)
             # DC isolation: exp*(f) = e^{f0/√4π} exp*(f̂), the factor taken below the squarings so that nothing
             # overflows
-            root[lane] = wp.exp(0.5 * s * log[0][lane] / _UNIT)
+            root[lane] = wp.exp(0.5 * s * log[0][lane] / UNIT)
             t = wp.clamp((s * depth[lane] / threshold - 0.5) * PER_BLEND, 0.0, 1.0)
             blend[lane] = t * t * (3.0 - 2.0 * t)
             blend_slope[lane] = 6.0 * PER_BLEND * t * (1.0 - t) * s / threshold
@@ -194,96 +178,9 @@ def _make_base(order: int, base: str, lanes: int) -> wp.Function:
             if wp.static(base == "quadratic"):
                 value += wp.cw_mul(quadratic, square[i])
             result[i] = value
-        result[0] = result[0] + _UNIT * wp.cw_mul(factor, constant)
+        result[0] = result[0] + UNIT * wp.cw_mul(factor, constant)
 
     return approximate
-
-
-@functools.cache
-def _make_hold(lanes: int) -> wp.Function:
-    """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
-    Lane = lane_type(lanes)
-    PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
-
-    @wp.func
-    def hold(loudness: Lane):
-        share = Lane(1.0)
-        slope = Lane(0.0)
-        if wp.max(loudness) > QUIET:
-            for lane in range(lanes):
-                if loudness[lane] > QUIET:
-                    t = wp.min(wp.log(loudness[lane] / QUIET) * PER_OCTAVES, 1.0)
-                    share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
-                    slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
-        return share, slope
-
-    return hold
-
-
-@functools.cache
-def _make_square(order: int, lanes: int) -> wp.Function:
-    """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
-    Lane = lane_type(lanes)
-    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
-
-    @wp.func
-    def square_held(
-        row: wp.array(dtype=Lane),
-        depth: Lane,
-        table: ProductTable,
-        square: wp.array(dtype=Lane),
-    ):
-        multiply(row, row, table, square)
-        share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / _UNIT)
-        rest = Lane(1.0) - share
-        if wp.max(rest) > 0.0:
-            for i in range(wp.static(order**2)):
-                square[i] = wp.cw_mul(rest, row[i]) + wp.cw_mul(share, square[i])
-        return rest
-
-    return square_held
-
-
-@functools.cache
-def _make_square_adjoint(order: int, lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`_make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
-
-    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the
-    loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄
-    λ/|f̂|.
-    """
-    Lane = lane_type(lanes)
-    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
-
-    @wp.func
-    def square_held_adjoint(
-        row: wp.array(dtype=Lane),
-        depth: Lane,
-        table: ProductTable,
-        adj_square: wp.array(dtype=Lane),
-        adj_row: wp.array(dtype=Lane),
-    ):
-        multiply(row, adj_square, table, adj_row)
-        mean_square = Lane(0.0)
-        row_dot = Lane(0.0)
-        adj_share = Lane(0.0)
-        for i in range(wp.static(order**2)):
-            mean_square += wp.cw_mul(row[i], row[i])
-            row_dot += wp.cw_mul(row[i], adj_square[i])
-            adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
-        growth = (mean_square / _UNIT - row[0]) / _UNIT
-        share, share_slope = hold(wp.cw_mul(depth, growth))
-        for i in range(wp.static(order**2)):
-            adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
-        adj_loudness = wp.cw_mul(adj_share, share_slope)
-        if wp.min(share_slope) < 0.0:
-            adj_growth = wp.cw_mul(adj_loudness, depth)
-            for i in range(wp.static(order**2)):
-                adj_row[i] = adj_row[i] + (2.0 / _UNIT / _UNIT) * wp.cw_mul(adj_growth, row[i])
-            adj_row[0] = adj_row[0] - adj_growth / _UNIT
-        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
-
-    return square_held_adjoint
 
 
 @functools.cache
@@ -293,7 +190,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
     load_rows, store_rows, multiply = fn.load_rows, fn.store_rows, make_multiply(order, lanes)
     find_block = fn.find_block
     measure, approximate = _make_measure(order, lanes), _make_base(order, base, lanes)
-    square_held = _make_square(order, lanes)
+    square_held = make_square(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh(
@@ -362,7 +259,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
     load_rows, add_rows, multiply = fn.load_rows, fn.add_rows, make_multiply(order, lanes)
     find_block = fn.find_block
     measure, factors = _make_measure(order, lanes), _make_factor(base, lanes)
-    square_held_adjoint = _make_square_adjoint(order, lanes)
+    square_held_adjoint = make_square_adjoint(order, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def exponentiate_log_sh_adjoint(
@@ -420,9 +317,9 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
             log[i] = wp.cw_mul(scale, log[i])
             row_dot += wp.cw_mul(adj_row[i], log[i])
             half_along += wp.cw_mul(adj_row[i], half[i])
-        whole = wp.cw_mul(factor, _UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, row_dot))  # Σ v̄ q
+        whole = wp.cw_mul(factor, UNIT * wp.cw_mul(constant, adj_row[0]) + wp.cw_mul(slope, row_dot))  # Σ v̄ q
         if wp.static(base == "quadratic"):
-            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * _UNIT * adj_row[0] + row_dot)
+            whole = 4.0 * wp.cw_mul(root, half_along) - wp.cw_mul(factor, 3.0 * UNIT * adj_row[0] + row_dot)
         rest = Lane(1.0) - blend
         dc = wp.cw_mul(rest, whole)
         if wp.max(blend) > 0.0:
@@ -444,8 +341,8 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         row_dot = wp.cw_mul(wp.cw_mul(factor, rest), row_dot)
         radial = Lane(0.0)
         if wp.static(base == "optimal_linear"):
-            radial = _UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
-            radial += _UNIT * wp.cw_mul(product[0], half_constant_change)
+            radial = UNIT * wp.cw_mul(adj_row[0], constant_change) + wp.cw_mul(row_dot, slope_change)
+            radial += UNIT * wp.cw_mul(product[0], half_constant_change)
             radial += 0.5 * wp.cw_mul(half_along, half_slope_change)
             radial = wp.cw_div(radial, wp.max(length, Lane(1.0e-20)))
         for i in range(wp.static(order**2)):
@@ -459,7 +356,7 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
         adj_depth = wp.cw_div(adj_depth, wp.max(wp.cw_mul(scale, depth), Lane(1.0e-20)))
         for i in range(1, wp.static(order**2)):
             adj_row[i] = wp.cw_mul(scale, adj_row[i]) + wp.cw_mul(adj_depth, log[i])
-        adj_row[0] = wp.cw_mul(scale, dc) / _UNIT + wp.cw_mul(adj_depth, above)
+        adj_row[0] = wp.cw_mul(scale, dc) / UNIT + wp.cw_mul(adj_depth, above)
         add_rows(adj_row, group, adj_log_sh[batch])
 
     return exponentiate_log_sh_adjoint

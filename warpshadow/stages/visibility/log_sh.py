@@ -250,13 +250,11 @@ def accumulate(
         log: "eigen" (Ren et al. 2006, accurate where spheres overlap) or "cap" (the paper's).
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
-        skip: Spheres that are left out: the first, and the one after the last.
-        clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
+        skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
         Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
     Raises:
-        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
-            is captured, nothing is checked.)
+        ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii, as the transmittance.
     Differentiable: points, normals, centers, radii.
     """
     sh.check_order(order)

@@ -1,0 +1,117 @@
+"""Held squarings of visibility in spherical harmonics: each stops where it would explode.
+
+Where many spheres overlap, the truncated sum of their logs has lobes above 0, and their exponential has no bound: with
+10 000 spheres in one direction it leaves float64. A visibility v has values from 0 to 1, so the mean of v² over all
+directions is at most the mean of v. Truncation breaks that rule, and d = ⟨v²⟩ − ⟨v⟩, which is then above 0, measures by
+how much. Each squaring is
+
+    v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / QUIET) / log(LOUD / QUIET))
+
+While |f̂| d ≤ QUIET, w = 1: v is squared. From LOUD on, w = 0: v stays as it is. If k squarings are left out, the
+result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops the
+squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings. LOUD is four
+times QUIET: one squaring raises d by that factor or more, so w is between 0 and 1 for one squaring at a time, and v
+changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the product v * v.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.lanes import lane_type
+from warpshadow.stages.sh_kernels import ProductTable, make_multiply
+
+QUIET = 6.0
+"""|f̂|(⟨v²⟩ − ⟨v⟩) up to which squaring is exact; 64 spheres around a bunny reach 0.4 (`eigen`) and 5.1 (`cap`)."""
+
+LOUD = 24.0  # |f̂|(⟨v²⟩ − ⟨v⟩) from which on nothing is squared
+
+UNIT = float(np.sqrt(4 * np.pi))  # the coefficient of the constant function 1
+
+
+@functools.cache
+def _make_hold(lanes: int) -> wp.Function:
+    """Make the kernel function of holding squarings: |f̂| d → the share w of the square, and its derivative."""
+    Lane = lane_type(lanes)
+    PER_OCTAVES = wp.constant(float(1 / np.log(LOUD / QUIET)))
+
+    @wp.func
+    def hold(loudness: Lane):
+        share = Lane(1.0)
+        slope = Lane(0.0)
+        if wp.max(loudness) > QUIET:
+            for lane in range(lanes):
+                if loudness[lane] > QUIET:
+                    t = wp.min(wp.log(loudness[lane] / QUIET) * PER_OCTAVES, 1.0)
+                    share[lane] = 1.0 - t * t * (3.0 - 2.0 * t)
+                    slope[lane] = -6.0 * PER_OCTAVES * t * (1.0 - t) / loudness[lane]
+        return share, slope
+
+    return hold
+
+
+@functools.cache
+def make_square(order: int, lanes: int) -> wp.Function:
+    """Make the kernel function of held squaring: H(v) = v + w (v * v − v); returns 1 − w."""
+    Lane = lane_type(lanes)
+    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
+
+    @wp.func
+    def square_held(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        table: ProductTable,
+        square: wp.array(dtype=Lane),
+    ):
+        multiply(row, row, table, square)
+        share, _slope = hold(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
+        rest = Lane(1.0) - share
+        if wp.max(rest) > 0.0:
+            for i in range(wp.static(order**2)):
+                square[i] = wp.cw_mul(rest, row[i]) + wp.cw_mul(share, square[i])
+        return rest
+
+    return square_held
+
+
+@functools.cache
+def make_square_adjoint(order: int, lanes: int) -> wp.Function:
+    """Make the adjoint of :func:`make_square`: H̄ → v̄; returns Σ H̄ H(v) and |f̂|¯.
+
+    Γ is symmetric, so v̄ = H̄ + w (2 v * H̄ − H̄), w̄ = Σ v (v * H̄ − H̄) and, as (v * v)_0 = |v|²/√4π, with the
+    loudness λ = |f̂| (|v|²/4π − v0/√4π) and λ̄ = w̄ w' where it is held also v̄ += λ̄ |f̂| (2v/4π − e0/√4π), |f̂|¯ = λ̄
+    λ/|f̂|.
+    """
+    Lane = lane_type(lanes)
+    hold, multiply = _make_hold(lanes), make_multiply(order, lanes)
+
+    @wp.func
+    def square_held_adjoint(
+        row: wp.array(dtype=Lane),
+        depth: Lane,
+        table: ProductTable,
+        adj_square: wp.array(dtype=Lane),
+        adj_row: wp.array(dtype=Lane),
+    ):
+        multiply(row, adj_square, table, adj_row)
+        mean_square = Lane(0.0)
+        row_dot = Lane(0.0)
+        adj_share = Lane(0.0)
+        for i in range(wp.static(order**2)):
+            mean_square += wp.cw_mul(row[i], row[i])
+            row_dot += wp.cw_mul(row[i], adj_square[i])
+            adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
+        growth = (mean_square / UNIT - row[0]) / UNIT
+        share, share_slope = hold(wp.cw_mul(depth, growth))
+        for i in range(wp.static(order**2)):
+            adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
+        adj_loudness = wp.cw_mul(adj_share, share_slope)
+        if wp.min(share_slope) < 0.0:
+            adj_growth = wp.cw_mul(adj_loudness, depth)
+            for i in range(wp.static(order**2)):
+                adj_row[i] = adj_row[i] + (2.0 / UNIT / UNIT) * wp.cw_mul(adj_growth, row[i])
+            adj_row[0] = adj_row[0] - adj_growth / UNIT
+        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_loudness, growth)
+
+    return square_held_adjoint
