@@ -11,6 +11,7 @@ import warp as wp
 
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
+from warpshadow.pipeline.convex import SceneParts
 from warpshadow.pipeline.groups import Group, Grouping, Transmittance
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
@@ -72,6 +73,11 @@ class SphereMethod(Method):
     def planes(self) -> ScenePlanes:
         """The bodies that lie in planes."""
         return ScenePlanes(self.merged_scene)
+
+    @functools.cached_property
+    def parts(self) -> SceneParts:
+        """The bodies that consist of convex parts."""
+        return SceneParts(self.merged_scene)
 
     def planes_in(self, geometry: Geometry | None) -> tuple[int, ...]:
         """Bodies that block as planes in a geometry, by default the scene's: where light does not bounce, no deformed
@@ -197,7 +203,7 @@ class InParts(Node):
         is_shaded: bool = True,
         extra_inputs: tuple[Node, ...] = (),
     ):
-        self.method, self._grouping = method, Grouping(points, method.planes)
+        self.method, self._grouping = method, Grouping(points, method.planes, method.parts)
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         self_visibility = _self_visibility(method, points, projected_light)
@@ -215,6 +221,10 @@ class InParts(Node):
         planes = points.blocking.planes
         place = functools.partial(method.planes.frames, planes) if planes else lambda _: None
         frames = Node("", place, points.vertices)
+        convex = points.blocking.convex
+        parts = Node(
+            "", functools.partial(method.parts.placed, convex) if convex else lambda _: None, points.vertices
+        )
         corners = Node("", method.planes.corners if method.planes.numbers else lambda _: None, points.vertices)
         self._passing = Node(
             f"planes{where}",
@@ -246,7 +256,7 @@ class InParts(Node):
         shadows = _static_shadows(method, points, light)
         cached_rows = shadows if shadows.function else None
         looked_up: Node | dict = self_visibility if self_visibility.function else {}
-        before = receivers, spheres, projected_light, cached_rows, looked_up, frames, corners
+        before = receivers, spheres, projected_light, cached_rows, looked_up, frames, corners, parts
         super().__init__(
             "", None, *before, extra_inputs=(self_visibility, shadows, result, *extra_inputs), caches=caches
         )
@@ -257,8 +267,8 @@ class InParts(Node):
 
     def parts(self, call: Call) -> Iterator[Any]:
         """Find it for one part after another."""
-        receivers, spheres, projected_light, cached_rows, looked_up, *plane_nodes = self.values(call)
-        groups = self._grouping.groups(call, receivers, spheres, cached_rows, looked_up, *plane_nodes)
+        receivers, spheres, projected_light, cached_rows, looked_up, *others = self.values(call)
+        groups = self._grouping.groups(call, receivers, spheres, cached_rows, looked_up, *others)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in groups:
@@ -285,24 +295,38 @@ class InParts(Node):
 
 
 def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
-    """Number of spheres by which each body blocks light."""
+    """Number of spheres by which each body blocks the light of others."""
     bodies = np.arange(len(method.merged_scene.scene.bodies))
-    return np.where(np.isin(bodies, points.blocking.planes), 0, method.merged_scene.sphere_counts)
+    return np.where(np.isin(bodies, (*points.blocking.planes, *points.blocking.convex)), 0, method.merged_scene.sphere_counts)
+
+
+def _part_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
+    """Number of convex parts by which each body blocks the light of others."""
+    counts = np.zeros(len(method.merged_scene.scene.bodies), int)
+    for body in points.blocking.convex:
+        counts[body] = len(method.parts.parts[body])
+    return counts
 
 
 def _pairs(method: SphereMethod, points: LitPoints) -> str:
-    """Receivers and the spheres that block them, in words."""
-    counts = _sphere_counts(method, points)
-    words = f"{receiver_words(points, static=False)} × {counts.sum():,} spheres"
+    """Receivers and the spheres and convex parts that block them, in words."""
+    spheres, parts = _sphere_counts(method, points), _part_counts(method, points)
+
+    def blockers(bodies: list[int]) -> str:
+        solids = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
+        return f"{spheres[bodies].sum():,} spheres{solids}"
+
+    words = f"{receiver_words(points, static=False)} × {blockers(list(range(len(spheres))))}"
     if points.static is None:
         return words
-    moving = counts[list(points.static.moving)].sum()
-    return f"{words}, {receiver_words(points, moving=False)} on static bodies × {moving:,} spheres"
+    moving = list(points.static.moving)
+    return f"{words}, {receiver_words(points, moving=False)} on static bodies × {blockers(moving)}"
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
     """Why no visibility has to be found; empty if it has."""
-    counts, (_, moving, static) = _sphere_counts(method, points), points.counts()
+    counts = _sphere_counts(method, points) + _part_counts(method, points)
+    _, moving, static = points.counts()
     if method.why_no_shadows or not counts.sum():
         rest = "but flat ones " if points.blocking.planes else ""
         return method.why_no_shadows or f"no body {rest}has blockers"

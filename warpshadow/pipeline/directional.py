@@ -13,6 +13,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import SphereMethod
+from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, Transmittance
 from warpshadow.pipeline.lighting import LARGEST_COEFFICIENT, KnownLight, map_of
 from warpshadow.pipeline.merged_scene import MergedScene
@@ -94,25 +95,42 @@ class Directional(SphereMethod):
 
     def see(self, group: Group, projected_light: ProjectedCells) -> Transmittance:
         """Transmittance, float32 of shape [batch, receiver, direction]."""
-        points, normals, centers, radii, cached_rows = group[:5]
+        points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
         transmittance_self = self._transmittance_self(group, projected_light)
-        if not (radii.shape[1] and points.size):
-            if transmittance_self is not None:
-                return Transmittance(transmittance_self, transmittance_self)
-            shape = *points.shape, len(projected_light.directions)
-            return Transmittance(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
         # cached cells have light although their middles are below the horizon
         facing = normals if cached_rows is None else None
-        arguments, scales = (points, facing, centers, radii), self._scales
+        factors = [transmittance_self]
+        if points.size and group.parts_around is not None:
+            factors.append(self._past_parts(group.parts_around, points, facing, projected_light))
+        if points.size and radii.shape[1]:
+            factors.append(self._past_spheres(group, facing, projected_light))
+        known = [factor for factor in factors if factor is not None]
+        if not known:
+            shape = *points.shape, len(projected_light.directions)
+            return Transmittance(wp.full(shape, 1.0, dtype=wp.float32, device=points.device))
+        return Transmittance(functools.reduce(multiply_transmittances, known), transmittance_self)
+
+    def _past_parts(
+        self, parts: PartsOfGroup, points: wp.array, facing: wp.array | None, projected_light: ProjectedCells
+    ) -> wp.array:
+        """Transmittance past convex parts."""
+        transmittance = parts.transmittance(points, facing, projected_light.directions)
+        if projected_light.sharp_cells_past_planes is None:
+            return transmittance
+        directions, places, scale = projected_light.sharp_cells_past_planes
+        # a part has its own edges: they need no room for the rest of a cell, as spheres do not
+        radius = self.visibility.softness * scale * cell_radius(len(directions))
+        return overwrite_sharp_cells(transmittance, parts.transmittance(points, facing, directions, radius), places)
+
+    def _past_spheres(self, group: Group, facing: wp.array | None, projected_light: ProjectedCells) -> wp.array:
+        """Transmittance past spheres."""
+        arguments, scales = (group.points, facing, group.centers, group.radii), self._scales
         block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
         transmittance = block(projected_light.directions, **scales(1.0))
-        if projected_light.sharp_cells is not None:
-            directions, places, scale = projected_light.sharp_cells
-            transmittance = overwrite_sharp_cells(transmittance, block(directions, **scales(scale)), places)
-        return Transmittance(
-            transmittance if transmittance_self is None else multiply_transmittances(transmittance_self, transmittance),
-            transmittance_self,
-        )
+        if projected_light.sharp_cells is None:
+            return transmittance
+        directions, places, scale = projected_light.sharp_cells
+        return overwrite_sharp_cells(transmittance, block(directions, **scales(scale)), places)
 
     def _scales(self, scale: float) -> dict[str, Any]:
         """Settings in radii of cells, of radii that are so much smaller."""
@@ -122,6 +140,10 @@ class Directional(SphereMethod):
     def plane_blockers(self) -> tuple[int, ...]:
         """Cells of the scene."""
         return blocking_planes(self.merged_scene.scene)
+
+    def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+        """Bodies that consist of convex parts."""
+        return tuple(body for body in traced if body in self.parts.parts)
 
     def past_planes(self, group: Group, seen: Transmittance, projected_light: ProjectedCells) -> Transmittance:
         """Transmittance past the flat bodies around a group, too."""
@@ -217,7 +239,7 @@ class Directional(SphereMethod):
         """Light of the sharpest cells, over all light if nothing blocked any."""
         directions, light, scale, power = self._sharpest
         points, normals, centers, radii = group[:4]
-        if not radii.shape[1] and group.planes is None:
+        if not radii.shape[1] and group.planes is None and group.parts_around is None:
             return None
         if radii.shape[1]:
             transmittance = directional.transmittance(
@@ -225,8 +247,12 @@ class Directional(SphereMethod):
             )
         else:
             transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
+        radius = scale * cell_radius(CHUNK)
+        if group.parts_around is not None:
+            past_parts = group.parts_around.transmittance(points, normals, directions, radius)
+            transmittance = multiply_transmittances(transmittance, past_parts)
         if group.planes is not None:
-            planes, radius = group.planes, scale * cell_radius(CHUNK)
+            planes = group.planes
             lifted, fronts = group.among(planes.frames, planes.planes, planes.skip)
             arguments = lifted, planes.frames, planes.planes, directions
             covered = plane_coverage(*arguments, radius=radius, facing=normals, fronts=fronts, skip=planes.skip)

@@ -10,12 +10,14 @@ import warp as wp
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
+from warpshadow.pipeline.convex import PartsOfGroup, SceneParts
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.planes import PlanesOfGroup, ScenePlanes
 from warpshadow.pipeline.self_visibility import SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
+from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
 from warpshadow.stages.planes.prepared import PlaneBlockers
 from warpshadow.stages.receivers import Receivers
@@ -45,6 +47,7 @@ class Group(NamedTuple):
         None  # by rays; None where there is none, or its spheres block
     )
     planes: PlanesOfGroup | None = None  # bodies that block as planes; None without any
+    parts_around: PartsOfGroup | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where they are not sources of light
     corners: wp.array | None = None  # of the body, vec3 of shape [batch, corner]; None where it is not known
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
@@ -63,14 +66,15 @@ class Group(NamedTuple):
         self_lookup, planes, clusters = self.self_lookup, self.planes, self.clusters
         turns = None if self_lookup is None else self_lookup.turned
         frames = None if planes is None else planes.frames
+        solids = None if self.parts_around is None else self.parts_around.placed.corners
         arguments = points, normals, centers, radii = self[:4]
-        if radii.shape[1] or turns is not None or frames is not None:
+        if radii.shape[1] or any(array is not None for array in (turns, frames, solids)):
             arrays = {"points": points, "centers": centers, "radii": radii, "rotations": turns, "planes": frames}
-            count = common_batch(arrays | {"corners": self.corners})
+            count = common_batch(arrays | {"corners": self.corners, "parts": solids})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
-        if self.cached_rows is not None or size <= PART or varies([*arguments, turns, frames, self.corners]):
+        if self.cached_rows is not None or size <= PART or varies([*arguments, turns, frames, solids, self.corners]):
             yield self._replace(points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, PART):
@@ -100,10 +104,11 @@ class Grouping:
     Args:
         points: The receivers.
         planes: The scene's bodies that lie in a plane.
+        parts: And those that consist of convex parts.
     """
 
-    def __init__(self, points: LitPoints, planes: ScenePlanes):
-        self._points, self._planes = points, planes
+    def __init__(self, points: LitPoints, planes: ScenePlanes, parts: SceneParts):
+        self._points, self._planes, self._parts = points, planes, parts
         self._merged_scene, self._static = points.merged_scene, points.static
 
     def groups(
@@ -115,6 +120,7 @@ class Grouping:
         self_visibility: dict[int, Any],
         frames: wp.array | None,
         corners: wp.array | None,
+        placed: PlacedParts | None,
     ) -> list[Group]:
         """Put receivers into groups.
 
@@ -126,13 +132,18 @@ class Grouping:
             self_visibility: Self-visibility of receivers, by body.
             frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · plane]; None without any.
             corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]; None without planes.
+            placed: Where convex parts are of bodies that block as such; None without any.
         """
-        groups = list(self._that_move(call, receivers, spheres, self_visibility, frames, corners))
+        groups = list(self._that_move(call, receivers, spheres, self_visibility, frames, corners, placed))
         if self._static is None or not len(receivers.on_static):
             return groups
         on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
         moving = self._merged_scene.spheres_of(self._solid(self._static.moving), spheres)
-        group = Group(*on_static, *moving, cached_rows, planes=self._planes_around(frames, self._static.moving))
+        around = {
+            "planes": self._planes_around(frames, self._static.moving),
+            "parts_around": self._parts_around(placed, self._static.moving),
+        }
+        group = Group(*on_static, *moving, cached_rows, **around)
         return [group, *groups] if receivers.points.shape[1] else [group]
 
     def _that_move(
@@ -143,6 +154,7 @@ class Grouping:
         self_visibility: dict[int, Any],
         frames: wp.array | None,
         corners: wp.array | None,
+        placed: PlacedParts | None,
     ) -> Iterator[Group]:
         """Receivers that may move."""
         bodies = self._solid(range(len(self._merged_scene.scene.bodies)))
@@ -165,6 +177,7 @@ class Grouping:
             skip = self._merged_scene.spheres_among(bodies, span.body) if is_traced else (0, 0)
             others = none if skip == (0, blocking[1].shape[1]) else blocking
             group = Group(points, normals, *others, planes=self._planes_around(frames, but=span.body))
+            group = group._replace(parts_around=self._parts_around(placed, but=span.body))
             if others is blocking:
                 clusters = clusters or find_clusters(*blocking, self._points.method.visibility.merging)
                 group = group._replace(skip=skip, clusters=clusters)
@@ -185,14 +198,17 @@ class Grouping:
         body: int,
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
+        placed: PlacedParts | None,
     ) -> Group:
         """Points of a flat body, and their blockers."""
         blocking = self._merged_scene.spheres_of(self._solid(range(len(self._merged_scene.scene.bodies))), spheres)
-        return Group(points, normals, *blocking, planes=self._planes_around(frames, but=body))
+        around = {"planes": self._planes_around(frames, but=body), "parts_around": self._parts_around(placed)}
+        return Group(points, normals, *blocking, **around)
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
         """The spheres of some blockers."""
-        return [body for body in bodies if body not in self._points.blocking.planes]
+        blocking = self._points.blocking
+        return [body for body in bodies if body not in blocking.planes and body not in blocking.convex]
 
     def _nearest_blockers(self, spheres: tuple[wp.array, wp.array]) -> NearestBlockers | None:
         """The blockers nearest to the receivers; None where these are not sources."""
@@ -201,6 +217,16 @@ class Grouping:
             return None
         own = merged_scene.spheres_of(solid_bodies(merged_scene), spheres)
         return NearestBlockers(*own, constant(numbers, wp.int32, merged_scene.device))
+
+    def _parts_around(
+        self, placed: PlacedParts | None, blocking: tuple[int, ...] | None = None, *, but: int = -1
+    ) -> PartsOfGroup | None:
+        """Convex parts of bodies around receivers of one body: all that block, or some."""
+        bodies = self._points.blocking.convex
+        named = bodies if blocking is None else tuple(body for body in bodies if body in blocking)
+        if placed is None or not set(named) - {but}:
+            return None
+        return PartsOfGroup(self._parts.among(bodies, named), placed, bodies.index(but) if but in bodies else None)
 
     def _planes_around(
         self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1

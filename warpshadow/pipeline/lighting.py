@@ -152,6 +152,10 @@ class Method:
         """Bodies that block as planes in a geometry, by default the scene's."""
         return ()
 
+    def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+        """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
+        return ()
+
     @functools.cached_property
     def samples_receive(self) -> np.ndarray:
         """Bodies on which samples are receivers, bool of shape [body]."""

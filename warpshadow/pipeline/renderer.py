@@ -377,8 +377,9 @@ class SceneRenderer:
         if geometry is not None and geometry.rotations is not None:
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
             rotations = Input.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
-        return self._method.self_visibility.blocking(geometry, rotations)._replace(
-            planes=self._method.planes_in(geometry)
+        blocking = self._method.self_visibility.blocking(geometry, rotations)
+        return blocking._replace(
+            planes=self._method.planes_in(geometry), convex=self._method.convex_among(blocking.traced)
         )
 
     def _call(self, view: LitPoints | None = None) -> Call:

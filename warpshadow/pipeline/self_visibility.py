@@ -63,6 +63,7 @@ class Blocking(NamedTuple):
     rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
     why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
+    convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
 
 
 BY_SPHERES = Blocking()

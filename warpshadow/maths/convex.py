@@ -1,0 +1,121 @@
+"""Convex parts: closed convex pieces of a mesh, such as the boxes and rods that furniture is made of."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+MOST_FACES = 64
+"""Faces of a part at most; a cylinder of 48 sides has 50."""
+
+_MOST_TRIANGLES = 16 * MOST_FACES
+"""Triangles of a part at most: its faces may be divided."""
+
+_FLATNESS = 1e-4
+"""Relative height up to which neighboring triangles lie in one face, and corners in its plane."""
+
+
+class ConvexPart(NamedTuple):
+    """A closed convex piece of a mesh, without the edges inside its faces."""
+
+    corners: np.ndarray
+    """Vertices of the mesh at its corners, int of shape [corner]."""
+    faces: np.ndarray
+    """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
+    edges: np.ndarray
+    """Where each edge begins and ends, numbers among the corners, and the faces to its left and right, [edge, 4]."""
+
+
+def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPart] | None:
+    """Find the convex parts of which a mesh consists.
+
+    Args:
+        positions: Vertices, shape [vertex, 3]; those at one place count as one.
+        faces: Triangles that wind alike, shape [face, 3].
+
+    Returns:
+        The parts, which may touch and overlap; None where a piece of the mesh is open or hollow, or has more than 64
+        faces.
+    """
+    _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    triangles = vertex.reshape(-1)[faces]
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    if not len(triangles):
+        return None
+    piece = _pieces(triangles)
+    if np.bincount(piece).max() > _MOST_TRIANGLES:
+        return None
+    points, parts = positions.astype(np.float64)[first], []
+    for number in range(piece.max() + 1):
+        part = _part(points, triangles[piece == number])
+        if part is None:
+            return None
+        parts.append(part._replace(corners=first[part.corners]))
+    return parts
+
+
+def _pieces(triangles: np.ndarray) -> np.ndarray:
+    """Number of the piece of each triangle; where pieces share an edge, triangles next to each other go together."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges, count = np.sort(_edges(triangles), axis=1), len(triangles)
+    _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    order = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
+    pairs = order[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
+    return connected_components(coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)), directed=False)[1]
+
+
+def _edges(triangles: np.ndarray) -> np.ndarray:
+    """Edges of triangles, those from each first corner first, shape [3 triangle, 2]."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
+    """The convex part of some triangles; None where they are none."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges, count = _edges(triangles), len(triangles)
+    triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
+    if len(triangle_at) != len(edges) or not all((b, a) in triangle_at for a, b in triangle_at):
+        return None
+    used = np.unique(triangles)
+    corners = points[triangles] - points[used].mean(axis=0)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used], axis=0).max()
+    if volume < 0:
+        return _part(points, triangles[:, ::-1])
+    lengths = np.linalg.norm(normals, axis=1)
+    if volume <= _FLATNESS**2 * size**3 or not lengths.all():
+        return None
+    units = normals / lengths[:, None]
+    heights = (points[used] - points[triangles[:, 0]][:, None]) @ units[..., None]  # [triangle, vertex, 1]
+    if heights.max() > _FLATNESS * size:
+        return None
+    right = np.array([triangle_at[b, a] for a, b in edges.tolist()])
+    left = np.tile(np.arange(count), 3)
+    is_flat = (units[left] * units[right]).sum(axis=1) > 1 - _FLATNESS
+    pairs = np.stack([left, right])[:, is_flat]
+    face_count, face = connected_components(coo_array((np.ones(pairs.shape[1]), pairs), shape=(count, count)), False)
+    if face_count > MOST_FACES:
+        return None
+    largest = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
+    runs: dict[tuple[int, int], list[list[int]]] = {}
+    for (a, b), f, g in zip(edges.tolist(), face[left].tolist(), face[right].tolist(), strict=True):
+        if f < g:
+            runs.setdefault((f, g), []).append([a, b])
+    found = []
+    for (f, g), run in runs.items():  # pieces of a straight edge follow each other
+        (starts, ends) = map(set, zip(*run, strict=True))
+        (begin,), (end,) = (starts - ends) or {None}, (ends - starts) or {None}
+        if begin is None or end is None:
+            return None
+        found.append([begin, end, f, g])
+    return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(found), used))
+
+
+def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Edges whose corners are numbers among those in use."""
+    return np.concatenate([np.searchsorted(used, edges[:, :2]), edges[:, 2:]], axis=1)

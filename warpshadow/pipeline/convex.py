@@ -1,0 +1,74 @@
+"""Convex blockers of a scene: bodies that consist of convex parts, such as boxes and rods, and block light as these.
+
+Spheres bulge out of flat sides and thin boards. Instead, the share of a cell of directions that each part covers is
+computed. On themselves such bodies cast shadows found by rays.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.maths.convex import ConvexPart, find_convex_parts
+from warpshadow.pipeline.merged_scene import MergedScene
+from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
+from warpshadow.stages.convex.transmittance import transmittance_past_parts
+
+
+class PartsOfGroup(NamedTuple):
+    """Convex parts around some receivers."""
+
+    blockers: ConvexBlockers
+    placed: PlacedParts
+    skip: int | None = None  # the body that the receivers are part of
+
+    def transmittance(
+        self, points: wp.array, facing: wp.array | None, directions: np.ndarray, radius: float | None = None
+    ) -> wp.array:
+        """Transmittance past them, see :func:`.transmittance_past_parts`. Differentiable: points."""
+        return transmittance_past_parts(
+            points, self.placed, self.blockers, directions, radius=radius, facing=facing, skip=self.skip
+        )
+
+
+class SceneParts:
+    """The bodies of a scene that consist of convex parts.
+
+    Args:
+        merged_scene: All bodies.
+    """
+
+    def __init__(self, merged_scene: MergedScene):
+        self._merged_scene = merged_scene
+        self._among: dict[tuple[tuple[int, ...], tuple[int, ...]], ConvexBlockers] = {}
+
+    @functools.cached_property
+    def parts(self) -> dict[int, list[ConvexPart]]:
+        """The parts of each body that consists of some and casts shadows, unless spheres of the user's own block."""
+        found: dict[int, list[ConvexPart] | None] = {}
+        result = {}
+        for number, body in enumerate(self._merged_scene.scene.bodies):
+            mesh = body.mesh
+            if body.casts_shadow and isinstance(body.blockers, str) and not self._merged_scene.is_flat[number]:
+                if id(mesh) not in found:
+                    found[id(mesh)] = find_convex_parts(mesh.positions, mesh.surface.faces)
+                parts = found[id(mesh)]
+                if parts:
+                    result[number] = parts
+        return result
+
+    def among(self, bodies: tuple[int, ...], blocking: tuple[int, ...]) -> ConvexBlockers:
+        """Some of these bodies, of which some block light."""
+        key = bodies, blocking
+        if key not in self._among:
+            starts, device = self._merged_scene.first_vertex, self._merged_scene.device
+            chosen = [ConvexBody(self.parts[number], int(starts[number]), number in blocking) for number in bodies]
+            self._among[key] = ConvexBlockers.of(chosen, int(starts[-1]), device=device)
+        return self._among[key]
+
+    def placed(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:
+        """Where parts of some bodies are, of vertices [batch, vertex]. Differentiable in them."""
+        return self.among(bodies, bodies).placed(positions)

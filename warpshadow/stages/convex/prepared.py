@@ -1,0 +1,146 @@
+"""Convex blockers: the convex parts of bodies, as kernels read them, and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.launch import detached, launch
+from warpshadow.maths.convex import ConvexPart
+from warpshadow.stages.sparse import SparseMatrix, multiply
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+class ConvexBody(NamedTuple):
+    """A body that consists of convex parts, among all bodies."""
+
+    parts: Sequence[ConvexPart]
+    first_vertex: int
+    """Offset of its vertices among the vertices of all bodies."""
+    blocks: bool = True
+    """Whether it casts shadows."""
+
+
+@wp.struct
+class ConvexArrays:
+    """Parts as kernels read them: corners, faces and edges of one part after another."""
+
+    blocks: wp.array(dtype=wp.int32)  # whether a body casts shadows
+    first_part: wp.array(dtype=wp.int32)  # of each body, and the end of the last
+    first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last
+    first_face: wp.array(dtype=wp.int32)
+    first_edge: wp.array(dtype=wp.int32)
+    faces: wp.array(dtype=wp.vec3i)  # three corners of each, counterclockwise from outside
+    edges: wp.array(dtype=wp.vec4i)  # begin, end, and numbers of the faces to the left and right among their part's
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexBlockers:
+    """The bodies of a scene that consist of convex parts.
+
+    Args:
+        body_count: Number of bodies.
+        edge_count: Edges of a part at most.
+        arrays: Their parts.
+        corners_of_vertices: Matrix that finds corners, [corner, vertex].
+    """
+
+    body_count: int
+    edge_count: int
+    arrays: ConvexArrays
+    corners_of_vertices: SparseMatrix
+
+    @staticmethod
+    def of(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
+        """Prepare bodies, among bodies that have so many vertices together."""
+        parts = [part for body in bodies for part in body.parts]
+        starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ConvexPart._fields}
+        faces = [part.faces + first for part, first in zip(parts, starts["corners"], strict=False)]
+        shifted = [part.edges + [first, first, 0, 0] for part, first in zip(parts, starts["corners"], strict=False)]
+        arrays = ConvexArrays()
+        arrays.blocks = wp.array([int(body.blocks) for body in bodies], dtype=wp.int32, device=device)
+        arrays.first_part = wp.array(_starts([len(body.parts) for body in bodies]), dtype=wp.int32, device=device)
+        arrays.first_corner = wp.array(starts["corners"], dtype=wp.int32, device=device)
+        arrays.first_face = wp.array(starts["faces"], dtype=wp.int32, device=device)
+        arrays.first_edge = wp.array(starts["edges"], dtype=wp.int32, device=device)
+        arrays.faces = wp.array(np.concatenate(faces), dtype=wp.vec3i, device=device)
+        arrays.edges = wp.array(np.concatenate(shifted), dtype=wp.vec4i, device=device)
+        vertices = np.concatenate([body.first_vertex + part.corners for body in bodies for part in body.parts])
+        return ConvexBlockers(
+            len(bodies),
+            max(len(part.edges) for part in parts),
+            arrays,
+            SparseMatrix.of(_chosen(vertices, vertex_count), device=device),
+        )
+
+    def placed(self, positions: wp.array) -> PlacedParts:
+        """Where parts are.
+
+        Args:
+            positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Parts must stay convex:
+                bodies may be moved and scaled.
+
+        Differentiable: positions.
+        """
+        check.shape("positions", positions.shape, ("batch", self.corners_of_vertices.shape[1]))
+        corners = multiply(self.corners_of_vertices, positions)
+        count, device, arrays = corners.shape[0], corners.device, self.arrays
+        planes = wp.empty((count, arrays.faces.size), dtype=wp.vec4, device=device)
+        bounds = wp.empty((count, arrays.first_face.size - 1), dtype=wp.vec4, device=device)
+        launch(_bound, bounds.shape, inputs=[detached(corners), arrays], outputs=[planes, bounds])
+        return PlacedParts(corners, planes, bounds)
+
+
+class PlacedParts(NamedTuple):
+    """Where parts are."""
+
+    corners: wp.array  # vec3 of shape [batch, corner]
+    planes: wp.array  # of faces: outward normals N, and N·x of their points, vec4 of shape [batch, face]
+    bounds: wp.array  # of parts: center and radius of a sphere around each, vec4 of shape [batch, part]
+
+
+@wp.kernel(enable_backward=False)
+def _bound(
+    # in
+    corners: wp.array2d(dtype=wp.vec3),
+    parts: ConvexArrays,
+    # out
+    planes: wp.array2d(dtype=wp.vec4),
+    bounds: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a part of an instance."""
+    batch, part = wp.tid()
+    first, end = parts.first_corner[part], parts.first_corner[part + 1]
+    total = wp.vec3()
+    for corner in range(first, end):
+        total += corners[batch, corner]
+    center = total / float(end - first)
+    radius = float(0.0)
+    for corner in range(first, end):
+        radius = wp.max(radius, wp.length(corners[batch, corner] - center))
+    bounds[batch, part] = wp.vec4(center[0], center[1], center[2], radius)
+    for face in range(parts.first_face[part], parts.first_face[part + 1]):
+        a = corners[batch, parts.faces[face][0]]
+        normal = wp.normalize(
+            wp.cross(corners[batch, parts.faces[face][1]] - a, corners[batch, parts.faces[face][2]] - a)
+        )
+        planes[batch, face] = wp.vec4(normal[0], normal[1], normal[2], wp.dot(normal, a))
+
+
+def _starts(counts: Sequence[int]) -> np.ndarray:
+    """Where items of each begin, and the end of the last."""
+    return np.cumsum([0, *counts]).astype(np.int32)
+
+
+def _chosen(columns: np.ndarray, count: int) -> csr_matrix:
+    """The matrix that chooses some of so many items."""
+    from scipy.sparse import csr_matrix
+
+    return csr_matrix((np.ones(len(columns)), (np.arange(len(columns)), columns)), shape=(len(columns), count))

@@ -1,0 +1,426 @@
+"""Transmittance past convex blockers, such as boxes and rods.
+
+    P_q = Π_bodies max(0, 1 − Σ_parts h_q)
+
+h is the share of cell q, a disc of radius ρ = 2/√Q around its direction ω, that a convex part takes as a receiver x
+sees it. The part's silhouette are the edges between a face that x sees and one that it does not. The plane through x
+and an edge from a to b, n = (a − x) × (b − x) towards the part, cuts the plane that touches the sphere of directions at
+ω in a line. Its signed distance from ω, positive where the part is, and where along it the edge runs, from s₀ to s₁
+within the disc, are
+
+    d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
+
+and the area of the disc inside the silhouette is that of the whole disc, if ω is inside, and a term for each edge that
+crosses the disc, what lies between the edge and the disc's border:
+
+    π ρ² h = π ρ² [ω inside] + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) (atan(s₁/|d|) − atan(s₀/|d|))
+
+As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, so with y the direction in the middle of it
+
+    ∂(π ρ² h) = Σ_edges (s₁ − s₀) / √(1 − (m·ω)²) ∂n·y / |n|
+
+Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
+exact, and so are thin parts: spheres bulge out of them.
+"""
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, expand, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.parallel import Scratch, scratch_place, split_row
+from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+
+_PART_COST = 300.0
+"""Mean time of a part of a receiver [ns]."""
+
+_TINY = wp.constant(1.0e-6)
+"""Sine of the least angle under which a receiver sees an edge."""
+
+# Scratch of a receiver, vec3, for each edge of a part's silhouette:
+#     5 e        unit normal m of the plane through the receiver and the edge
+#     5 e + 1    the edge's begin and end relative to the receiver, in 5 e + 2
+#     5 e + 3    their numbers, and |n|
+#     5 e + 4    gradient of n
+_ROWS = 5
+
+
+@wp.func
+def _find_silhouette(
+    point: wp.vec3,
+    corners: wp.array(dtype=wp.vec3),
+    planes: wp.array(dtype=wp.vec4),
+    parts: ConvexArrays,
+    part: int,
+    silhouette: wp.array(dtype=wp.vec3),
+):
+    """Store a part's silhouette; return how many edges it has, −1 for a receiver inside the part."""
+    first_face = parts.first_face[part]
+    facing = wp.uint64(0)
+    for face in range(first_face, parts.first_face[part + 1]):
+        plane = planes[face]
+        if plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] > plane[3]:
+            facing = facing | (wp.uint64(1) << wp.uint64(face - first_face))
+    if facing == wp.uint64(0):
+        return -1
+    count = int(0)
+    for e in range(parts.first_edge[part], parts.first_edge[part + 1]):
+        edge = parts.edges[e]
+        is_left = ((facing >> wp.uint64(edge[2])) & wp.uint64(1)) == wp.uint64(1)
+        is_right = ((facing >> wp.uint64(edge[3])) & wp.uint64(1)) == wp.uint64(1)
+        if is_left != is_right:
+            # the part is to the left of its faces' edges as they are seen
+            begin = wp.where(is_left, edge[1], edge[0])
+            end = wp.where(is_left, edge[0], edge[1])
+            a = corners[begin] - point
+            b = corners[end] - point
+            n = wp.cross(a, b)
+            length = wp.length(n)
+            if length > _TINY * wp.length(a) * wp.length(b):
+                silhouette[_ROWS * count] = n / length
+                silhouette[_ROWS * count + 1] = a
+                silhouette[_ROWS * count + 2] = b
+                silhouette[_ROWS * count + 3] = wp.vec3(float(begin), float(end), length)
+                silhouette[_ROWS * count + 4] = wp.vec3()
+                count += 1
+    return count
+
+
+@wp.struct
+class Chord:
+    """Part of an edge that is seen within a cell, in the plane that touches the sphere of directions there."""
+
+    distance: float  # d, of the line from the middle of the cell
+    begin: float  # s₀
+    end: float  # s₁
+    along: wp.vec3  # t
+    sine: float  # √(1 − (m·ω)²), of the angle between ω and the normal
+
+
+@wp.func
+def _along_line(end: wp.vec3, along: wp.vec3, direction: wp.vec3, half: float, behind: float):
+    """Where an end of an edge lies on its line, no farther than the disc reaches; which way an end behind is, is known.
+    """
+    ahead = wp.dot(end, direction)
+    if ahead <= 0.0:
+        return behind
+    aside = wp.dot(end, along)
+    if ahead * half <= wp.abs(aside):
+        return wp.where(aside > 0.0, half, -half)
+    return aside / ahead
+
+
+@wp.func
+def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, direction: wp.vec3, radius: float):
+    """Find the chord of an edge, m·ω = ``cosine``."""
+    chord = Chord()
+    chord.sine = wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
+    chord.distance = cosine / chord.sine
+    half2 = radius * radius - chord.distance * chord.distance
+    a = silhouette[_ROWS * e + 1]
+    b = silhouette[_ROWS * e + 2]
+    if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
+        half = wp.sqrt(half2)
+        chord.along = wp.cross(direction, silhouette[_ROWS * e]) / chord.sine
+        chord.begin = _along_line(b, chord.along, direction, half, -half)
+        chord.end = _along_line(a, chord.along, direction, half, half)
+    return chord
+
+
+@wp.func
+def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float):
+    """Share of a cell that a silhouette takes."""
+    inside = float(1.0)
+    area = float(0.0)
+    limit = radius / wp.sqrt(1.0 + radius * radius)
+    for e in range(count):
+        cosine = wp.dot(silhouette[_ROWS * e], direction)
+        if cosine < -limit:
+            return 0.0
+        if cosine < limit:
+            if cosine <= 0.0:
+                inside = 0.0
+            chord = _find_chord(silhouette, e, cosine, direction, radius)
+            if chord.end > chord.begin:
+                d = wp.abs(chord.distance)
+                angle = wp.atan2(chord.end, d) - wp.atan2(chord.begin, d)
+                area += 0.5 * (
+                    chord.distance * (chord.end - chord.begin)
+                    - radius * radius * wp.where(cosine > 0.0, angle, -angle)
+                )
+    return wp.clamp(inside + area / (wp.pi * radius * radius), 0.0, 1.0)
+
+
+@wp.func
+def _share_adjoint(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float, adj: float):
+    """Add to the gradients of the normals of a silhouette."""
+    limit = radius / wp.sqrt(1.0 + radius * radius)
+    for e in range(count):
+        cosine = wp.dot(silhouette[_ROWS * e], direction)
+        if wp.abs(cosine) < limit:
+            chord = _find_chord(silhouette, e, cosine, direction, radius)
+            if chord.end > chord.begin:
+                foot = direction - (chord.distance / chord.sine) * (silhouette[_ROWS * e] - cosine * direction)
+                middle = foot + 0.5 * (chord.begin + chord.end) * chord.along
+                scale = adj * (chord.end - chord.begin) / (wp.pi * radius * radius * chord.sine)
+                silhouette[_ROWS * e + 4] = silhouette[_ROWS * e + 4] + scale * middle
+
+
+@wp.func
+def _silhouette_adjoint(
+    silhouette: wp.array(dtype=wp.vec3), count: int, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
+):
+    """Add to the gradients of corners; returns that of the receiver."""
+    adj_point = wp.vec3()
+    for e in range(count):
+        ends = silhouette[_ROWS * e + 3]
+        adj_n = silhouette[_ROWS * e + 4] / ends[2]
+        adj_a = wp.cross(silhouette[_ROWS * e + 2], adj_n)
+        adj_b = wp.cross(adj_n, silhouette[_ROWS * e + 1])
+        adj_point -= adj_a + adj_b
+        if adj_corners:
+            wp.atomic_add(adj_corners, instance, int(ends[0]), adj_a)
+            wp.atomic_add(adj_corners, instance, int(ends[1]), adj_b)
+    return adj_point
+
+
+@wp.struct
+class PartBound:
+    """The cone around a part, as a receiver sees it."""
+
+    is_seen: wp.bool  # whether some of it is above the horizon
+    axis: wp.vec3
+    cosine: float  # of its half-angle and that of a cell
+
+
+@wp.func
+def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
+    """Find the cone around a part, widened by the radius of cells."""
+    result = PartBound()
+    away = wp.vec3(bound[0], bound[1], bound[2]) - point
+    result.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
+    distance2 = wp.length_sq(away)
+    result.cosine = -2.0
+    if distance2 > bound[3] * bound[3]:
+        distance = wp.sqrt(distance2)
+        result.axis = away / distance
+        sine = bound[3] / distance
+        cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
+        result.cosine = (cosine - sine * radius) / wp.sqrt(1.0 + radius * radius) - 1.0e-5
+    return result
+
+
+@wp.func
+def _add_coverage(
+    point: wp.vec3,
+    normal: wp.vec3,
+    corners: wp.array(dtype=wp.vec3),
+    planes: wp.array(dtype=wp.vec4),
+    bounds: wp.array(dtype=wp.vec4),
+    parts: ConvexArrays,
+    body: int,
+    directions: wp.array(dtype=wp.vec3),
+    radius: float,
+    silhouette: wp.array(dtype=wp.vec3),
+    coverage: wp.array(dtype=wp.float32),
+):
+    """Σ_parts h_q of a body; returns whether it covers something: else nothing is written."""
+    covers = bool(False)
+    for part in range(parts.first_part[body], parts.first_part[body + 1]):
+        bound = _find_bound(point, normal, bounds[part], radius)
+        if bound.is_seen:
+            if not covers:
+                for q in range(directions.shape[0]):
+                    coverage[q] = 0.0
+                covers = True
+            count = _find_silhouette(point, corners, planes, parts, part, silhouette)
+            for q in range(directions.shape[0]):
+                direction = directions[q]
+                if (
+                    wp.dot(direction, bound.axis) > bound.cosine
+                    and coverage[q] < 1.0
+                    and (wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0)
+                ):
+                    share = float(1.0)
+                    if count >= 0:
+                        share = _share(silhouette, count, direction, radius)
+                    coverage[q] = coverage[q] + share
+    return covers
+
+
+@wp.func
+def _facing(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
+    """Where a receiver looks; 0 for one that looks everywhere."""
+    if facing:
+        return facing[instance_in(batch, facing.shape[0]), receiver]
+    return wp.vec3()
+
+
+@wp.kernel(enable_backward=False)
+def _pass(
+    first_row: int,
+    worker: int,
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec3),
+    corners: wp.array2d(dtype=wp.vec3),
+    planes: wp.array2d(dtype=wp.vec4),
+    bounds: wp.array2d(dtype=wp.vec4),
+    parts: ConvexArrays,
+    directions: wp.array(dtype=wp.vec3),
+    radius: float,
+    skip: int,
+    # scratch
+    silhouettes: wp.array2d(dtype=wp.vec3),
+    coverages: wp.array2d(dtype=wp.float32),
+    # out
+    passing: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a receiver."""
+    row = first_row + wp.tid()
+    batch, receiver = split_row(row, points.shape[1])
+    place = scratch_place(worker, row)
+    instance = instance_in(batch, corners.shape[0])
+    normal = _facing(facing, batch, receiver)
+    for q in range(directions.shape[0]):
+        passing[batch, receiver, q] = 1.0
+    for body in range(parts.first_part.shape[0] - 1):
+        if body != skip and parts.blocks[body] == 1 and _add_coverage(
+            points[batch, receiver],
+            normal,
+            corners[instance],
+            planes[instance],
+            bounds[instance],
+            parts,
+            body,
+            directions,
+            radius,
+            silhouettes[place],
+            coverages[place],
+        ):
+            for q in range(directions.shape[0]):
+                passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
+
+
+@wp.kernel(enable_backward=False)
+def _pass_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    points: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec3),
+    corners: wp.array2d(dtype=wp.vec3),
+    planes: wp.array2d(dtype=wp.vec4),
+    bounds: wp.array2d(dtype=wp.vec4),
+    parts: ConvexArrays,
+    directions: wp.array(dtype=wp.vec3),
+    radius: float,
+    skip: int,
+    passing: wp.array3d(dtype=wp.float32),
+    adj_passing: wp.array3d(dtype=wp.float32),
+    # scratch
+    silhouettes: wp.array2d(dtype=wp.vec3),
+    coverages: wp.array2d(dtype=wp.float32),
+    # out
+    adj_points: wp.array2d(dtype=wp.vec3),
+    # sums
+    adj_corners: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  ∂P/∂h = −P / (1 − Σ_parts h) where that is positive."""
+    row = first_row + wp.tid()
+    batch, receiver = split_row(row, points.shape[1])
+    place = scratch_place(worker, row)
+    instance = instance_in(batch, corners.shape[0])
+    point, normal = points[batch, receiver], _facing(facing, batch, receiver)
+    adj_point = wp.vec3()
+    for body in range(parts.first_part.shape[0] - 1):
+        if body != skip and parts.blocks[body] == 1 and _add_coverage(
+            point,
+            normal,
+            corners[instance],
+            planes[instance],
+            bounds[instance],
+            parts,
+            body,
+            directions,
+            radius,
+            silhouettes[place],
+            coverages[place],
+        ):
+            for part in range(parts.first_part[body], parts.first_part[body + 1]):
+                bound = _find_bound(point, normal, bounds[instance, part], radius)
+                if bound.is_seen:
+                    count = _find_silhouette(
+                        point, corners[instance], planes[instance], parts, part, silhouettes[place]
+                    )
+                    for q in range(directions.shape[0]):
+                        direction, left = directions[q], 1.0 - coverages[place, q]
+                        if (
+                            wp.dot(direction, bound.axis) > bound.cosine
+                            and left > 0.0
+                            and left < 1.0
+                            and count > 0
+                            and adj_passing[batch, receiver, q] != 0.0
+                        ):
+                            adj = -adj_passing[batch, receiver, q] * passing[batch, receiver, q] / left
+                            _share_adjoint(silhouettes[place], count, direction, radius, adj)
+                    adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
+    if adj_points:
+        adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
+
+
+def transmittance_past_parts(
+    points: wp.array,
+    placed: PlacedParts,
+    blockers: ConvexBlockers,
+    directions: np.ndarray,
+    *,
+    radius: float | None = None,
+    facing: wp.array | None = None,
+    skip: int | None = None,
+) -> wp.array:
+    """Transmittance of cells past the convex parts of bodies.
+
+    Args:
+        points: Receivers [scene units], vec3 of shape [batch, receiver].
+        placed: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
+        blockers: The bodies.
+        directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
+        radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
+        facing: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
+        skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
+
+    Returns:
+        Float32 of shape [batch, receiver, direction].
+
+    Differentiable: points, placed. Not: facing, which decides by steps.
+    """
+    check.shape("points", points.shape, ("batch", "receiver"))
+    check.shape("directions", directions.shape, ("direction", 3))
+    if skip is not None:
+        check.choice("skip", skip, range(blockers.body_count))
+    points = expand(points, common_batch({"points": points, "corners": placed.corners}))
+    own_radius, cells = cell_radius(len(directions)) if radius is None else radius, constant(
+        directions, wp.vec3, points.device
+    )
+    inputs = [points, facing, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
+    scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]
+    cost = _PART_COST * placed.bounds.shape[1]
+    passing = wp.empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
+    return differentiable(
+        lambda result: launch(_pass, points.size, inputs=inputs, outputs=[result], scratch=scratch, cost=cost),
+        lambda adj_passing: launch(
+            _pass_adjoint,
+            points.size,
+            inputs=[*inputs, passing, adj_passing],
+            outputs=[points.grad],
+            sums=[placed.corners.grad],
+            scratch=scratch,
+            cost=2 * cost,
+        ),
+        result=passing,
+        variables=[points, placed.corners],
+    )
