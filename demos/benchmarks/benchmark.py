@@ -3,11 +3,13 @@
     make bench       or        python demos/benchmarks/benchmark.py [--compile]
     python demos/benchmarks/benchmark.py --busy     a loop in torch beside processes that compute
     python demos/benchmarks/benchmark.py --set-up   the first image of meshes of several kinds
+    python demos/benchmarks/benchmark.py --host     what Python costs around the kernels
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
 Figures are medians of runs that take turns, so that a slow moment of the machine strikes all alike: on one thread, and
-on all cores (or what WARPSHADOW_NUM_THREADS says).
+on all cores (or what WARPSHADOW_NUM_THREADS says). Rows of the host are CPU time, of one thread, of a scene so small
+that kernels take next to none of it: what Python around them costs.
 """
 
 import argparse
@@ -15,6 +17,7 @@ import contextlib
 import dataclasses
 import itertools
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -221,6 +224,26 @@ def time_fits(device: str) -> None:
         print(f"  {f'iteration of inverse.fit: {label}':70}{1e3 * result.seconds:8.2f} ms", flush=True)
 
 
+def small_scene() -> ws.Scene:
+    """A ball of 42 vertices and 8 spheres on a ground of 16 quads, 16 × 16 pixels."""
+    ground = ws.Body(ws.plane(6.0, 4), blockers=0)
+    scene = on_ground(ws.icosphere(1.0, 1), ws.synthetic_sky(), blockers=8, ground=ground)
+    return dataclasses.replace(scene, camera=scene.camera.resized(1 / 16), supersampling=1)
+
+
+def time_host(device: str, runs: int) -> None:
+    """CPU milliseconds of images and iterations of a small scene on one thread, medians."""
+    ws.set_thread_count(1)
+    for bounces, words in ((0, ""), (2, BOUNCED)):
+        rows = iterations(dataclasses.replace(small_scene(), bounces=bounces), device)
+        for label, function in rows.items():
+            for _ in range(3):  # twice for places that images take turns with, and once for what is kept
+                function()
+            milliseconds = 1e3 * statistics.median(seconds_of(function) for _ in range(2 * runs))
+            print(f"  {f'host: {label}, 42 vertices{words}':84}{milliseconds:8.2f} ms of CPU", flush=True)
+    ws.set_thread_count(None)
+
+
 def on_threads(count: int, function: Callable[[], object]) -> Callable[[], object]:
     """Make a function run on a number of threads."""
 
@@ -368,6 +391,7 @@ if __name__ == "__main__":
     parser.add_argument("--compile", action="store_true", help="also time compilation from an empty cache")
     parser.add_argument("--busy", action="store_true", help="time a loop in torch beside other processes")
     parser.add_argument("--set-up", action="store_true", help="time the first image of meshes, with nothing cached")
+    parser.add_argument("--host", action="store_true", help="time the host alone: CPU time of a small scene")
     arguments = parser.parse_args()
     if arguments.busy:
         time_busy(arguments.runs)
@@ -375,7 +399,14 @@ if __name__ == "__main__":
     if arguments.set_up:
         time_set_up(arguments.device)
         sys.exit()
+    if arguments.host:
+        ws.quiet()
+        torch.set_num_threads(1)
+        print(cpu_text())
+        time_host(arguments.device, arguments.runs)
+        sys.exit()
     main(arguments.device, arguments.runs)
+    time_host(arguments.device, arguments.runs)
     time_fits(arguments.device)
     if arguments.compile:
         time_compilation(arguments.device)
