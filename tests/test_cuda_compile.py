@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import warpshadow
-from demos.tools.cuda_kernels import FACTORIES, compile_ptx, file_modules, import_package
+from demos.tools.cuda_kernels import FACTORIES, compile_module, file_modules, import_package
 
 ARCHITECTURES = [75]  # the oldest; nothing in a kernel's source asks for its architecture
 
@@ -30,7 +30,7 @@ def check_ptx(files, kernel_names):
 @pytest.mark.parametrize("name", FACTORIES)
 def test_kernels_made_by_factories_compile_for_cuda(name, tmp_path):
     kernel = FACTORIES[name]()
-    check_ptx(compile_ptx(kernel.module, ARCHITECTURES, tmp_path), [kernel.func.__name__])
+    check_ptx(compile_module(kernel.module, ARCHITECTURES, tmp_path), [kernel.func.__name__])
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_kernels_of_files_compile_for_cuda(tmp_path):
         folder = tmp_path / name
         folder.mkdir()
         kernel_names = [kernel.func.__name__ for kernel in module.kernels.values()]
-        check_ptx(compile_ptx(module, ARCHITECTURES, folder), kernel_names)
+        check_ptx(compile_module(module, ARCHITECTURES, folder), kernel_names)
 
 
 def test_no_kernel_of_the_package_is_left_out():

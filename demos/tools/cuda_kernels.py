@@ -1,4 +1,4 @@
-"""Every kernel of the package as a GPU gets it, compiled without one: Warp's NVRTC makes PTX of each module."""
+"""Every kernel of the package as a GPU gets it, compiled without one by Warp's NVRTC: PTX, or a GPU's machine code."""
 
 import importlib
 import pkgutil
@@ -89,16 +89,17 @@ def file_modules() -> dict[str, wp.Module]:
     }
 
 
-def compile_ptx(module: wp.Module, architectures: list[int], folder: Path) -> list[Path]:
+def compile_module(module: wp.Module, architectures: list[int], folder: Path, *, to_cubin: bool = False) -> list[Path]:
     """Compile a Warp module.
 
     Args:
         module: The module; a kernel's is ``kernel.module``.
         architectures: Compute capabilities, 90 for sm_90.
         folder: Empty folder to compile in.
+        to_cubin: Make machine code, as a GPU of each architecture loads it; otherwise PTX.
 
     Returns:
-        PTX files, one an architecture.
+        Files, one an architecture.
     """
-    wp.compile_aot_module(module, device=None, arch=architectures, module_dir=folder, use_ptx=True)
-    return sorted(folder.glob("*.ptx"))
+    wp.compile_aot_module(module, device=None, arch=architectures, module_dir=folder, use_ptx=not to_cubin)
+    return sorted(folder.glob("*.cubin" if to_cubin else "*.ptx"))

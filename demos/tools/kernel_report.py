@@ -1,19 +1,17 @@
-"""What a GPU has for each kernel of the package: registers, spills, shared memory, and how many threads fit at once.
+"""What a GPU has for each kernel of the package: registers, stack, shared memory, and how many threads fit at once.
 
-    pip install nvidia-cuda-nvcc
-    python demos/tools/kernel_report.py [--architecture 90] [--block 256]
+    python demos/tools/kernel_report.py [--architecture 90] [--block 256] [--only REGEX]
 
-It takes no GPU: Warp compiles each kernel to PTX, and ptxas, the assembler of that package, says what it takes. The
-*occupancy* is the part of the threads that a streaming multiprocessor can hold which it holds of this kernel alone:
-registers are what limits it here. Below a quarter, a kernel that waits for memory has too few others to go on with.
-Kernels that a factory makes are named after it and its arguments, others after their files.
+It takes no GPU: Warp compiles each kernel to machine code, a cubin, which says what it takes. The *stack* is memory of
+a thread outside the registers: what is spilled, and what is indexed by a variable. The *occupancy* is the part of the
+threads that a streaming multiprocessor can hold which it holds of this kernel alone: registers are what limits it here.
+Below a quarter, a kernel that waits for memory has too few others to go on with. Kernels that a factory makes are named
+after it and its arguments, others after their files.
 """
 
 import argparse
-import importlib.metadata
 import re
-import shutil
-import subprocess
+import struct
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -24,7 +22,7 @@ import warp as wp
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
-from demos.tools.cuda_kernels import FACTORIES, compile_ptx, file_modules
+from demos.tools.cuda_kernels import FACTORIES, compile_module, file_modules
 
 WARP = 32
 
@@ -39,33 +37,48 @@ SHARED_AT_ONCE = 128
 SHARED_OF_SYSTEM = 1024  # of each block
 
 
+# A cubin is an ELF file of 64 bits whose section .nv.info has a record for each number of an entry.
+SECTION_TABLE, SECTION_SIZE = 0x28, 0x3A
+SYMBOL_SIZE = 24
+RECORD_OF_SYMBOL = 4  # a record's format: the symbol and a number
+REGISTER_COUNT, FRAME_SIZE = 0x2F, 0x11
+
+
 class Resources(NamedTuple):
-    """What ptxas says of an entry of a module; all but the registers in bytes."""
+    """What an entry of a cubin takes."""
 
     entry: str
-    registers: int
-    stack: int
-    spill_stores: int
-    spill_loads: int
-    shared: int
+    registers: int  # of a thread
+    stack: int  # of a thread [bytes]
+    shared: int  # memory of a block [bytes]
 
 
-_ENTRY = re.compile(
-    r"Compiling entry function '(?P<entry>\w+)'.*?Function properties for (?P=entry)\s+"
-    r"(?P<stack>\d+) bytes stack frame, (?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
-    r"Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
-    re.DOTALL,
-)
+def read_cubin(cubin: bytes) -> list[Resources]:
+    """Read what the entries of a cubin take, by name."""
+    (table,) = struct.unpack_from("<Q", cubin, SECTION_TABLE)
+    size, count, names_at = struct.unpack_from("<HHH", cubin, SECTION_SIZE)
+    headers = [struct.unpack_from("<IIQQQQII", cubin, table + k * size) for k in range(count)]
 
+    def text(strings: int, at: int) -> str:
+        begin = headers[strings][4] + at
+        return cubin[begin : cubin.index(b"\0", begin)].decode()
 
-def parse(report: str) -> list[Resources]:
-    """Read what ``ptxas -v`` prints."""
-    found = []
-    for match in _ENTRY.finditer(report):
-        shared = re.search(r"(\d+) bytes smem", match["rest"])
-        numbers = (int(match[name]) for name in ("registers", "stack", "stores", "loads"))
-        found.append(Resources(match["entry"], *numbers, int(shared[1]) if shared else 0))
-    return found
+    sections = {text(names_at, header[0]): header for header in headers}
+    _, _, _, _, begin, length, strings, _ = sections[".symtab"]
+    symbols = [text(strings, *struct.unpack_from("<I", cubin, begin + at)) for at in range(0, length, SYMBOL_SIZE)]
+    _, _, _, _, at, length, _, _ = sections[".nv.info"]
+    numbers: dict[int, dict[str, int]] = {REGISTER_COUNT: {}, FRAME_SIZE: {}}
+    end = at + length
+    while at < end:
+        kind, attribute, size = struct.unpack_from("<BBH", cubin, at)
+        if kind == RECORD_OF_SYMBOL and attribute in numbers:
+            symbol, number = struct.unpack_from("<II", cubin, at + 4)
+            numbers[attribute][symbols[symbol]] = number
+        at += 4 + (size if kind == RECORD_OF_SYMBOL else 0)
+    return [
+        Resources(entry, registers, numbers[FRAME_SIZE][entry], sections.get(f".nv.shared.{entry}", [0] * 6)[5])
+        for entry, registers in sorted(numbers[REGISTER_COUNT].items())
+    ]
 
 
 def occupancy(registers: int, shared: int, block: int) -> float:
@@ -88,31 +101,11 @@ def _in_portions(amount: int, portion: int) -> int:
     return -(-amount // portion) * portion
 
 
-def find_ptxas() -> Path | None:
-    """The assembler of the package nvidia-cuda-nvcc, or one on the path; None where there is neither."""
-    try:
-        files = importlib.metadata.files("nvidia-cuda-nvcc") or []
-    except importlib.metadata.PackageNotFoundError:
-        files = []
-    packaged = [Path(str(file.locate())) for file in files if file.name == "ptxas"]
-    on_path = shutil.which("ptxas")
-    return next(iter([*packaged, *([Path(on_path)] if on_path else [])]), None)
-
-
-def assemble(ptxas: Path, module: wp.Module, architecture: int) -> list[Resources]:
-    """Compile a module and ask what its entries take.
-
-    Raises:
-        RuntimeError: with what ptxas says, as of PTX that is newer than it.
-    """
+def resources(module: wp.Module, architectures: list[int]) -> list[list[Resources]]:
+    """Compile a module, and read what its entries take on each architecture."""
     with tempfile.TemporaryDirectory() as folder:
-        (ptx,) = compile_ptx(module, [architecture], Path(folder))
-        ptx.write_bytes(ptx.read_bytes().rstrip(b"\0"))  # Warp ends it as C ends a string
-        command = [ptxas, "-v", "--gpu-name", f"sm_{architecture}", ptx, "-o", ptx.with_suffix(".cubin")]
-        run = subprocess.run(command, capture_output=True, text=True)
-    if run.returncode:
-        raise RuntimeError(f"{ptxas}: {run.stderr.strip()}")
-    return sorted(parse(run.stderr))
+        cubins = compile_module(module, architectures, Path(folder), to_cubin=True)
+        return [read_cubin(cubin.read_bytes()) for cubin in cubins]
 
 
 def kernels() -> Iterator[tuple[str, wp.Module]]:
@@ -131,27 +124,22 @@ def label(module_name: str, entry: str) -> str:
     return f"{module_name}{kernel}" + (", backward" if match["pass"] == "backward" else "")
 
 
-def main(architecture: int, block: int) -> None:
-    ptxas = find_ptxas()
-    if ptxas is None:
-        raise SystemExit("ptxas is not installed: pip install nvidia-cuda-nvcc")
+def main(architecture: int, block: int, only: str) -> None:
     ws.quiet()
-    print(f"sm_{architecture}, blocks of {block} threads; spills, stack and shared memory in bytes\n")
-    print("| kernel | registers | spills | stack | shared | occupancy |\n| --- | --- | --- | --- | --- | --- |")
+    print(f"sm_{architecture}, blocks of {block} threads; stack and shared memory in bytes\n")
+    print("| kernel | registers | stack | shared | occupancy |\n| --- | --- | --- | --- | --- |")
     for name, module in kernels():
-        try:
-            found = assemble(ptxas, module, architecture)
-        except RuntimeError as error:
-            raise SystemExit(f"{error}\n(if it is older than Warp's PTX: pip install -U nvidia-cuda-nvcc)") from error
-        for entry, registers, stack, stores, loads, shared in found:
-            part = occupancy(registers, shared, block)
-            spills = f"{stores} / {loads}"
-            print(f"| {label(name, entry)} | {registers} | {spills} | {stack} | {shared} | {part:.0%} |", flush=True)
+        if re.search(only, name):
+            (found,) = resources(module, [architecture])
+            for entry, registers, stack, shared in found:
+                part = occupancy(registers, shared, block)
+                print(f"| {label(name, entry)} | {registers} | {stack} | {shared} | {part:.0%} |", flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--architecture", type=int, default=90, help="compute capability, 90 for 9.0")
     parser.add_argument("--block", type=int, default=256, help="threads of a block; Warp takes 256")
+    parser.add_argument("--only", default="", help="only kernels whose name this finds")
     arguments = parser.parse_args()
-    main(arguments.architecture, arguments.block)
+    main(arguments.architecture, arguments.block, arguments.only)

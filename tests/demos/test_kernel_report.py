@@ -1,33 +1,14 @@
-"""The kernel report: what it reads of ptxas, and how many threads fit."""
+"""The kernel report: what it reads of cubins, how many threads fit, and the budgets of the kernels of visibility."""
+
+from typing import NamedTuple
 
 import pytest
 import warp as wp
 
 from demos.tools import kernel_report
-from demos.tools.kernel_report import Resources
+from demos.tools.cuda_kernels import FACTORIES, file_modules
 
-REPORT = """\
-ptxas info    : 154 bytes gmem
-ptxas info    : Compiling entry function '_add_1234abcd_cuda_kernel_backward' for 'sm_90'
-ptxas info    : Function properties for _add_1234abcd_cuda_kernel_backward
-    232 bytes stack frame, 244 bytes spill stores, 248 bytes spill loads
-ptxas info    : Used 255 registers, used 0 barriers, 232 bytes cumulative stack size, 1024 bytes smem
-ptxas info    : Compile time = 17.938 ms
-ptxas info    : Compiling entry function 'make__locals__add_1234abcd_cuda_kernel_forward' for 'sm_90'
-ptxas info    : Function properties for helper
-    8 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
-ptxas info    : Function properties for make__locals__add_1234abcd_cuda_kernel_forward
-    16 bytes stack frame, 4 bytes spill stores, 12 bytes spill loads
-ptxas info    : Used 24 registers, used 0 barriers
-"""
-
-
-def test_a_report_of_ptxas_is_read_entry_by_entry():
-    assert kernel_report.parse(REPORT) == [
-        Resources("_add_1234abcd_cuda_kernel_backward", 255, 232, 244, 248, 1024),
-        Resources("make__locals__add_1234abcd_cuda_kernel_forward", 24, 16, 4, 12, 0),
-    ]
-    assert kernel_report.parse("ptxas info    : 0 bytes gmem\n") == []
+ARCHITECTURES = [75, 80, 90]
 
 
 @pytest.mark.parametrize(
@@ -56,53 +37,63 @@ def test_entries_are_called_after_their_files_or_factories_and_passes():
     assert kernel_report.label("copy_kernel vec3f", entry) == "copy_kernel vec3f, backward"
 
 
-def test_without_an_assembler_the_report_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(kernel_report, "find_ptxas", lambda: None)
-    with pytest.raises(SystemExit, match="pip install nvidia-cuda-nvcc"):
-        kernel_report.main(90, 256)
-
-
-def test_an_assembler_that_fails_is_quoted(tmp_path, monkeypatch):
-    monkeypatch.setattr(kernel_report, "compile_ptx", lambda *arguments: [write(tmp_path / "a.ptx", "text\0")])
-    refusing = write(tmp_path / "ptxas", "#!/bin/sh\necho Unsupported .version >&2\nexit 255\n")
-    refusing.chmod(0o755)
-    with pytest.raises(RuntimeError, match="ptxas: Unsupported .version"):
-        kernel_report.assemble(refusing, None, 90)
-    assert (tmp_path / "a.ptx").read_text() == "text"
-    monkeypatch.setattr(kernel_report, "find_ptxas", lambda: refusing)
-    with pytest.raises(SystemExit, match=r"Unsupported .version\n.*pip install -U nvidia-cuda-nvcc"):
-        kernel_report.main(90, 256)
-
-
 @pytest.mark.slow
-def test_the_resources_of_a_module_are_found_by_the_assembler():
-    ptxas = kernel_report.find_ptxas()
-    if ptxas is None:
-        pytest.skip("needs nvidia-cuda-nvcc")
+def test_what_a_kernel_takes_stands_in_its_cubin():
+    Indexed = wp.types.vector(length=32, dtype=wp.float32)
 
-    @wp.kernel(module="unique")
-    def square(
+    @wp.kernel(module="unique", enable_backward=False)
+    def pick(
         # in
         values: wp.array(dtype=float),
+        indices: wp.array(dtype=int),
         # out
-        squares: wp.array(dtype=float),
+        picked: wp.array(dtype=float),
     ):
         """A thread owns a number."""
         thread = wp.tid()
-        squares[thread] = values[thread] * values[thread]
+        indexed = Indexed()
+        for k in range(indices.shape[0]):
+            indexed[indices[k]] = values[thread] * indexed[indices[k + 1]]
+        picked[thread] = indexed[indices[thread]]
 
-    try:
-        found = kernel_report.assemble(ptxas, square.module, 90)
-    except RuntimeError as error:
-        if "Unsupported .version" in str(error):
-            pytest.skip(f"{ptxas} is older than Warp's PTX")
-        raise
-    assert [kernel_report.label("", resources.entry) for resources in found] == [", backward", ""]
-    for resources in found:
-        assert 8 <= resources.registers <= 48
-        assert resources.spill_stores == resources.spill_loads == 0
+    ((found,),) = kernel_report.resources(pick.module, [75])
+    assert kernel_report.label("", found.entry) == ""
+    assert found.stack == 32 * 4  # the vector, which registers cannot hold
+    assert 8 <= found.registers <= 48
 
 
-def write(path, text):
-    path.write_text(text)
-    return path
+class Budget(NamedTuple):
+    """The most that an entry may take, on each architecture that it is compiled for."""
+
+    registers: int
+    stack: int = 0  # [bytes]
+
+
+BUDGETS = {
+    "_make_transmit True": {"": Budget(64)},
+    "_make_transmit_adjoint True": {"": Budget(104)},
+    "_make_light": {"": Budget(96)},
+    "_make_light_adjoint": {"": Budget(144)},
+    # the stack is that of vectors of eight bands, which loops index
+    "_make_accumulate 8 True": {"": Budget(72, 4 * 8)},
+    "_make_accumulate_adjoint 8 True": {"": Budget(128, 2 * 4 * 8)},
+    "_make_gather": {"": Budget(72)},
+    "_make_gather_adjoint": {"": Budget(80)},
+    "warpshadow.stages.self_visibility.lookup": {"find_lookups": Budget(56), "find_lookups_adjoint": Budget(64)},
+    "warpshadow.stages.planes.transmittance": {"add_coverage": Budget(96), "add_coverage_adjoint": Budget(168)},
+    "warpshadow.stages.bounces.plane_light": {"light_receivers": Budget(104), "light_receivers_adjoint": Budget(176)},
+}
+"""By the name of a factory's kernel, or of a file and its kernels: compiling a file takes long, so it is for sm_90."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BUDGETS)
+def test_kernels_of_visibility_stay_in_registers(name):
+    is_made = name in FACTORIES
+    module, architectures = (FACTORIES[name]().module, ARCHITECTURES) if is_made else (file_modules()[name], [90])
+    for architecture, found in zip(architectures, kernel_report.resources(module, architectures), strict=True):
+        taken = {kernel_report.label("", resources.entry).lstrip("."): resources for resources in found}
+        for kernel, budget in BUDGETS[name].items():
+            resources = taken[kernel]
+            assert resources.registers <= budget.registers, f"sm_{architecture}: {resources}"
+            assert resources.stack <= budget.stack, f"sm_{architecture}: {resources}"

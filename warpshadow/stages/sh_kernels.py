@@ -17,18 +17,36 @@ def zonal_type(order: int, lanes: int) -> type:
     return wp.types.matrix(shape=(order, lanes), dtype=wp.float32)
 
 
-def _recurrence_constants(order: int) -> tuple:
-    """:func:`warpshadow.maths.sh.schmidt_recurrence` as constants that kernels close over."""
-    diagonal, up, back = schmidt_recurrence(order)
-    square = wp.types.matrix(shape=(order, order), dtype=wp.float32)
-    return wp.types.vector(length=order, dtype=wp.float32)(*diagonal), square(*up.ravel()), square(*back.ravel())
+@functools.cache
+def _make_recurrence(order: int) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """:func:`warpshadow.maths.sh.schmidt_recurrence` as kernel functions: diagonal(m), up(band, m), back(band, m).
+
+    The values stand in read-only memory: as a matrix that a kernel closes over, each thread of a GPU would copy them
+    to its stack.
+    """
+
+    def values(table: np.ndarray) -> str:
+        return f"static const float values[] = {{{', '.join(f'{float(np.float32(x))!r}f' for x in table.ravel())}}};"
+
+    of_diagonal, of_up, of_back = map(values, schmidt_recurrence(order))
+
+    @wp.func_native(f"{of_diagonal} return values[m];")
+    def diagonal(m: int) -> float: ...  # type: ignore[empty-body]
+
+    @wp.func_native(f"{of_up} return values[{order} * band + m];")
+    def up(band: int, m: int) -> float: ...  # type: ignore[empty-body]
+
+    @wp.func_native(f"{of_back} return values[{order} * band + m];")
+    def back(band: int, m: int) -> float: ...  # type: ignore[empty-body]
+
+    return diagonal, up, back
 
 
 @functools.cache
 def make_add_rotated_zonal(order: int, lanes: int) -> wp.Function:
     """Make the kernel function that turns lanes of zonal vectors to lanes of directions and adds them up."""
     Lane, Vectors, Zonal = lane_type(lanes), vectors_type(lanes), zonal_type(order, lanes)
-    diagonal, up, back = _recurrence_constants(order)
+    diagonal, up, back = _make_recurrence(order)
 
     @wp.func
     def add_rotated_zonal(direction: Vectors, zonal: Zonal, coefficients: wp.array(dtype=Lane)):
@@ -37,14 +55,14 @@ def make_add_rotated_zonal(order: int, lanes: int) -> wp.Function:
         sine = Lane(0.0)
         for m in range(order):
             previous = Lane(0.0)
-            legendre = Lane(diagonal[m])
+            legendre = Lane(diagonal(m))
             for band in range(m, order):
                 weight = wp.cw_mul(zonal[band], legendre)
                 center = band * band + band
                 coefficients[center + m] = coefficients[center + m] + wp.cw_mul(weight, cosine)
                 if m > 0:
                     coefficients[center - m] = coefficients[center - m] + wp.cw_mul(weight, sine)
-                above = up[band, m] * wp.cw_mul(direction.z, legendre) - back[band, m] * previous
+                above = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
                 previous = legendre
                 legendre = above
             turned = wp.cw_mul(cosine, direction.x) - wp.cw_mul(sine, direction.y)
@@ -62,7 +80,7 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
     = (x + iy)^m:  ∂cos_m/∂x = m cos_{m−1}, ∂cos_m/∂y = −m sin_{m−1}, ∂sin_m/∂x = m sin_{m−1}, ∂sin_m/∂y = m cos_{m−1}.
     """
     Lane, Vectors, Zonal = lane_type(lanes), vectors_type(lanes), zonal_type(order, lanes)
-    diagonal, up, back = _recurrence_constants(order)
+    diagonal, up, back = _make_recurrence(order)
 
     @wp.func
     def adjoint(direction: Vectors, zonal: Zonal, adj_coefficients: wp.array(dtype=Lane)):
@@ -77,7 +95,7 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
         for m in range(order):
             previous = Lane(0.0)
             slope_previous = Lane(0.0)
-            legendre = Lane(diagonal[m])
+            legendre = Lane(diagonal(m))
             slope = Lane(0.0)
             for band in range(m, order):
                 center = band * band + band
@@ -91,8 +109,8 @@ def make_rotated_zonal_adjoint(order: int, lanes: int) -> wp.Function:
                 weight = float(m) * wp.cw_mul(zonal[band], legendre)
                 adj_x += wp.cw_mul(weight, wp.cw_mul(even, cosine_below) + wp.cw_mul(odd, sine_below))
                 adj_y += wp.cw_mul(weight, wp.cw_mul(odd, cosine_below) - wp.cw_mul(even, sine_below))
-                above = up[band, m] * wp.cw_mul(direction.z, legendre) - back[band, m] * previous
-                slope_above = up[band, m] * (legendre + wp.cw_mul(direction.z, slope)) - back[band, m] * slope_previous
+                above = up(band, m) * wp.cw_mul(direction.z, legendre) - back(band, m) * previous
+                slope_above = up(band, m) * (legendre + wp.cw_mul(direction.z, slope)) - back(band, m) * slope_previous
                 previous = legendre
                 legendre = above
                 slope_previous = slope

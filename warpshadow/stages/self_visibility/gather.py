@@ -254,19 +254,20 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                 of_rays = looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
                     for k in range(all_counts[turn, q]):
-                        for corner in range(probes.corner_count):
-                            pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], bits, words))
-                            adj_place[corner] += weights[k] * pull
-                            if adj_all_weights:
-                                adj_weight = total(wp.cw_mul(probes.weights[corner], pull))
-                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                        for corner in range(3):
+                            if corner < probes.corner_count:
+                                pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], bits, words))
+                                adj_place[corner] += weights[k] * pull
+                                if adj_all_weights:
+                                    adj_weight = total(wp.cw_mul(probes.weights[corner], pull))
+                                    wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
                 else:
                     for k in range(all_counts[turn, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
                         if adj_all_weights:
                             wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
         if adj_place_weights:
-            for corner in range(probes.corner_count):
+            for corner in range(3):
                 adj_corner = adj_place[corner]
                 if wp.static(lanes > 1):
                     for cell in range(shares.shape[0]):
