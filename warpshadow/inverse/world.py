@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from warpshadow.scene.scene import SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer
+
+T = TypeVar("T")
 
 
 class Setting:
@@ -35,7 +37,14 @@ class Setting:
         self.unit = unit
         self.device = device
         self._graphs: dict[tuple[int, int], DeformationGraph] = {}
+        self._cached: dict[object, Any] = {}
         self._smoothings: dict[tuple[int, int, float], torch.Tensor] = {}
+
+    def cached(self, key: object, make: Callable[[], T]) -> T:
+        """A result that is the same for the whole fit, by its key."""
+        if key not in self._cached:
+            self._cached[key] = make()
+        return self._cached[key]
 
     @functools.cached_property
     def distances(self) -> np.ndarray:

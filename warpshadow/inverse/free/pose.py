@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,9 +12,15 @@ import torch
 from numpy.typing import ArrayLike
 
 from warpshadow import check
+from warpshadow.inverse import constraints
+from warpshadow.inverse.constraints import PoseConstraint
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
+
+PRIOR = 1e-3
+"""Loss of a prior that is missed by one standard deviation: about 3% of the targets' root mean square in each pixel."""
 
 _NO_TURN = {
     "axis-angle": (0.0, 0.0, 0.0),
@@ -35,7 +41,18 @@ class Pose(FreeOfBody):
         rotation: Parameters: "axis-angle" [radians], "quaternion" or "6d" (two columns).
         scale: Whether the size is free, too.
         spread: Angle by which candidates are turned [radians]: about each axis, either way, then about the eight
-            directions between, then about any.
+            directions between, then about any; a pose with one axis about that, farther and farther.
+        stands_on: A flat body, its number or name, that the body touches from above; three degrees of freedom stay.
+        resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn; "given",
+            as the scene has it; "free", any way, so that five degrees of freedom stay. Its height always follows.
+        upright: Whether it turns about the world's y alone.
+        axis: Direction about which alone it turns, shape [3].
+        fixed: Coordinates of its middle that stay: "x", "y", "z".
+        distance: Prior of the distance of its middle from the first view's eye, and its standard deviation [scene
+            units].
+        size: Prior of the diagonal of its bounding box, and its standard deviation [scene units], of a free scale.
+        covariance: Prior of turn [radians] and shift [scene units] from where the scene has it, shape [6, 6]; or their
+            six standard deviations.
     """
 
     key: ClassVar[str] = "pose"
@@ -44,6 +61,14 @@ class Pose(FreeOfBody):
     rotation: str = "axis-angle"
     scale: bool = False
     spread: float = 0.55
+    stands_on: BodyLike | None = None
+    resting: str = "stable"
+    upright: bool = False
+    axis: Sequence[float] | None = None
+    fixed: Sequence[str] = ()
+    distance: Sequence[float] | None = None
+    size: Sequence[float] | None = None
+    covariance: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,16 +76,87 @@ class Pose(FreeOfBody):
         check.flag("scale", self.scale)
         if not (check.is_number(self.spread) and 0 <= self.spread <= np.pi):
             raise ValueError(f"spread: got {self.spread!r}, expected an angle from 0 to π")
+        self._check_constraints()
+        self._check_priors()
+
+    def _check_constraints(self) -> None:
+        check.choice("resting", self.resting, constraints.RESTING)
+        check.flag("upright", self.upright)
+        if isinstance(self.fixed, str) or not isinstance(self.fixed, Sequence):
+            raise ValueError(f'fixed: got {check.described(self.fixed)}, expected a list of coordinates, such as ["y"]')
+        object.__setattr__(self, "fixed", tuple(self.fixed))
+        for coordinate in self.fixed:
+            check.choice("fixed", coordinate, constraints.AXES)
+        if self.axis is not None:
+            object.__setattr__(self, "axis", constraints.checked_axis(self.axis))
+        turning = [name for name in ("upright", "axis") if getattr(self, name)]
+        if self.stands_on is not None and self.resting != "free":
+            turning.append("stands_on")
+        if len(turning) > 1:
+            raise ValueError(f"{turning[0]}: got it beside {turning[1]}, expected one axis to turn about")
+        if turning and self.rotation != "axis-angle":
+            raise ValueError(f'rotation: got {self.rotation!r} beside {turning[0]}, expected "axis-angle"')
+
+    def _check_priors(self) -> None:
+        for name in ("distance", "size"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, constraints.checked_prior(name, getattr(self, name)))
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", constraints.checked_covariance(self.covariance))
+        if self.size is not None and not self.scale:
+            raise ValueError("size: got a prior of a size that is not free, expected scale = true beside it")
+
+    def numbered(self, scene: Scene) -> Pose:
+        """The same of the bodies' numbers."""
+        numbered = replace(self, body=scene.body_number(self.body))
+        if self.stands_on is None:
+            return numbered
+        return replace(numbered, stands_on=scene.body_number(self.stands_on, "stands_on"))
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that stands on itself, or on one that is not flat."""
+        if self.stands_on is None:
+            return
+        ground = scene.body_number(self.stands_on, "stands_on")
+        if ground == self.number:
+            raise ValueError(f"stands_on: got {ground}, the body itself; expected another, such as the ground")
+        constraints.plane_below(scene.bodies[ground], np.zeros(3))
+
+    def constraint(self, setting: Setting) -> PoseConstraint:
+        """The poses that are possible."""
+        return setting.cached(self, lambda: self._constraint(setting))
+
+    def _constraint(self, setting: Setting) -> PoseConstraint:
+        body = setting.scene.bodies[self.number]
+        rotation = body.rotation_matrix()
+        axis = constraints.UP if self.upright else self.axis
+        turns = np.eye(3) if axis is None else np.array([axis])
+        stays = [np.eye(3)[constraints.AXES[coordinate]] for coordinate in self.fixed]
+        if self.stands_on is None:
+            return PoseConstraint(turns, constraints.remaining(stays), rotation)
+        ground = setting.scene.bodies[setting.scene.body_number(self.stands_on, "stands_on")]
+        plane = constraints.plane_below(ground, self._start_middle(setting))
+        if self.resting != "free":
+            turns = plane.normal[None]
+        if self.resting == "stable":
+            rotation = constraints.stable_rotation(body.mesh, rotation, plane.normal)
+        shifts = constraints.remaining([plane.normal, *stays])
+        return PoseConstraint(turns, shifts, rotation, plane, constraints.hull_points(body.mesh))
 
     def start(self, setting: Setting) -> Values:
         """Where the body is."""
-        values = {"turn": setting.tensor(_NO_TURN[self.rotation]), "shift": setting.tensor(np.zeros(3))}
+        possible = self.constraint(setting)
+        turn = np.zeros(len(possible.turns)) if self.rotation == "axis-angle" else _NO_TURN[self.rotation]
+        values = {"turn": setting.tensor(turn), "shift": setting.tensor(np.zeros(len(possible.shifts)))}
         return values | ({"log_scale": setting.tensor(0.0)} if self.scale else {})
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
         """The pose, turned."""
         from scipy.spatial.transform import Rotation
 
+        copies = super().scattered(values, number, generator)
+        if values["turn"].numel() == 1:  # either way, and farther and farther
+            return copies | {"turn": copies["turn"] + self.spread * (number // 2 + 1) * (-1) ** number}
         known = number < len(_TURNS)
         axis = _TURNS[number] if known else torch.randn(3, generator=generator).numpy().astype(np.float64)
         turn = Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis))
@@ -71,18 +167,45 @@ class Pose(FreeOfBody):
             turned = (turn * Rotation.from_quat(start)).as_quat()
         else:
             turned = turn.apply(start.reshape(2, 3)).ravel()
-        copies = super().scattered(values, number, generator)
         return copies | {"turn": torch.tensor(turned, dtype=torch.float32, device=values["turn"].device)}
 
     def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
-        body = setting.scene.bodies[self.number]
-        at_start, middle = setting.tensor(body.rotation_matrix()), setting.tensor(setting.middle(self.number))
-        rotation = rotation_matrices(values["turn"]) @ at_start
+        rotation, middle, scale = self._moved(values, setting)
+        return rotation, middle - scale * rotation @ setting.tensor(setting.middle(self.number)), scale
+
+    def _moved(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rotation, middle in the world, and scale of the body."""
+        body, possible = setting.scene.bodies[self.number], self.constraint(setting)
+        turn = possible.turn(values["turn"]) if self.rotation == "axis-angle" else values["turn"]
+        rotation = rotation_matrices(turn) @ setting.tensor(possible.rotation)
         scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
-        moved = body.scale * at_start @ middle + setting.tensor(body.translation)
-        moved = moved + body.scale * setting.extent(self.number) * values["shift"]
-        return rotation, moved - scale * rotation @ middle, scale
+        shift = body.scale * setting.extent(self.number) * possible.shift(values["shift"])
+        middle = setting.tensor(self._start_middle(setting)) + shift
+        return rotation, possible.touching(middle, rotation, scale, setting.tensor(setting.middle(self.number))), scale
+
+    def _start_middle(self, setting: Setting) -> np.ndarray:
+        """Where the body's middle is at the start, in the world."""
+        body = setting.scene.bodies[self.number]
+        return body.scale * body.rotation_matrix() @ setting.middle(self.number) + body.translation
+
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Squared distances from the priors, in standard deviations."""
+        body = setting.scene.bodies[self.number]
+        rotation, middle, scale = self._moved(values, setting)
+        squares = []
+        if self.distance is not None:
+            mean, deviation = self.distance
+            gap = (middle - setting.tensor(setting.cameras[0].eye)).norm() - mean
+            squares.append((gap / deviation).square())
+        if self.size is not None:
+            mean, deviation = self.size
+            squares.append(((2 * setting.extent(self.number) * scale - mean) / deviation).square())
+        if self.covariance is not None:
+            turn = _rotation_vector(rotation @ setting.tensor(body.rotation_matrix()).T)
+            away = torch.cat([turn, middle - setting.tensor(self._start_middle(setting))])
+            squares.append(away @ setting.tensor(np.linalg.inv(self.covariance)) @ away)
+        return PRIOR * torch.stack(squares).sum() if squares else None
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Move the body."""
@@ -105,3 +228,11 @@ class Pose(FreeOfBody):
         body = fitted.scene.bodies[self.number]
         names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
         return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in names}
+
+
+def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
+    """The axis-angle vector of a rotation by less than π [radians]. Differentiable: matrix."""
+    sine = torch.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    length = (sine.square().sum() + 1e-20).sqrt()
+    angle = torch.atan2(length, (matrix.trace() - 1) / 2)
+    return sine * (angle / length)

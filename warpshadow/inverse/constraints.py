@@ -1,0 +1,191 @@
+"""Constraints of a pose: what is known of it besides the images.
+
+A pose has six degrees of freedom: a turn, as an axis-angle vector, and a shift of the body's middle. A constraint
+leaves each of them a subspace, and the values of a fit are coordinates in it, so that no step can violate it. A body
+that stands on a plane keeps three: it turns about the plane's normal and slides, and its height follows from its lowest
+vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpshadow import check
+from warpshadow.assets.mesh import Mesh
+from warpshadow.maths.plane import plane_normal
+from warpshadow.scene.scene import Body
+
+AXES = {"x": 0, "y": 1, "z": 2}
+UP = (0.0, 1.0, 0.0)
+RESTING = ("stable", "given", "free")
+_INSIDE = 1e-6  # how far outside a triangle its centroid may project, in barycentric coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneConstraint:
+    """A plane that a body touches from above: points with normal · p = offset.
+
+    Args:
+        normal: Unit vector away from the plane's solid side, shape [3].
+        offset: Distance from the origin along the normal [scene units].
+    """
+
+    normal: np.ndarray
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseConstraint:
+    """The poses that remain possible.
+
+    Args:
+        turns: Orthonormal basis of possible axis-angle vectors, rows, shape [0 to 3, 3].
+        shifts: The same of the shifts of the body's middle, [0 to 3, 3].
+        rotation: From which the body turns, shape [3, 3].
+        plane: That the body touches, if any.
+        hull: Vertices of the mesh's convex hull, of which one is the lowest, [vertex, 3]; for a plane.
+    """
+
+    turns: np.ndarray
+    shifts: np.ndarray
+    rotation: np.ndarray
+    plane: PlaneConstraint | None = None
+    hull: np.ndarray | None = None
+
+    def turn(self, values: torch.Tensor) -> torch.Tensor:
+        """The axis-angle vector of coordinates among the possible ones. Differentiable: values."""
+        return torch.as_tensor(self.turns).to(values).T @ values
+
+    def shift(self, values: torch.Tensor) -> torch.Tensor:
+        """The shift of coordinates among the possible ones. Differentiable: values."""
+        return torch.as_tensor(self.shifts).to(values).T @ values
+
+    def touching(
+        self, middle: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
+    ) -> torch.Tensor:
+        """The body's middle in the world, moved along the normal until the lowest vertex touches the plane.
+
+        Args:
+            middle: In the world, shape [3].
+            rotation: Of the body, [3, 3].
+            scale: Of the body, [].
+            center: The same middle in the body's own space, [3].
+
+        Differentiable: middle, rotation, scale.
+        """
+        if self.plane is None or self.hull is None:
+            return middle
+        normal, hull = (torch.as_tensor(part).to(middle) for part in (self.plane.normal, self.hull))
+        below = ((hull - center) @ (rotation.T @ normal)).amin() * scale
+        return middle + normal * (self.plane.offset - below - normal @ middle)
+
+
+def remaining(removed: list[np.ndarray]) -> np.ndarray:
+    """Orthonormal basis of the directions perpendicular to some, rows, shape [0 to 3, 3]."""
+    if not removed:
+        return np.eye(3)
+    _, sizes, rows = np.linalg.svd(np.stack(removed))
+    return rows[int((sizes > 1e-9).sum()) :]
+
+
+def plane_below(ground: Body, above: np.ndarray) -> PlaneConstraint:
+    """The plane of a flat body, its normal towards a point.
+
+    Raises:
+        ValueError: for a body that does not lie in a plane.
+    """
+    mesh = ground.world_mesh()
+    points = mesh.positions.astype(np.float64)
+    normal = plane_normal(points[mesh.faces])
+    if normal is None:
+        raise ValueError(f"stands_on: got {ground.called!r}, which is not flat; expected a plane, such as the ground")
+    offset = float(np.median(points @ normal))
+    sign = 1.0 if normal @ above >= offset else -1.0
+    return PlaneConstraint(sign * normal, sign * offset)
+
+
+def hull_points(mesh: Mesh) -> np.ndarray:
+    """Vertices of a mesh's convex hull, float64 of shape [vertex, 3]."""
+    from scipy.spatial import ConvexHull
+
+    points = mesh.positions.astype(np.float64)
+    return points[ConvexHull(points).vertices]
+
+
+def stable_rotation(mesh: Mesh, rotation: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The rotation nearest to one in which a body rests on a plane without tipping over.
+
+    A body rests on a triangle of its convex hull if the hull's centroid projects into it [Goldberg et al. 1999, "Part
+    pose statistics"]. Of these triangles the body is turned onto that which needs the least turn.
+
+    Args:
+        mesh: Of the body.
+        rotation: Of the body, shape [3, 3].
+        normal: Of the plane, upwards, shape [3].
+    """
+    from scipy.spatial import ConvexHull
+
+    points = mesh.positions.astype(np.float64)
+    hull = ConvexHull(points)
+    corners, downwards = points[hull.simplices], hull.equations[:, :3]
+    apex = points[hull.vertices].mean(axis=0)
+    tetrahedra = np.abs(np.linalg.det(corners - apex))
+    centroid = (tetrahedra[:, None] * (corners.sum(axis=1) + apex) / 4).sum(axis=0) / tetrahedra.sum()
+    is_stable = _project_into(corners, centroid)
+    down = -rotation.T @ normal
+    best = downwards[is_stable][np.argmax(downwards[is_stable] @ down)]
+    return turn_onto(rotation @ best, -normal) @ rotation
+
+
+def _project_into(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Whether a point projects into each triangle along its normal, bool of shape [triangle]."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    away = point - corners[:, 0]
+    a, b, c = ((u * v).sum(axis=1) for u, v in ((first, first), (first, second), (second, second)))
+    d, e = ((away * edge).sum(axis=1) for edge in (first, second))
+    area = np.maximum(a * c - b * b, np.finfo(float).tiny)
+    u, v = (c * d - b * e) / area, (a * e - b * d) / area
+    return (u >= -_INSIDE) & (v >= -_INSIDE) & (u + v <= 1 + _INSIDE)
+
+
+def turn_onto(source: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """The least rotation that takes a unit vector onto another, shape [3, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    axis, cosine = np.cross(source, goal), float(source @ goal)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        axis, sine = np.cross(source, np.eye(3)[np.argmin(np.abs(source))]), 0.0
+    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / np.linalg.norm(axis)).as_matrix()
+
+
+# ------------------------------------------------------------------------------------------------ arguments
+
+
+def checked_axis(value: object) -> tuple[float, ...]:
+    """A unit vector, of a direction of any length."""
+    axis = check.array("axis", value, (3,), "a direction")
+    if not axis.any():
+        raise ValueError(f"axis: got {axis.tolist()}, expected a direction, of any length but 0")
+    return tuple((axis / np.linalg.norm(axis)).tolist())
+
+
+def checked_prior(name: str, value: object) -> tuple[float, float]:
+    """A number and its standard deviation, both positive."""
+    mean, deviation = check.array(name, value, (2,), "a value and its standard deviation").tolist()
+    return check.positive(name, mean), check.positive(f"{name}[1]", deviation)
+
+
+def checked_covariance(value: object) -> tuple[tuple[float, ...], ...]:
+    """Symmetric and positive definite, of six numbers; or their six standard deviations."""
+    numbers = check.numbers("covariance", value, expected="6 standard deviations, or [6, 6]", dtype=np.float64)
+    if numbers.shape == (6,):
+        numbers = np.diag(numbers**2)
+    check.shape("covariance", numbers.shape, (6, 6), "or six standard deviations")
+    check.finite("covariance", numbers)
+    if not np.allclose(numbers, numbers.T) or np.linalg.eigvalsh(numbers).min() <= 0:
+        raise ValueError("covariance: got a matrix that is not symmetric and positive definite")
+    return tuple(map(tuple, numbers.tolist()))
