@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 
-_HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Intrinsics with pixel centers at +0.5, from ones with pixel centers at whole numbers."""
 
 _LARGEST_NORMALIZED = 10.0  # numbers of intrinsics up to which they are in parts of the image, and no pixels
@@ -57,7 +57,7 @@ def from_opencv(
 
         rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
     translation = _shaped("tvec", tvec, (3,), (3, 1), (1, 3)).ravel()
-    return Pinhole(intrinsics + _HALF_PIXEL, rotation, translation), check.image_size(size)
+    return Pinhole(intrinsics + HALF_PIXEL, rotation, translation), check.image_size(size)
 
 
 def _calibration(K: Any) -> tuple[np.ndarray, object, object]:

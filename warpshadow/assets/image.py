@@ -56,6 +56,12 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
         raise ImageError(f"{path}: {error}") from error
 
 
+def image_size(path: AnyPath) -> tuple[int, int]:
+    """Width and height of a picture [pixels], upright as :func:`read_image` turns it."""
+    height, width = read_image(path).shape[:2]
+    return width, height
+
+
 def read_rgb(path: AnyPath, *, part: str | int | None = None) -> np.ndarray:
     """Read a picture as :func:`read_image` does, as RGB: gray is repeated, alpha dropped."""
     pixels = read_image(path, part=part)

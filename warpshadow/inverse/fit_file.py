@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from warpshadow import check
+from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result, default_optimizer, fit, short_adam
 from warpshadow.inverse.free.base import Free
@@ -23,14 +24,15 @@ from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
-from warpshadow.inverse.target import Target, read_target
+from warpshadow.inverse.target import Target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
 from warpshadow.scene.scene import Scene, Visibility
 from warpshadow.scene.toml_tables import Table
 
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
-_TARGET_KEYS = ("image", "mask", "camera")
+_PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "distortion")
+_TARGET_KEYS = ("image", "mask", "camera", *_PHOTOGRAPH_KEYS)
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
 
@@ -126,14 +128,15 @@ def _fit(table: Table, folder: Path) -> Fit:
 def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
     check.known_keys("key", table, _TARGET_KEYS)
-    image = read_target(toml_tables.file(table, "image", folder))
-    mask: Table = {"mask": toml_tables.file(table, "mask", folder)} if "mask" in table else {}
-    camera = None
+    path = toml_tables.file(table, "image", folder)
+    options: Table = {key: table[key] for key in _PHOTOGRAPH_KEYS if key in table}
+    if "mask" in table:
+        options["mask"] = toml_tables.file(table, "mask", folder)
     if "camera" in table:
         with check.located("camera"):
             toml_tables.check_table(table["camera"])
-            camera = parse_camera({"size": [image.shape[1], image.shape[0]]} | table["camera"])
-    return Target(image, camera=camera, **mask)
+            options["camera"] = parse_camera({"size": image_size(path)} | table["camera"])
+    return Target(path, **options)
 
 
 # ---------------------------------------------------------------------------------------------- free parameters

@@ -96,9 +96,15 @@ class Report:
             {"exposure": factor} | camera_table(camera)
             for camera, factor in zip(fitted.cameras, fitted.exposures, strict=True)
         ]
+        images: list[toml_tables.Table] = [
+            {"encoding": target.encoding, "stops": math.log2(factor)}
+            for target, factor in zip(self.result.problem.targets, fitted.exposures, strict=True)
+        ]
+        for image, gains in zip(images, fitted.white_balances, strict=False):  # none unless they were free
+            image["white_balance"] = list(gains)
         light = self.result.light
         known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
-        return {"fit": fit, **known, "view": views}
+        return {"fit": fit, **known, "view": views, "image": images}
 
     def _write_pictures(self, folder: Path) -> list[Path]:
         """Targets, and images before and after, the views side by side, at one exposure."""

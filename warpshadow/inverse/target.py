@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +11,9 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.color import linear_to_srgb
-from warpshadow.assets.image import read_image
+from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.check import AnyPath
-
-_ENCODED = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
+from warpshadow.inverse.encoding import checked_encoding, guess_encoding, read_linear, read_mask
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -27,25 +24,48 @@ class Target:
 
     Args:
         image: Linear RGB, shape [height, width, 3]; or premultiplied RGB with coverage, [height, width, 4], as
-            renderers make it, and the coverage is explained, too; or a file that :func:`read_target` reads.
+            renderers make it, and the coverage is explained, too; or a picture's file.
         mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out pixels that the
-            scene does not model: the background of a photograph, say. Or a file that :func:`read_mask` reads.
+            scene does not model: the background of a photograph, say. Or a file of gray.
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
+        encoding: Of a file: "srgb", "linear", or a gamma, such as 2.2; by default as its metadata say, see
+            :func:`~warpshadow.inverse.encoding.guess_encoding`.
+        exposure: At which the image was taken [stops]: its values are divided by 2^exposure.
+        white_balance: Gains of red, green and blue with which it was developed: its values are divided by them.
+        distortion: OpenCV's coefficients k1, k2, p1, p2[, k3] of the camera's lens: the image is made that of a
+            pinhole, and pixels that the lens did not see do not count.
     """
 
     image: np.ndarray = field(repr=False)
     mask: np.ndarray | None = field(repr=False)
     camera: Camera | None
+    encoding: str | float
 
     def __init__(
-        self, image: npt.ArrayLike | AnyPath, mask: npt.ArrayLike | AnyPath | None = None, camera: Camera | None = None
+        self,
+        image: npt.ArrayLike | AnyPath,
+        mask: npt.ArrayLike | AnyPath | None = None,
+        camera: Camera | None = None,
+        *,
+        encoding: str | float | None = None,
+        exposure: float = 0.0,
+        white_balance: npt.ArrayLike | None = None,
+        distortion: npt.ArrayLike | None = None,
     ):
-        vars(self).update(image=image, mask=mask, camera=camera)
-        for name, read in (("image", read_target), ("mask", read_mask)):
-            if check.is_path(getattr(self, name)):
-                path = check.file(name, getattr(self, name))
-                with check.located(name):
-                    object.__setattr__(self, name, read(path))
+        if encoding is not None:
+            encoding = checked_encoding(encoding)
+        vars(self).update(image=image, mask=mask, camera=camera, encoding=encoding or "linear")
+        if check.is_path(image):
+            path = check.file("image", image)
+            with check.located("image"):
+                object.__setattr__(self, "encoding", encoding or guess_encoding(path))
+                object.__setattr__(self, "image", read_linear(path, self.encoding))
+        elif encoding not in (None, "linear"):
+            raise ValueError(f"encoding: got {encoding!r} for an array, expected a file, or linear values")
+        if check.is_path(mask):
+            path = check.file("mask", mask)
+            with check.located("mask"):
+                object.__setattr__(self, "mask", read_mask(path))
         image = check.pixels("image", self.image, expected="linear RGB [height, width, 3], or the path of a picture")
         if image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
             remedy = check.channels_last(image.shape)
@@ -67,8 +87,6 @@ class Target:
                 )
             object.__setattr__(self, "mask", mask)
             image[mask == 0] = 0  # whatever the value
-        check.finite("image", image)
-        object.__setattr__(self, "image", image)
         size = image.shape[1], image.shape[0]
         check.instance("camera", self.camera, (Camera, type(None)), "a Camera, or None for the scene's")
         if self.camera is not None and (self.camera.width, self.camera.height) != size:
@@ -76,31 +94,34 @@ class Target:
                 f"image: got {size[0]} × {size[1]} pixels, expected the camera's "
                 f"{self.camera.width} × {self.camera.height}"
             )
+        gains = 2.0 ** check.number("exposure", exposure) * _gains(white_balance)
+        image[..., :3] = image[..., :3] / gains.astype(np.float32)
+        if distortion is not None:
+            image = self._undistorted(image, distortion)
+        check.finite("image", image)
+        object.__setattr__(self, "image", image)
+
+    def _undistorted(self, image: np.ndarray, distortion: npt.ArrayLike) -> np.ndarray:
+        """The image of a pinhole; its mask as well, which is 0 where the lens saw nothing."""
+        coefficients = checked_distortion(distortion)
+        if self.camera is None:
+            raise ValueError("distortion: got it without a camera, expected one with the intrinsics of the calibration")
+        both = undistorted(np.concatenate([image, self.weights()[..., None]], axis=-1), self.camera, coefficients)
+        is_seen = np.isfinite(both).all(axis=-1)
+        both[~is_seen] = 0
+        object.__setattr__(self, "mask", np.clip(both[..., -1], 0, 1))
+        return np.ascontiguousarray(both[..., :-1])
 
     def weights(self) -> np.ndarray:
         """How much each pixel counts, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
 
 
-def read_target(path: AnyPath) -> np.ndarray:
-    """Linear RGB, or premultiplied RGB with coverage where the file has alpha, which is straight in PNG alone."""
-    pixels = read_image(path)
-    if pixels.shape[2] < 3:
-        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
-    if pixels.shape[2] == 4 and Path(path).suffix.lower() in _ENCODED:
-        pixels[..., :3] *= pixels[..., 3:]
-    return pixels
-
-
-def read_mask(path: AnyPath) -> np.ndarray:
-    """Gray as it is stored, 0 to 1: a mask is no light, so that half gray is half."""
-    pixels = read_image(path)
-    has_alpha = pixels.shape[2] in (2, 4)
-    colors = pixels[..., :-1] if has_alpha else pixels
-    if (colors != colors[..., :1]).any() or (has_alpha and (pixels[..., -1] != 1).any()):
-        raise ValueError(f"got colors or transparency in {path}, expected gray")
-    gray = colors[..., 0]
-    return linear_to_srgb(gray) if Path(path).suffix.lower() in _ENCODED else gray
+def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:
+    gains = np.ones(3) if white_balance is None else check.array("white_balance", white_balance, (3,))
+    if gains.min() <= 0:
+        raise ValueError(f"white_balance: got {gains.tolist()}, expected three gains above 0")
+    return gains
 
 
 def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -111,7 +111,7 @@ class World:
         rest: The bodies in their own spaces, None for the scene's.
         moving: Bodies that do not stand where the scene has them.
         clip_matrices: Of the views, [view, 4, 4], None for the scene's.
-        exposures: Factors of the views' colors, [view], None for 1.
+        exposures: Factors of the views' colors, [view, 1] or [view, 3], None for 1.
     """
 
     def __init__(self, renderer: TorchRenderer, cameras: Sequence[Camera]):
@@ -141,7 +141,7 @@ class World:
             clip_matrices=self.clip_matrices,
         )
         if self.exposures is not None:
-            color = images[..., :3] * self.exposures[:, None, None, None]
+            color = images[..., :3] * self.exposures[:, None, None]
             images = torch.cat([color, images[..., 3:]], dim=-1)
         return images
 
@@ -154,11 +154,13 @@ class FittedScene:
         scene: The scene; its camera is that of the first view.
         cameras: Of the views.
         exposures: Factors of the views' colors.
+        white_balances: Gains of red, green and blue in each view, beside its exposure; green has 1.
     """
 
     scene: Scene
     cameras: list[Camera]
     exposures: list[float]
+    white_balances: list[tuple[float, float, float]] = field(default_factory=list)
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""

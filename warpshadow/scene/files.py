@@ -13,6 +13,7 @@ import numpy.typing as npt
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera_conventions import HALF_PIXEL
 from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
@@ -39,7 +40,8 @@ from warpshadow.spheres import Spheres
 _VIEW_KEYS = ("eye", "target", "up", "fov_y")
 _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
-_CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "size", "near")
+_CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "pixel_centers", "size", "near")
+_PIXEL_CENTERS = {"half": np.zeros((3, 3)), "whole": HALF_PIXEL}
 _LIGHT_KEYS = ("envmap", "sh", "rotation", "scale", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground", "creased")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {
@@ -151,9 +153,13 @@ def parse_camera(table: Table) -> Camera:
             f"expected either {', '.join(_VIEW_KEYS)} or {', '.join(_PINHOLE_KEYS)}"
         )
     width, height = check.image_size(table.get("size", check.NOTHING))
-    return toml_tables.make(
-        Camera, {key: table[key] for key in table if key != "size"} | {"width": width, "height": height}
-    )
+    arguments = {key: table[key] for key in table if key not in ("size", "pixel_centers")}
+    arguments |= {"width": width, "height": height}
+    centers = table.get("pixel_centers", "half")
+    check.choice("pixel_centers", centers, _PIXEL_CENTERS)
+    if "intrinsics" in table:
+        arguments["intrinsics"] = check.array("intrinsics", table["intrinsics"], (3, 3)) + _PIXEL_CENTERS[centers]
+    return toml_tables.make(Camera, arguments)
 
 
 def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:

@@ -204,7 +204,7 @@ class Pose(FreeOfBody):
         if self.covariance is not None:
             turn = _rotation_vector(rotation @ setting.tensor(body.rotation_matrix()).T)
             away = torch.cat([turn, middle - setting.tensor(self._start_middle(setting))])
-            squares.append(away @ setting.tensor(np.linalg.inv(self.covariance)) @ away)
+            squares.append(away @ setting.tensor(np.linalg.inv(np.asarray(self.covariance, np.float64))) @ away)
         return PRIOR * torch.stack(squares).sum() if squares else None
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:

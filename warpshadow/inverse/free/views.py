@@ -19,25 +19,46 @@ from warpshadow.torch import rotation_matrices
 
 @dataclass(frozen=True)
 class Exposure(Free):
-    """The exposure of each view, a factor of its colors; known light then keeps its unit."""
+    """The exposure of each view, a factor of its colors; known light then keeps its unit.
+
+    Args:
+        white_balance: Whether the gains of red and blue are free, too; that of green is 1.
+    """
 
     key: ClassVar[str] = "exposure"
 
+    white_balance: bool = False
+
+    def __post_init__(self) -> None:
+        check.flag("white_balance", self.white_balance)
+
     def start(self, setting: Setting) -> Values:
-        """A factor of 1."""
-        return {"log": setting.tensor(np.zeros(len(setting.cameras)))}
+        """Factors of 1."""
+        views = len(setting.cameras)
+        values = {"log": setting.tensor(np.zeros(views))}
+        return values | ({"log_white": setting.tensor(np.zeros((views, 2)))} if self.white_balance else {})
+
+    def _gains(self, values: Values) -> torch.Tensor:
+        """Gains of red, green and blue, [view, 3]; or of all, [view, 1]."""
+        if not self.white_balance:
+            return torch.ones_like(values["log"])[:, None]
+        red, blue = values["log_white"].exp().unbind(dim=1)
+        return torch.stack([red, torch.ones_like(red), blue], dim=1)
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
         """Expose the world's images."""
-        world.exposures = values["log"].exp()
+        world.exposures = values["log"].exp()[:, None] * self._gains(values)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Factors of the views."""
         fitted.exposures = values["log"].exp().tolist()
+        if self.white_balance:
+            fitted.white_balances = [tuple(gains) for gains in self._gains(values).tolist()]
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """A factor of each view."""
-        return {"exposure": fitted.exposures}
+        """A factor of each view, and its gains."""
+        figures: dict[str, ArrayLike] = {"exposure": fitted.exposures}
+        return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
 
 
 @dataclass(frozen=True)
