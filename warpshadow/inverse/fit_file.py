@@ -31,7 +31,7 @@ from warpshadow.scene.scene import Scene, Visibility
 from warpshadow.scene.toml_tables import Table
 
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
-_PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "distortion")
+_PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", *_PHOTOGRAPH_KEYS)
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}

@@ -6,7 +6,8 @@ import torch
 
 from warpshadow import check
 
-KINDS = ("l2", "l1", "huber")
+KINDS = ("l2", "l1", "huber", "geman-mcclure", "barron")
+_BY_PIXEL = ("geman-mcclure", "barron")
 REDUCTIONS = ("mean", "sum")
 
 
@@ -18,14 +19,18 @@ class Loss:
 
     Args:
         kind: "l2", squares (the paper's); "l1", magnitudes; "huber", squares up to ``delta`` and magnitudes beyond,
-            less disturbed by noise and model errors.
-        delta: Where "huber" changes over [root mean squares of the target].
+            less disturbed by noise and model errors. Two that are redescending, of a pixel's three differences x
+            together, so that an occluder or a highlight hardly counts: "geman-mcclure", x² / (1 + x² / delta²); and
+            "barron", the general robust loss of ``alpha`` [Barron 2019], x² near 0 like the others.
+        delta: Where "huber" changes over, and the scale of redescending ones [root mean squares of the target].
+        alpha: Shape of "barron": 2 is "l2", 1 about "huber", 0 Cauchy's, -2 Geman and McClure's (of twice the delta).
         coverage: Weight of the coverage, for targets that have it. reduction: "mean" over pixels, or "sum", for plain
             gradient descent on parameters of single pixels.
     """
 
     kind: str = "l2"
     delta: float = 0.1
+    alpha: float = -2.0
     coverage: float = 1.0
     reduction: str = "mean"
 
@@ -34,8 +39,17 @@ class Loss:
         check.choice("reduction", self.reduction, REDUCTIONS)
         check.positive("delta", self.delta)
         check.nonnegative("coverage", self.coverage)
+        if check.number("alpha", self.alpha) > 2:
+            raise ValueError(f"alpha: got {self.alpha:g}, expected 2 or less")
 
-    def __call__(self, images: torch.Tensor, targets: torch.Tensor, weights: torch.Tensor, unit: float) -> torch.Tensor:
+    def __call__(
+        self,
+        images: torch.Tensor,
+        targets: torch.Tensor,
+        weights: torch.Tensor,
+        unit: float,
+        saturated: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Compare images.
 
         Args:
@@ -43,19 +57,66 @@ class Loss:
             targets: [view, height, width, 3 or 4].
             weights: Of the pixels, [view, height, width].
             unit: Radiance that counts as 1.
+            saturated: Where a target is a lower bound of the radiance, bool of shape [view, height, width, 3].
 
         Differentiable: images.
         """
-        costs = self._costs((images[..., :3] - targets[..., :3]) / unit).sum(-1)
+        costs = self._costs(differences(images, targets, unit, saturated))
         if targets.shape[-1] == 4 and self.coverage:
-            costs = costs + self.coverage * self._costs(images[..., 3] - targets[..., 3])
+            costs = costs + self.coverage * self._costs(images[..., 3:] - targets[..., 3:])
         total = (weights * costs).sum()
         return total / weights.sum() if self.reduction == "mean" else total
 
-    def _costs(self, differences: torch.Tensor) -> torch.Tensor:
+    def _costs(self, x: torch.Tensor) -> torch.Tensor:
+        """Cost of each pixel, of its differences, [..., channel] to [...]."""
+        if self.kind in _BY_PIXEL:
+            squares = x.square().sum(-1)
+            if self.kind == "geman-mcclure":
+                return squares / (1 + squares / self.delta**2)
+            return self._general(squares / self.delta**2) * (2 * self.delta**2)
         if self.kind == "l2":
-            return differences.square()
+            return x.square().sum(-1)
         if self.kind == "l1":
-            return differences.abs()
-        none = torch.zeros_like(differences)
-        return torch.nn.functional.huber_loss(differences, none, reduction="none", delta=self.delta)
+            return x.abs().sum(-1)
+        none = torch.zeros_like(x)
+        return torch.nn.functional.huber_loss(x, none, reduction="none", delta=self.delta).sum(-1)
+
+    def _general(self, squares: torch.Tensor) -> torch.Tensor:
+        """ρ(x, α, 1) of squares of x [Barron 2019, equation 8]."""
+        if self.alpha == 2:
+            return squares / 2
+        if self.alpha == 0:
+            return torch.log1p(squares / 2)
+        width = 2 - self.alpha
+        return width / self.alpha * ((squares / width + 1) ** (self.alpha / 2) - 1)
+
+    def pixel_weights(self, x: torch.Tensor) -> torch.Tensor:
+        """Weights w for which Σ w x² has the gradient of the costs: those of iteratively reweighted least squares.
+
+        They tell which pixels a fit believes: about 0 where a redescending loss takes a pixel for an occluder's.
+
+        Args:
+            x: Differences as :func:`differences` makes them, [..., channel].
+
+        Returns:
+            [..., channel].
+        """
+        size = x.abs().clamp_min(1e-6)
+        if self.kind == "l2":
+            return torch.ones_like(x)
+        if self.kind == "l1":
+            return 0.5 / size
+        if self.kind == "huber":
+            return 0.5 * (self.delta / size).clamp_max(1)
+        squares = x.square().sum(-1, keepdim=True).expand_as(x) / self.delta**2
+        if self.kind == "geman-mcclure":
+            return (1 + squares) ** -2
+        return torch.ones_like(x) if self.alpha == 2 else (squares / (2 - self.alpha) + 1) ** (self.alpha / 2 - 1)
+
+
+def differences(
+    images: torch.Tensor, targets: torch.Tensor, unit: float, saturated: torch.Tensor | None
+) -> torch.Tensor:
+    """Colors of images minus those of targets, in units of radiance; none above a target that is saturated."""
+    x = (images[..., :3] - targets[..., :3]) / unit
+    return x if saturated is None else torch.where(saturated, x.clamp_max(0), x)

@@ -33,7 +33,7 @@ class Model:
         self.problem, self.setting, self.regularization = problem, setting, stage.regularization
         self.cameras = tuple(camera.resized(stage.scale) for camera in setting.cameras)
         self.renderer = self._make_renderer(stage)
-        self.targets, self.weights = stacked(problem.targets, stage.scale, setting.device)
+        self.targets, self.weights, self.saturated = stacked(problem.targets, stage.scale, setting.device)
 
     def _make_renderer(self, stage: Stage) -> TorchRenderer:
         scene = self.setting.scene
@@ -68,7 +68,7 @@ class Model:
     def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return (image loss, images)."""
         images = self.images(values)
-        return self.problem.loss(images, self.targets, self.weights, self.setting.unit), images
+        return self.problem.loss(images, self.targets, self.weights, self.setting.unit, self.saturated), images
 
 
 class LightModel(Model):
@@ -100,7 +100,8 @@ class LightModel(Model):
     @staticmethod
     def applies(problem: Problem) -> bool:
         """Whether a problem is one of light alone, and of squares."""
-        return len(problem.free) == 1 and isinstance(problem.free[0], Light) and problem.loss.kind == "l2"
+        is_light = len(problem.free) == 1 and isinstance(problem.free[0], Light)
+        return is_light and problem.loss.kind == "l2" and all(target.saturated is None for target in problem.targets)
 
     def _images_of_units(self) -> list[torch.Tensor]:
         """Images in light of which one coefficient is 1, [view, height, width, 4] each."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.check import AnyPath
-from warpshadow.inverse.encoding import checked_encoding, guess_encoding, read_linear, read_mask
+from warpshadow.inverse.encoding import checked_encoding, decoded, guess_encoding, read_linear, read_mask
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -32,6 +33,8 @@ class Target:
             :func:`~warpshadow.inverse.encoding.guess_encoding`.
         exposure: At which the image was taken [stops]: its values are divided by 2^exposure.
         white_balance: Gains of red, green and blue with which it was developed: its values are divided by them.
+        saturation: Value of the file, 0 to 1 as it is stored, from which a color is saturated: an image may be brighter
+            there. None: none is.
         distortion: OpenCV's coefficients k1, k2, p1, p2[, k3] of the camera's lens: the image is made that of a
             pinhole, and pixels that the lens did not see do not count.
     """
@@ -40,6 +43,7 @@ class Target:
     mask: np.ndarray | None = field(repr=False)
     camera: Camera | None
     encoding: str | float
+    saturated: np.ndarray | None = field(repr=False)
 
     def __init__(
         self,
@@ -50,6 +54,7 @@ class Target:
         encoding: str | float | None = None,
         exposure: float = 0.0,
         white_balance: npt.ArrayLike | None = None,
+        saturation: float | None = None,
         distortion: npt.ArrayLike | None = None,
     ):
         if encoding is not None:
@@ -94,6 +99,8 @@ class Target:
                 f"image: got {size[0]} × {size[1]} pixels, expected the camera's "
                 f"{self.camera.width} × {self.camera.height}"
             )
+        saturated = None if saturation is None else image[..., :3] >= decoded(_share(saturation), self.encoding)
+        object.__setattr__(self, "saturated", saturated if saturated is not None and saturated.any() else None)
         gains = 2.0 ** check.number("exposure", exposure) * _gains(white_balance)
         image[..., :3] = image[..., :3] / gains.astype(np.float32)
         if distortion is not None:
@@ -108,6 +115,9 @@ class Target:
             raise ValueError("distortion: got it without a camera, expected one with the intrinsics of the calibration")
         both = undistorted(np.concatenate([image, self.weights()[..., None]], axis=-1), self.camera, coefficients)
         is_seen = np.isfinite(both).all(axis=-1)
+        if self.saturated is not None:
+            spread = undistorted(self.saturated.astype(np.float32), self.camera, coefficients)
+            object.__setattr__(self, "saturated", spread > 0)
         both[~is_seen] = 0
         object.__setattr__(self, "mask", np.clip(both[..., -1], 0, 1))
         return np.ascontiguousarray(both[..., :-1])
@@ -124,8 +134,29 @@ def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:
     return gains
 
 
-def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images [view, height, width, channel] and weights [view, height, width] at the size of a camera resized."""
+def _share(saturation: float) -> np.ndarray:
+    if not (check.is_number(saturation) and 0 < saturation <= 1):
+        raise ValueError(f"saturation: got {check.described(saturation)}, expected above 0 and up to 1, such as 0.98")
+    return np.float64(saturation) - 1e-6
+
+
+class Stacked(NamedTuple):
+    """Targets of all views at the size of a stage.
+
+    Attributes:
+        images: [view, height, width, channel].
+        weights: [view, height, width].
+        saturated: Where a part of a pixel is, so that all of it is at least as bright, [view, height, width, 3]; None
+            if nowhere.
+    """
+
+    images: torch.Tensor
+    weights: torch.Tensor
+    saturated: torch.Tensor | None
+
+
+def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> Stacked:
+    """Targets at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]
     down, width_means = (_area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
@@ -135,7 +166,12 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> tu
 
     weight = resized(weights)
     image = resized(images * weights) / torch.where(weight > 0, weight, 1)  # masked-out pixels bleed into nothing
-    return image.contiguous(), weight[..., 0].contiguous()
+    saturated = None
+    if any(target.saturated is not None for target in targets):
+        none = np.zeros((*images.shape[1:3], 3), bool)
+        flags = [none if target.saturated is None else target.saturated for target in targets]
+        saturated = resized(np.stack(flags).astype(np.float32)) > 0
+    return Stacked(image.contiguous(), weight[..., 0].contiguous(), saturated)
 
 
 def _area_means(count: int, fewer: int) -> torch.Tensor:
