@@ -24,9 +24,11 @@ from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.scene import (
     COLORS,
+    GLOSS,
     MEANT,
     READ_BY,
     SCENE,
+    VALUES,
     Body,
     Bounces,
     Scene,
@@ -212,6 +214,9 @@ def _body(table: Table, folder: Path) -> Body:
         place["texture"] = toml_tables.file(table, "texture", folder)
     if isinstance(place.get("albedo"), str) and place["albedo"].endswith(COLORS):
         place["albedo"] = toml_tables.file(table, "albedo", folder)
+    for name in GLOSS:
+        if isinstance(place.get(name), str) and place[name].endswith(VALUES):
+            place[name] = toml_tables.file(table, name, folder)
     if "spheres" in place:
         path = toml_tables.file(place, "spheres", folder)
         with check.located("spheres"):
@@ -241,8 +246,9 @@ def write_scene(scene: Scene, folder: AnyPath) -> list[Path]:
 
     Args:
         folder: Made if it is not there. It gets scene.toml, light.exr for an environment map, and for body N (from 0)
-            body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex, and
-            where it has a texture body_N.exr, with body_N.png and body_N.mtl for programs that draw OBJ files.
+            body_N.obj, body_N.npz where it has spheres of its own, body_N.npy where it has a color for each vertex,
+            body_N_roughness.npy and the like where it has one for each vertex, and where it has a texture body_N.exr,
+            with body_N.png and body_N.mtl for programs that draw OBJ files.
     Returns:
         The files.
     """
@@ -308,7 +314,18 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         body.blockers.write(arrays)
         table["spheres"] = arrays.name
         written.append(arrays)
-    place = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
+    place: Table = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
+    for name in GLOSS:
+        values = getattr(body, name)
+        if values is None:
+            continue
+        place[name] = _numbers(values)[0]
+        if values.size > 1:
+            path = stem.with_name(f"{stem.name}_{name}{VALUES}")
+            with files.whole(path) as unfinished:
+                np.save(unfinished, values)
+            place[name] = path.name
+            written.append(path)
     if body.self_shadows is not None:
         place["self_shadows"] = body.self_shadows
     if body.shadow_catcher:

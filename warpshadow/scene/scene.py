@@ -77,7 +77,16 @@ SCENE = "a Scene; load_scene(path) reads one"
 COLORS = ".npy"
 """Suffixes of files with a color for each vertex; other text is no albedo."""
 
+VALUES = ".npy"
+"""Suffix of files with a number for each vertex."""
+
 _SPHERES = ".npz"
+
+GLOSS = ("roughness", "metallic", "specular")
+"""Arguments of a body that say how it shines."""
+
+GLOSSY = ("directional", "ray-traced", AUTO)
+"""The methods that show it."""
 
 MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """Replacements for likely mistakes in a body's arguments, and keys."""
@@ -235,6 +244,11 @@ class Body:
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
+        roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
+            shines by a GGX lobe of width α = roughness². None, the default, is a diffuse surface. Below 0.1 it is shown
+            as 0.1. Such a body has receivers at pixels; methods "directional" and "ray-traced" show it.
+        metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
+        specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
     """
 
     mesh: Mesh
@@ -248,6 +262,9 @@ class Body:
     name: str | None
     self_shadows: str | None
     shadow_catcher: bool
+    roughness: np.ndarray | None
+    metallic: np.ndarray | None
+    specular: np.ndarray | None
 
     @check.keywords(**MEANT, spheres="blockers", path="mesh")
     def __init__(
@@ -263,10 +280,14 @@ class Body:
         name: str | None = None,
         self_shadows: str | None = None,
         shadow_catcher: bool = False,
+        roughness: npt.ArrayLike | AnyPath | None = None,
+        metallic: npt.ArrayLike | AnyPath | None = None,
+        specular: npt.ArrayLike | AnyPath | None = None,
     ):
         vars(self).update(mesh=mesh, albedo=albedo, texture=texture, blockers=blockers)
         vars(self).update(rotation=rotation, translation=translation, scale=scale, receivers=receivers, name=name)
         vars(self).update(self_shadows=self_shadows, shadow_catcher=check.flag("shadow_catcher", shadow_catcher))
+        vars(self).update(roughness=roughness, metallic=metallic, specular=specular)
         self._read_mesh()
         self._read_files()
         expected = "a Mesh or the path of a file, or a mesh of trimesh; Mesh(positions, faces) makes one of arrays"
@@ -290,6 +311,7 @@ class Body:
                 "axes; mesh.transformed(scale=(x, y, z)) stretches a mesh"
             )
         check.choice("receivers", self.receivers, RECEIVERS)
+        self._check_gloss()
         if self.self_shadows is not None:
             check.choice("self_shadows", self.self_shadows, SELF_SHADOWS)
         if self.name is not None and not (isinstance(self.name, str) and self.name):
@@ -330,6 +352,7 @@ class Body:
             ("texture", read_rgb, "", ImageError),
             ("albedo", _read_colors, COLORS, ValueError),
             ("blockers", Spheres.read, _SPHERES, ValueError),
+            *((name, _read_values, VALUES, ValueError) for name in GLOSS),
         )
         for name, read, suffix, error in readers:
             value = getattr(self, name)
@@ -366,6 +389,31 @@ class Body:
         texture.setflags(write=False)
         return texture
 
+    def _check_gloss(self) -> None:
+        """Hold roughness and its like as float32, [1] or [vertex]; without roughness there is none of them."""
+        expected = f"a number from 0 to 1, one for each vertex, [vertex], or an {VALUES} file of them"
+        for name in GLOSS:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if self.roughness is None:
+                raise ValueError(f"{name}: got {check.described(value)} without roughness, expected both, or neither")
+            numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
+            check.shape(name, numbers.shape, (1 if numbers.shape == (1,) else self.mesh.vertex_count,), expected)
+            check.finite(name, numbers, minimum=0.0, maximum=1.0)
+            numbers.setflags(write=False)
+            object.__setattr__(self, name, numbers)
+        if self.roughness is not None and self.receivers in ("vertex", "adaptive"):
+            raise ValueError(
+                f"receivers: got {self.receivers!r} beside roughness, expected 'pixel' or 'auto', since "
+                "reflections depend on the camera"
+            )
+
+    @property
+    def is_glossy(self) -> bool:
+        """Whether it shines."""
+        return self.roughness is not None
+
     def rotation_matrix(self) -> np.ndarray:
         """The rotation as a matrix, float64 of shape [3, 3] (Rodrigues' formula)."""
         angle = np.radians(np.linalg.norm(self.rotation))
@@ -382,7 +430,10 @@ class Body:
             angle: Edges are sharp where their faces bend by more [degrees], 0 to 180.
         """
         mesh = self.mesh.creased(angle)
-        return replace(self, mesh=mesh, albedo=self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins])
+        values: dict[str, Any] = {name: getattr(self, name) for name in GLOSS}
+        of_vertices = {name: array[mesh.origins] for name, array in values.items() if np.size(array) > 1}
+        colors = self.albedo if self.albedo.ndim == 1 else self.albedo[mesh.origins]
+        return replace(self, mesh=mesh, albedo=colors, **of_vertices)
 
     @check.keywords(rotation="Body(…, rotation=…).on_ground(…)", scale="size", height="size", translation="foot")
     def on_ground(self, foot: npt.ArrayLike = (0.0, 0.0, 0.0), *, size: float | None = None) -> Body:
@@ -429,11 +480,15 @@ def _colors(mesh: Mesh | MeshSource) -> npt.ArrayLike:
     return colors if np.ptp(colors, axis=0).any() else colors[0]
 
 
-def _read_colors(path: Path) -> np.ndarray:
+def _read_colors(path: Path, shape: str = "[vertex, 3]") -> np.ndarray:
     try:
         return np.load(path, allow_pickle=False)
     except (ValueError, EOFError) as error:
-        raise ValueError(f"got {path} ({error}), expected an .npy file of [vertex, 3]") from error
+        raise ValueError(f"got {path} ({error}), expected an .npy file of {shape}") from error
+
+
+def _read_values(path: Path) -> np.ndarray:
+    return _read_colors(path, "[vertex]")
 
 
 def _meant(color: str) -> str:
@@ -544,6 +599,12 @@ class Scene:
             object.__setattr__(self, "light", light)
         check_supersampling(self.supersampling)
         check_bounces(self.bounces)
+        glossy = next((body for body in self.bodies if body.is_glossy), None)
+        if glossy is not None and self.visibility.method not in (*GLOSSY, None):
+            raise ValueError(
+                f"roughness: got some for body {glossy.called!r}, which {self.visibility.method!r} does not show, "
+                f"expected None, or method = one of {', '.join(map(repr, GLOSSY))}"
+            )
         if self.bounces and self.visibility.method not in (*BOUNCING, None):
             finders = ", ".join(map(repr, BOUNCING))
             raise ValueError(

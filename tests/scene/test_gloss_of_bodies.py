@@ -1,0 +1,55 @@
+"""Roughness, metallic and specular of bodies: their checks, and scene files that have them."""
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from warpshadow.scene.files import write_scene
+
+BALL = ws.icosphere(0.5, 1)
+SKY = ws.EnvironmentMap.constant(1.0)
+
+
+def test_a_body_without_roughness_is_diffuse():
+    assert not ws.Body(BALL).is_glossy
+    assert ws.Body(BALL, roughness=0.3).is_glossy
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"roughness": 1.2}, "roughness: got 1 values out of range"),
+        ({"roughness": "matte"}, "roughness: got 'matte', expected a number from 0 to 1"),
+        ({"roughness": np.zeros(7)}, r"roughness: got shape \(7,\), expected \[42\]"),
+        ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected both"),
+        ({"roughness": 0.5, "receivers": "vertex"}, "receivers: got 'vertex' beside roughness"),
+    ],
+)
+def test_values_that_no_surface_has_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ws.Body(BALL, **arguments)
+
+
+@pytest.mark.parametrize("method", ["log-sh", "none"])
+def test_methods_that_do_not_show_gloss_refuse_it(method):
+    with pytest.raises(ValueError, match="roughness: got some for body 'ball', which"):
+        ws.Scene([ws.Body(BALL, roughness=0.5, name="ball")], SKY, visibility=ws.Visibility(method))
+
+
+def test_scene_files_read_back_the_same_gloss(tmp_path):
+    values = np.random.default_rng(0).uniform(size=BALL.vertex_count).astype(np.float32)
+    bodies = [
+        ws.Body(BALL, roughness=1 / 3, name="plain"),
+        ws.Body(BALL, roughness=values, metallic=1.0, specular=0.25, name="each", translation=(2, 0, 0)),
+    ]
+    write_scene(ws.Scene(bodies, SKY), tmp_path)
+    plain, each = ws.load_scene(tmp_path / "scene.toml").bodies
+    assert plain.roughness == np.float32(1 / 3) and plain.metallic is None
+    assert np.array_equal(each.roughness, values) and each.metallic == 1 and each.specular == 0.25
+
+
+def test_vertex_values_follow_creases():
+    box = ws.icosphere(0.5, 0)
+    values = np.linspace(0, 1, box.vertex_count, dtype=np.float32)
+    body = ws.Body(box, roughness=values).creased(10)
+    assert np.array_equal(body.roughness, values[body.mesh.origins]) and body.roughness.size > box.vertex_count
