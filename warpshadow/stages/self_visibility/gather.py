@@ -36,6 +36,22 @@ _MEAN_LOOKUPS = 6  # lookups of a cell, for the cost
 _WORD = wp.constant(4)  # coarse cells of a word of 32 bits
 
 
+@wp.struct
+class GatherInputs:
+    """Inputs of gathering, and of its adjoint."""
+
+    normals: wp.array2d(dtype=wp.vec3)
+    rows: wp.array2d(dtype=wp.vec3i)
+    place_weights: wp.array2d(dtype=wp.vec3)
+    directions: wp.array(dtype=wp.vec3)
+    looks_at_rays: wp.array(dtype=wp.int32)
+    counts: wp.array2d(dtype=wp.int32)
+    indices: wp.array3d(dtype=wp.int32)
+    weights: wp.array3d(dtype=wp.float32)
+    bits: wp.array2d(dtype=wp.uint32)
+    words: wp.array2d(dtype=wp.uint32)
+
+
 @functools.cache
 def _probes_type(lanes: int) -> Any:
     """Struct of where a group of receivers lies."""
@@ -54,7 +70,7 @@ def _probes_type(lanes: int) -> Any:
 class _ProbeFunctions(NamedTuple):
     """Kernel functions on the probes of a group."""
 
-    load_probes: wp.Function
+    begin: wp.Function
     spread: wp.Function
     look: wp.Function
 
@@ -64,13 +80,13 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane, ProbeLanes = lane_type(lanes), _probes_type(lanes)
     Rows = wp.types.vector(length=lanes, dtype=wp.int32)
+    fn = make_lane_functions(lanes)
+    find_block, load = fn.find_block, fn.load
 
     @wp.func
-    def load_probes(
-        all_rows: wp.array2d(dtype=wp.vec3i), all_weights: wp.array2d(dtype=wp.vec3), batch: int, group: int
-    ):
-        rows = all_rows[instance_in(batch, all_rows.shape[0])]
-        weights = all_weights[instance_in(batch, all_weights.shape[0])]
+    def load_probes(inputs: GatherInputs, batch: int, group: int):
+        rows = inputs.rows[instance_in(batch, inputs.rows.shape[0])]
+        weights = inputs.place_weights[instance_in(batch, inputs.place_weights.shape[0])]
         probes = ProbeLanes()
         probes.corner_count = 1
         for lane in range(lanes):
@@ -104,45 +120,45 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         ...
 
     @wp.func
-    def look(
-        rows: Rows, of_rays: int, index: int, bits: wp.array2d(dtype=wp.uint32), words: wp.array2d(dtype=wp.uint32)
-    ):
+    def look(rows: Rows, of_rays: int, index: int, inputs: GatherInputs):
         """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
         share = Lane()
         for lane in range(lanes):
             if of_rays == 1:
-                share[lane] = float(int((bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
+                share[lane] = float(int((inputs.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
             else:
-                word = words[rows[lane], index // _WORD]
+                word = inputs.words[rows[lane], index // _WORD]
                 byte = (word >> wp.uint32(8 * (index % _WORD))) & wp.uint32(255)
                 share[lane] = float(int(byte)) * (1.0 / 255.0)
         return share
 
-    return _ProbeFunctions(load_probes, spread, look)
+    @wp.func
+    def begin(inputs: GatherInputs, row: int, receiver_count: int, shares: wp.array(dtype=Lane)):
+        """Load a group of receivers, and S of all coarse cells where there are several."""
+        batch, group = find_block(row, receiver_count)
+        probes = load_probes(inputs, batch, group)
+        if wp.static(lanes > 1):
+            for cell in range(shares.shape[0]):
+                shares[cell] = Lane(0.0)
+            for corner in range(probes.corner_count):
+                spread(probes.rows[corner], probes.weights[corner], inputs.words, shares)
+        return batch, group, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], group), probes
+
+    return _ProbeFunctions(begin, spread, look)
 
 
 @functools.cache
 def _make_gather(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    load_probes, spread, look = _make_probe_functions(lanes)
-    find_block, load, store_columns = fn.find_block, fn.load, fn.store_columns
-    dot_direction, is_any_above = fn.dot_direction, fn.is_any_above
+    begin, _spread, look = _make_probe_functions(lanes)
+    store_columns, dot_direction, is_any_above = fn.store_columns, fn.dot_direction, fn.is_any_above
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def gather(
         first_row: int,
         worker: int,
         # in
-        normals: wp.array2d(dtype=wp.vec3),
-        rows: wp.array2d(dtype=wp.vec3i),
-        place_weights: wp.array2d(dtype=wp.vec3),
-        directions: wp.array(dtype=wp.vec3),
-        looks_at_rays: wp.array(dtype=wp.int32),
-        all_counts: wp.array2d(dtype=wp.int32),
-        all_indices: wp.array3d(dtype=wp.int32),
-        all_weights: wp.array3d(dtype=wp.float32),
-        bits: wp.array2d(dtype=wp.uint32),
-        words: wp.array2d(dtype=wp.uint32),
+        inputs: GatherInputs,
         # scratch
         scratch: wp.array3d(dtype=Lane),
         # out
@@ -150,31 +166,24 @@ def _make_gather(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a group of receivers."""
         item = first_row + wp.tid()
-        batch, group = find_block(item, own.shape[1])
-        normal = load(normals[instance_in(batch, normals.shape[0])], group)
-        probes = load_probes(rows, place_weights, batch, group)
-        turn = instance_in(batch, all_counts.shape[0])
         shares = scratch[scratch_place(worker, item), 0]
         columns = scratch[scratch_place(worker, item), 1]
-        if wp.static(lanes > 1):
-            for cell in range(shares.shape[0]):
-                shares[cell] = Lane(0.0)
-            for corner in range(probes.corner_count):
-                spread(probes.rows[corner], probes.weights[corner], words, shares)
-        for q in range(directions.shape[0]):
+        batch, group, normal, probes = begin(inputs, item, own.shape[1], shares)
+        turn = instance_in(batch, inputs.counts.shape[0])
+        for q in range(inputs.directions.shape[0]):
             passing = Lane(0.0)
-            cosine = dot_direction(directions[q], normal)
+            cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
-                indices = all_indices[turn, q]
-                weights = all_weights[turn, q]
-                of_rays = looks_at_rays[q]
+                indices = inputs.indices[turn, q]
+                weights = inputs.weights[turn, q]
+                of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(all_counts[turn, q]):
+                    for k in range(inputs.counts[turn, q]):
                         for corner in range(probes.corner_count):
-                            share = look(probes.rows[corner], of_rays, indices[k], bits, words)
+                            share = look(probes.rows[corner], of_rays, indices[k], inputs)
                             passing += weights[k] * wp.cw_mul(probes.weights[corner], share)
                 else:
-                    for k in range(all_counts[turn, q]):
+                    for k in range(inputs.counts[turn, q]):
                         passing += weights[k] * shares[indices[k]]
             for lane in range(lanes):
                 passing[lane] = wp.where(cosine[lane] > 0.0, passing[lane], 1.0)
@@ -183,7 +192,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
             else:
                 columns[q] = passing
         if wp.static(lanes > 1):
-            store_columns(columns, 0, directions.shape[0], group, own[batch])
+            store_columns(columns, 0, inputs.directions.shape[0], group, own[batch])
 
     return gather
 
@@ -191,14 +200,8 @@ def _make_gather(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_gather_adjoint(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    load_probes, spread, look = _make_probe_functions(lanes)
-    find_block, load, dot_direction, is_any_above, total = (
-        fn.find_block,
-        fn.load,
-        fn.dot_direction,
-        fn.is_any_above,
-        fn.total,
-    )
+    begin, spread, look = _make_probe_functions(lanes)
+    dot_direction, is_any_above, total = fn.dot_direction, fn.is_any_above, fn.total
     Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -206,16 +209,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         first_row: int,
         worker: int,
         # in
-        normals: wp.array2d(dtype=wp.vec3),
-        rows: wp.array2d(dtype=wp.vec3i),
-        place_weights: wp.array2d(dtype=wp.vec3),
-        directions: wp.array(dtype=wp.vec3),
-        looks_at_rays: wp.array(dtype=wp.int32),
-        all_counts: wp.array2d(dtype=wp.int32),
-        all_indices: wp.array3d(dtype=wp.int32),
-        all_weights: wp.array3d(dtype=wp.float32),
-        bits: wp.array2d(dtype=wp.uint32),
-        words: wp.array2d(dtype=wp.uint32),
+        inputs: GatherInputs,
         adj_own: wp.array3d(dtype=wp.float32),
         # scratch
         scratch: wp.array3d(dtype=Lane),
@@ -228,41 +222,35 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
         """
         item = first_row + wp.tid()
-        batch, group = find_block(item, adj_own.shape[1])
-        normal = load(normals[instance_in(batch, normals.shape[0])], group)
-        probes = load_probes(rows, place_weights, batch, group)
-        turn = instance_in(batch, all_counts.shape[0])
-        place = scratch_place(worker, item)
-        shares = scratch[place, 0]
-        adj_shares = scratch[place, 1]
+        shares = scratch[scratch_place(worker, item), 0]
+        adj_shares = scratch[scratch_place(worker, item), 1]
+        batch, group, normal, probes = begin(inputs, item, adj_own.shape[1], shares)
+        turn = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
-                shares[cell] = Lane(0.0)
                 adj_shares[cell] = Lane(0.0)
-            for corner in range(probes.corner_count):
-                spread(probes.rows[corner], probes.weights[corner], words, shares)
         receiver_count = wp.min(lanes, adj_own.shape[1] - group * lanes)
         adj_place = Weights()
-        for q in range(directions.shape[0]):
-            cosine = dot_direction(directions[q], normal)
+        for q in range(inputs.directions.shape[0]):
+            cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
                 adj = Lane()
                 for lane in range(receiver_count):
                     adj[lane] = wp.where(cosine[lane] > 0.0, adj_own[batch, group * lanes + lane, q], 0.0)
-                indices = all_indices[turn, q]
-                weights = all_weights[turn, q]
-                of_rays = looks_at_rays[q]
+                indices = inputs.indices[turn, q]
+                weights = inputs.weights[turn, q]
+                of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
-                    for k in range(all_counts[turn, q]):
+                    for k in range(inputs.counts[turn, q]):
                         for corner in range(3):
                             if corner < probes.corner_count:
-                                pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], bits, words))
+                                pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], inputs))
                                 adj_place[corner] += weights[k] * pull
                                 if adj_all_weights:
                                     adj_weight = total(wp.cw_mul(probes.weights[corner], pull))
                                     wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
                 else:
-                    for k in range(all_counts[turn, q]):
+                    for k in range(inputs.counts[turn, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
                         if adj_all_weights:
                             wp.atomic_add(adj_all_weights, turn, q, k, total(wp.cw_mul(adj, shares[indices[k]])))
@@ -272,7 +260,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                 if wp.static(lanes > 1):
                     for cell in range(shares.shape[0]):
                         shares[cell] = Lane(0.0)
-                    spread(probes.rows[corner], Lane(1.0), words, shares)
+                    spread(probes.rows[corner], Lane(1.0), inputs.words, shares)
                     for cell in range(shares.shape[0]):
                         adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
                 for lane in range(receiver_count):
@@ -314,17 +302,21 @@ def gather_self_transmittance(
         places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
     lanes = lane_count(normals.device)
     words = _as_words(rows.cells)
-    inputs = [normals, *places, kernels.directions, kernels.looks_at_rays, *lookup, rows.bits, words]
+    inputs = GatherInputs()
+    inputs.normals, inputs.rows, inputs.place_weights = normals, *places
+    inputs.directions, inputs.looks_at_rays = kernels.directions, kernels.looks_at_rays
+    inputs.counts, inputs.indices, inputs.weights = lookup
+    inputs.bits, inputs.words = rows.bits, words
     row_count = count * block_count(shape[1], lanes)
     cell_count = max(_WORD * words.shape[1], direction_count) if lanes > 1 else 1
     scratch = [Scratch((2, cell_count), lane_type(lanes))]
     cost = _LOOKUP_COST * _MEAN_LOOKUPS * direction_count * lanes
     return differentiable(
-        lambda own: launch(_make_gather(lanes), row_count, inputs=inputs, scratch=scratch, outputs=[own], cost=cost),
+        lambda own: launch(_make_gather(lanes), row_count, inputs=[inputs], scratch=scratch, outputs=[own], cost=cost),
         lambda adj_own: launch(
             _make_gather_adjoint(lanes),
             row_count,
-            inputs=[*inputs, adj_own],
+            inputs=[inputs, adj_own],
             scratch=scratch,
             outputs=[places.weights.grad],
             sums=[lookup.weights.grad],

@@ -91,10 +91,25 @@ class ResamplingWeights(NamedTuple):
     weights: wp.array
 
 
+@wp.struct
+class KernelArrays:
+    """Where cells look: :class:`ResamplingKernels` as kernels see them."""
+
+    directions: wp.array(dtype=wp.vec3)
+    reaches: wp.array(dtype=wp.float32)
+    looks_at_rays: wp.array(dtype=wp.int32)
+    rays: wp.array(dtype=wp.vec3)
+    cells: wp.array(dtype=wp.vec3)
+
+
 @wp.func
-def _body_direction(rotation: wp.mat33, direction: wp.vec3):
-    """Find d·|Rᵀω|."""
-    return wp.transpose(rotation) * direction
+def _look_from(kernels: KernelArrays, rotation: wp.mat33, direction: int):
+    """Find d·|Rᵀω|, d, cos h, and the directions among which a cell looks."""
+    along = wp.transpose(rotation) * kernels.directions[direction]
+    candidates = kernels.cells
+    if kernels.looks_at_rays[direction] == 1:
+        candidates = kernels.rays
+    return along, wp.normalize(along), kernels.reaches[direction], candidates
 
 
 @wp.func
@@ -110,11 +125,7 @@ def _find_lookups(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
-    directions: wp.array(dtype=wp.vec3),
-    reaches: wp.array(dtype=wp.float32),
-    looks_at_rays: wp.array(dtype=wp.int32),
-    rays: wp.array(dtype=wp.vec3),
-    cells: wp.array(dtype=wp.vec3),
+    kernels: KernelArrays,
     # out
     counts: wp.array2d(dtype=wp.int32),
     indices: wp.array3d(dtype=wp.int32),
@@ -123,11 +134,7 @@ def _find_lookups(
     """A thread owns a cell of directions of an instance."""
     row, direction = wp.tid()
     batch = first_row + row
-    toward = wp.normalize(_body_direction(rotations[batch, body], directions[direction]))
-    reach = reaches[direction]
-    candidates = cells
-    if looks_at_rays[direction] == 1:
-        candidates = rays
+    _along, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
     count = int(0)
     total = float(0.0)
     for candidate in range(candidates.shape[0]):
@@ -151,11 +158,7 @@ def _find_lookups_adjoint(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
     body: int,
-    directions: wp.array(dtype=wp.vec3),
-    reaches: wp.array(dtype=wp.float32),
-    looks_at_rays: wp.array(dtype=wp.int32),
-    rays: wp.array(dtype=wp.vec3),
-    cells: wp.array(dtype=wp.vec3),
+    kernels: KernelArrays,
     counts: wp.array2d(dtype=wp.int32),
     indices: wp.array3d(dtype=wp.int32),
     weights: wp.array3d(dtype=wp.float32),
@@ -169,12 +172,7 @@ def _find_lookups_adjoint(
     v̄ = (d̄ − d d·d̄) / |v|,  R̄ += ω v̄ᵀ
     """
     batch, direction = wp.tid()
-    body_direction = _body_direction(rotations[batch, body], directions[direction])
-    toward = wp.normalize(body_direction)
-    reach = reaches[direction]
-    candidates = cells
-    if looks_at_rays[direction] == 1:
-        candidates = rays
+    along, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
     total = float(0.0)
     mean = float(0.0)
     for k in range(counts[batch, direction]):
@@ -186,8 +184,8 @@ def _find_lookups_adjoint(
         candidate = candidates[indices[batch, direction, k]]
         height = _height(wp.dot(candidate, toward), reach)
         adj_toward += 2.0 * height * (adj_weights[batch, direction, k] - mean) / total / (1.0 - reach) * candidate
-    adj_along = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(body_direction)
-    wp.atomic_add(adj_rotations, batch, body, wp.outer(directions[direction], adj_along))
+    adj_along = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(along)
+    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_along))
 
 
 def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingKernels) -> ResamplingWeights:
@@ -203,7 +201,9 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     device = rotations.device
     counts = wp.empty(shape, dtype=wp.int32, device=device)
     indices = wp.empty((*shape, kernels.most), dtype=wp.int32, device=device)
-    inputs = [rotations, body, *kernels[:5]]
+    arrays = KernelArrays()
+    arrays.directions, arrays.reaches, arrays.looks_at_rays, arrays.rays, arrays.cells = kernels[:5]
+    inputs = [rotations, body, arrays]
     weights = differentiable(
         lambda weights: launch(
             _find_lookups, shape, inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
