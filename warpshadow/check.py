@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import functools
+import importlib
 import inspect
 import math
 import os
@@ -415,6 +416,14 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
     if not matches:
         lengths = ", ".join(map(str, expected))
         raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")
+
+
+def importable(module: str, what: str, package: str, extra: str) -> None:
+    """Raise ImportError, which says how to install it, unless a module of one of our extras can be imported."""
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(missing(what, package, extra)) from error
 
 
 def missing(what: str, package: str, extra: str) -> str:

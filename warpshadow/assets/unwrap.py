@@ -26,10 +26,8 @@ def unwrap(mesh: Mesh, *, size: int = 1024, padding: int = 4) -> Mesh:
     Raises:
         ImportError: when xatlas, the extra ``unwrap``, is not installed.
     """
-    try:
-        import xatlas
-    except ImportError:
-        raise ImportError(check.missing("unwrapping", "xatlas", "unwrap")) from None
+    check.importable("xatlas", "unwrapping", "xatlas", "unwrap")
+    import xatlas
 
     if not (isinstance(size, int) and isinstance(padding, int) and 0 <= padding < size):
         raise MeshError(f"size, padding: got {size} and {padding}, expected integers with 0 <= padding < size")

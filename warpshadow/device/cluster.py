@@ -44,10 +44,9 @@ def run_on_ray(
         ConnectionError: where there is no such cluster, where it wants a token that this process does not give, or once
             its head or this machine's part of it has died.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError(check.missing("a Ray cluster", "ray", "ray")) from error
+    check.importable("ray", "a Ray cluster", "ray", "ray")
+    import ray
+
     is_ours = not ray.is_initialized()
     if is_ours:
         try:

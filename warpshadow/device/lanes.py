@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.memory import as_items
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 
@@ -153,12 +154,13 @@ def module_options(lanes: int) -> dict[str, Any]:
 
 
 @functools.cache
-def use_vector_registers(module_name: str) -> None:
-    """Give the kernels on chunks of a Python module the flags that follow the CPU, before the first is built.
+def use_vector_registers(module_name: str, device: wp.Device) -> None:
+    """Give the kernels on chunks of a Python module the flags that follow a CPU, before the first is built.
 
     Importing the module does not ask for the CPU: that starts Warp.
     """
-    wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
+    if device.is_cpu:
+        wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
 
 
 def block_count(vertex_count: int, lanes: int) -> int:
@@ -360,15 +362,4 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
 
 def as_chunks(rows: wp.array | None) -> wp.array | None:
     """View rows of coefficients [batch, row, coefficient] as rows of whole chunks; the remainder is left out."""
-    if rows is None:
-        return None
-    instances, row_count, count = rows.shape
-    chunks = wp.array(
-        ptr=rows.ptr,
-        dtype=Chunk,
-        shape=(instances, row_count, count // CHUNK),
-        strides=(*rows.strides[:2], CHUNK * rows.strides[2]),
-        device=rows.device,
-    )
-    chunks.viewed = rows  # the memory stays while the view does
-    return chunks
+    return None if rows is None else as_items(rows, Chunk, CHUNK)

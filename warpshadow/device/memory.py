@@ -1,4 +1,4 @@
-"""Memory: huge pages for large arrays.
+"""Memory: huge pages for large arrays, and views of arrays.
 
 Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
 receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
@@ -43,3 +43,12 @@ def require_gradient(array: wp.array) -> None:
     if not array.requires_grad:
         array.grad = in_huge_pages(wp.empty(array.shape, dtype=array.dtype, device=array.device))
         array.grad.zero_()
+
+
+def as_items(array: wp.array, dtype: type, count: int) -> wp.array:
+    """View every ``count`` items of the last dimension as one of another dtype; the remainder is left out."""
+    *lengths, last = array.shape
+    shape, strides = (*lengths, last // count), (*array.strides[:-1], count * array.strides[-1])
+    items = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
+    items.viewed = array  # the memory stays while the view does
+    return items

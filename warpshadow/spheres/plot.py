@@ -13,10 +13,7 @@ from warpshadow.spheres.sphere_set import Spheres
 
 def check_matplotlib() -> None:
     """Raise ImportError unless matplotlib is installed."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise ImportError(check.missing("a picture of spheres", "matplotlib", "plot")) from None
+    check.importable("matplotlib", "a picture of spheres", "matplotlib", "plot")
 
 
 def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:

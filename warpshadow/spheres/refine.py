@@ -336,7 +336,7 @@ class Refinement:
     RATE = 0.003  # learning rate of the centers of 64 spheres or fewer; ten times that for the logarithm of the radii
 
     def __init__(self, mesh: NormalizedMesh, receivers: FitReceivers, rng: np.random.Generator):
-        use_vector_registers(__name__)
+        use_vector_registers(__name__, mesh.device)
         self.mesh, self.receivers, self.rng, self.device = mesh, receivers, rng, mesh.device
         bundles = np.ascontiguousarray(receivers.directions.T, dtype=np.float32).reshape(3, -1, FIT_BUNDLE)
         self.directions = wp.array(bundles, dtype=_Bundle, device=self.device)

@@ -69,8 +69,7 @@ def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     Differentiable: transmittance.
     """
     device = transmittance.device
-    if device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, device)
     factors = [cached.index, as_chunks(cached.rows)]
 
     def forward(shading: wp.array) -> None:
@@ -113,8 +112,7 @@ def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
     Differentiable: transmittance.
     """
     device = transmittance.device
-    if device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, device)
     factors = [cached.index, as_chunks(cached.rows)]
 
     def multiply(values: wp.array, products: wp.array) -> None:

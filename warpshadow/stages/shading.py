@@ -186,8 +186,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     device = transfer.device
     count = light.shape[1]
     instances = common_batch({"transfer": transfer, "light": light})
-    if device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, device)
     channels = _channels(light)
     seen, lit = [transfer, as_chunks(transfer)], [channels, as_chunks(channels)]
     cost = _COEFFICIENT_COST * count
@@ -310,8 +309,7 @@ def shade_cells(
     cells, device = cell_inputs(transmittance, normals, directions), normals.device
     check.shape("light", light.shape, ("batch", len(directions)))
     check.finite_arrays({"light": light}, maximum=maximum)
-    if device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, device)
     inputs, cost = [cells, as_chunks(_channels(light))], _COEFFICIENT_COST * len(directions)
     return differentiable(
         lambda shading: launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost),

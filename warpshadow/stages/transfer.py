@@ -373,8 +373,7 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
     Differentiable: transmittance, normals.
     """
     cells, cost, device = cell_inputs(transmittance, normals, directions), _CELL_COST * len(directions), normals.device
-    if device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, device)
     return differentiable(
         lambda transfer: launch(
             _transfer_directions, normals.size, inputs=[cells], outputs=[as_chunks(transfer)], cost=cost

@@ -14,6 +14,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import as_items
 from warpshadow.device.parallel import split_row
 
 _COEFFICIENT_COST, _ROW_COST = 1.0, 8.0  # nanoseconds that a coefficient of a receiver takes, and a receiver beside
@@ -40,15 +41,6 @@ class ColoredTransfer:
 
 Quad = wp.types.vector(length=12, dtype=wp.float32)
 """Four colors after one another, which take a third of the time of four by themselves."""
-
-
-def _as_quads(colors: wp.array) -> wp.array:
-    """View vec3 of shape [row, column] as rows of whole quads; the remainder is left out."""
-    rows, columns = colors.shape
-    shape, strides = (rows, columns // 4), (colors.strides[0], 4 * colors.strides[1])
-    quads = wp.array(ptr=colors.ptr, dtype=Quad, shape=shape, strides=strides, device=colors.device)
-    quads.viewed = colors  # the memory stays while the view does
-    return quads
 
 
 @wp.kernel(enable_backward=False)
@@ -95,7 +87,7 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
 
     def times(matrix: wp.array, values: wp.array, plus: wp.array | None, products: wp.array) -> None:
         cost = _COEFFICIENT_COST * matrix.shape[1] + _ROW_COST
-        inputs = [matrix, _as_quads(matrix), values, _as_quads(values), plus]
+        inputs = [matrix, as_items(matrix, Quad, 4), values, as_items(values, Quad, 4), plus]
         launch(_multiply, products.size, inputs=inputs, outputs=[products], cost=cost)
 
     return differentiable(

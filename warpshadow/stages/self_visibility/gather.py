@@ -26,6 +26,7 @@ from warpshadow.device.lanes import (
     use_vector_registers,
 )
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import as_items
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
@@ -33,7 +34,7 @@ from warpshadow.stages.self_visibility.trace import VisibilityRows
 
 _LOOKUP_COST = 0.2  # nanoseconds that a lookup takes
 _MEAN_LOOKUPS = 6  # lookups of a cell, for the cost
-_WORD = wp.constant(4)  # coarse cells of a word of 32 bits
+_WORD = 4  # coarse cells of a word of 32 bits
 
 
 @wp.struct
@@ -272,14 +273,6 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
     return gather_adjoint
 
 
-def _as_words(cells: wp.array) -> wp.array:
-    """View rows of bytes as rows of words."""
-    row_count, count = cells.shape
-    words = wp.array(ptr=cells.ptr, dtype=wp.uint32, shape=(row_count, count // _WORD), device=cells.device)
-    words.viewed = cells  # the memory stays while the view does
-    return words
-
-
 def gather_self_transmittance(
     normals: wp.array, places: ProbeWeights, lookup: ResamplingWeights, kernels: ResamplingKernels, rows: VisibilityRows
 ) -> wp.array:
@@ -301,7 +294,7 @@ def gather_self_transmittance(
     if places.weights.requires_grad:
         places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
     lanes = lane_count(normals.device)
-    words = _as_words(rows.cells)
+    words = as_items(rows.cells, wp.uint32, _WORD)
     inputs = GatherInputs()
     inputs.normals, inputs.rows, inputs.place_weights = normals, *places
     inputs.directions, inputs.looks_at_rays = kernels.directions, kernels.looks_at_rays
@@ -345,8 +338,7 @@ def _add_products(
 
 def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
     """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
-    if own.device.is_cpu:
-        use_vector_registers(__name__)
+    use_vector_registers(__name__, own.device)
 
     def add_product(first: wp.array, second: wp.array, total: wp.array) -> None:
         launch(
