@@ -17,6 +17,8 @@ from typing import ParamSpec, TypeGuard, TypeVar
 import numpy as np
 import warp as wp
 
+from warpshadow.device.memory import zeros
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -382,7 +384,7 @@ def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[
 def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
     """The same by a kernel, with one readback."""
     device = next(iter(arrays.values())).device
-    faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
+    faults = zeros(len(arrays), dtype=wp.int32, device=device)
     for argument, (name, array) in enumerate(arrays.items()):
         values = _scalars(array)
         wp.launch(

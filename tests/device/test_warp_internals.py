@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import warp as wp
 from packaging.requirements import Requirement
@@ -41,16 +42,66 @@ def a_thread_has_a_tape_of_its_own():
     assert len(inner.launches) == 1 and not outer.launches
 
 
-def a_recorded_launch_can_be_copied_with_other_arguments():
-    values, other = (wp.full(4, -1, dtype=wp.int32, device="cpu") for _ in range(2))
-    command = wp.launch(_count_up, dim=4, inputs=[0], outputs=[values], device="cpu", record_cmd=True)
-    piece = warp_internals.resized_launch(command, [2])
-    piece.set_param_at_index(0, 1)
-    piece.set_param_at_index(1, other)
-    piece.launch()
-    assert other.numpy().tolist() == [-1, 1, 1, -1] and values.numpy().tolist() == [-1] * 4
-    command.launch()
-    assert values.numpy().tolist() == [0] * 4
+@wp.struct
+class _Scaled:
+    values: wp.array(dtype=wp.float32)
+    factor: float
+
+
+@wp.kernel
+def _fill(
+    first: int,
+    is_shifted: bool,
+    offset: wp.vec3,
+    scaled: _Scaled,
+    missing: wp.array(dtype=wp.float32),
+    results: wp.array2d(dtype=wp.float32),
+):
+    row, column = wp.tid()
+    value = scaled.factor * scaled.values[row] + offset[column]
+    if is_shifted:
+        value += float(first)
+    if not missing:
+        results[row, column] = value
+
+
+def _filled(launch) -> tuple[np.ndarray, np.ndarray]:
+    """Results of a launch of a kernel with arguments of all kinds, and a gradient by its adjoint."""
+    scaled = _Scaled()
+    scaled.values = wp.array([1.0, 2.0, 4.0], dtype=wp.float32, device="cpu", requires_grad=True)
+    scaled.factor = 0.5
+    results = wp.empty((3, 2), dtype=wp.float32, device="cpu", requires_grad=True)
+    arguments = [7, True, wp.vec3(10.0, 20.0, 30.0), scaled, None, results]
+    launch(arguments, None)
+    results.grad.assign(np.arange(6).reshape(3, 2))
+    gradient = wp.Tape().get_adjoint(scaled)
+    launch(arguments, [None, None, None, gradient, None, results.grad])
+    return results.numpy(), scaled.values.grad.numpy()
+
+
+def kernels_take_their_arguments_as_warp_passes_them():
+    device = wp.get_device("cpu")
+
+    def by_warp(arguments, gradients):
+        options = {} if gradients is None else {"adj_inputs": gradients, "adjoint": True}
+        wp.launch(_fill, dim=(3, 2), inputs=arguments, device=device, **options)
+
+    def directly(arguments, gradients):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(wp, "launch", None)
+            warp_internals.run_kernel(_fill, (3, 2), arguments, device, gradients=gradients)
+
+    expected, found = _filled(by_warp), _filled(directly)
+    assert expected[0].tolist() == [[17.5, 27.5], [18, 28], [19, 29]] and expected[1].tolist() == [0.5, 2.5, 4.5]
+    assert all(map(np.array_equal, expected, found))
+
+
+def arguments_of_a_wrong_type_are_refused():
+    values = wp.zeros(3, dtype=wp.float32, device="cpu")
+    for arguments in ([0, values], [0, wp.zeros((3, 1), dtype=wp.int32, device="cpu")], [0.5, "text"], [0]):
+        with pytest.raises(RuntimeError, match="Error launching kernel"):
+            warp_internals.run_kernel(_count_up, (3,), arguments, wp.get_device("cpu"))
+    assert not values.numpy().any()
 
 
 def a_dtype_says_of_what_its_items_are():
@@ -103,7 +154,8 @@ def check(works):
     "works",
     [
         a_thread_has_a_tape_of_its_own,
-        a_recorded_launch_can_be_copied_with_other_arguments,
+        kernels_take_their_arguments_as_warp_passes_them,
+        arguments_of_a_wrong_type_are_refused,
         a_dtype_says_of_what_its_items_are,
         views_know_that_they_are_views,
         modules_list_their_kernels,

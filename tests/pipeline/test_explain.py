@@ -11,6 +11,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
+from warpshadow.device import warp_internals
 from warpshadow.device.batch import expand
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.pipeline import directional as directional_method
@@ -109,7 +110,7 @@ def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
     view = fresh.view(geometry)
     np.testing.assert_array_equal(known, fresh.draw(view=view).numpy())
     np.testing.assert_array_equal(free, fresh.draw(light, view=view).numpy())
-    monkeypatch.setattr(wp, "launch", None)
+    monkeypatch.setattr(warp_internals, "run_kernel", None)
     assert renderer.shade(view=renderer.view(geometry)) is renderer.shade(view=renderer.view(geometry))
 
 
@@ -122,7 +123,7 @@ def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch
         scenes = renderer.shade()
         np.testing.assert_array_equal(first.numpy(), SceneRenderer(scene_of(method)).shade(light).numpy())
         with monkeypatch.context() as patch:
-            patch.setattr(wp, "launch", None)
+            patch.setattr(warp_internals, "run_kernel", None)
             assert renderer.shade(light) is first and renderer.shade() is scenes
     coefficients *= 2
     assert_near(renderer.shade(coefficients).numpy(), 2 * first.numpy())
@@ -501,13 +502,13 @@ class Launches:
 
     def __init__(self, monkeypatch):
         self.counts: Counter = Counter()
-        launch = wp.launch
+        run = warp_internals.run_kernel
 
-        def counted(kernel, *arguments, **options):
-            self.counts[stage_of(kernel, options["inputs"])] += 1
-            return launch(kernel, *arguments, **options)
+        def counted(kernel, dim, arguments, device, **options):
+            self.counts[stage_of(kernel, arguments)] += 1
+            run(kernel, dim, arguments, device, **options)
 
-        monkeypatch.setattr(wp, "launch", counted)
+        monkeypatch.setattr(warp_internals, "run_kernel", counted)
 
     def of(self, call, variables) -> tuple[set, set]:
         """Stages that a call launches, and those of its adjoint, which is asked for gradients to variables."""
@@ -672,7 +673,7 @@ def test_an_explanation_computes_nothing(monkeypatch):
     scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
     renderer = SceneRenderer(scene)
     monkeypatch.setattr(merged_scene, "scene_blockers", None)
-    monkeypatch.setattr(wp, "launch", None)
+    monkeypatch.setattr(warp_internals, "run_kernel", None)
     assert "up to 902 receivers × 14 spheres" in str(renderer.explain())
 
 

@@ -10,6 +10,7 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.basis import HarmonicBasis
+from warpshadow.device import warp_internals
 from warpshadow.pipeline import view as view_module
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
@@ -330,14 +331,14 @@ def test_gradients_of_backs_are_central_differences_of_the_image(method, receive
 def launches_of(monkeypatch, call) -> Counter:
     """Kernels that a call launches, with their numbers of threads."""
     counts: Counter = Counter()
-    launch = wp.launch
+    run = warp_internals.run_kernel
 
     def counted(kernel, dim, *arguments, **options):
         counts[kernel.key, str(dim)] += 1
-        return launch(kernel, dim, *arguments, **options)
+        run(kernel, dim, *arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(wp, "launch", counted)
+        patch.setattr(warp_internals, "run_kernel", counted)
         call()
     return counts
 

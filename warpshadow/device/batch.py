@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 
 
 def common_batch(arrays: Mapping[str, Any]) -> int:
@@ -63,7 +64,7 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
     """
     if instances is None:
         instances = common_batch({f"part {number}": part for number, part in enumerate(parts)})
-    whole = wp.empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
+    whole = empty((instances, sum(counts)), dtype=parts[0].dtype, device=parts[0].device)
     first = 0
     for part, count in zip(parts, counts, strict=True):
         launch(_make_copy(part.dtype), (instances, count), inputs=[part, first], outputs=[whole])

@@ -10,9 +10,10 @@ from typing import Any
 
 import warp as wp
 
+from warpshadow.device import warp_internals
 from warpshadow.device.memory import in_huge_pages, require_gradient
 from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
-from warpshadow.device.tape import record_adjoint
+from warpshadow.device.tape import record_adjoint, record_kernel
 from warpshadow.device.warp_internals import is_view, scalar_type
 
 
@@ -51,7 +52,10 @@ def launch(
             if output is not None:
                 _require_gradient(in_huge_pages(output), kernel)
     if cost is None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[*outputs, *sums], device=device, record_tape=is_wanted)
+        shape, arguments = (dim,) if isinstance(dim, int) else dim, [*inputs, *outputs, *sums]
+        warp_internals.run_kernel(kernel, shape, arguments, device)
+        if is_wanted:
+            record_kernel(kernel, shape, arguments, device)
         return
     launch_slices(kernel, dim, cost=cost, inputs=inputs, outputs=outputs, scratch=scratch, sums=sums, device=device)
     if is_wanted:

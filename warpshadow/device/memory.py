@@ -1,4 +1,4 @@
-"""Memory: huge pages for large arrays, and views of arrays.
+"""Memory: new arrays, huge pages for large ones, and views of arrays.
 
 Memory that is new to a process comes in pages of 4 kB, each of which stops the kernel that first writes to it. Of
 receivers × directions there are 100 MB: their pages took a fifth of a forward call on 64 small images, and a quarter of
@@ -8,9 +8,11 @@ one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them
 import ctypes
 import functools
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import warp as wp
+
+from warpshadow.device.warp_internals import new_array, set_gradient
 
 _HUGE = 2**21  # bytes of a huge page
 _LEAST = 2 * _HUGE  # bytes of an array that is worth asking
@@ -38,11 +40,24 @@ def in_huge_pages(array: wp.array) -> wp.array:
     return array
 
 
+def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
+    """Make an array of memory that nobody has written to: ``wp.empty``, but quicker."""
+    return new_array(shape, dtype, device if isinstance(device, wp.Device) else wp.get_device(device))
+
+
+def zeros(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
+    """Make an array of zeros: ``wp.zeros``, but quicker."""
+    array = empty(shape, dtype, device)
+    array.zero_()
+    return array
+
+
 def require_gradient(array: wp.array) -> None:
     """Let an array require a gradient, which is zero."""
     if not array.requires_grad:
-        array.grad = in_huge_pages(wp.empty(array.shape, dtype=array.dtype, device=array.device))
-        array.grad.zero_()
+        gradient = in_huge_pages(empty(array.shape, array.dtype, array.device))
+        gradient.zero_()
+        set_gradient(array, gradient)
 
 
 def as_items(array: wp.array, dtype: type, count: int) -> wp.array:

@@ -16,13 +16,15 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from warpshadow.device.warp_internals import resized_launch
+from warpshadow.device import warp_internals
+from warpshadow.device.memory import empty, zeros
+from warpshadow.device.tape import gradients_of
 
 ENVIRONMENT_VARIABLE = "WARPSHADOW_NUM_THREADS"
 
@@ -130,7 +132,7 @@ def launch_slices(
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
     rows = thread_count() if device.is_cpu else math.prod(_shape(dim))
-    before = [*inputs, *(wp.empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch), *outputs]
+    before = [*inputs, *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch), *outputs]
     summed = {place: array for place, array in enumerate(sums, 2 + len(before)) if array is not None}
     _launch_slices(kernel, dim, cost, [*before, *sums], summed, None, device)
 
@@ -151,7 +153,7 @@ def launch_adjoint_slices(
         shared: Inputs to whose gradients all rows add.
     """
     arguments = [*inputs, *outputs]
-    gradients = [value.grad if isinstance(value, wp.array) else wp.Tape().get_adjoint(value) for value in arguments]
+    gradients = gradients_of(arguments)
     summed = {
         place: value.grad
         for place, value in enumerate(inputs, 2)
@@ -178,33 +180,44 @@ def _launch_slices(
     Args:
         summed: What all rows add to, by the place of the argument that it is, or is the gradient of.
     """
-    dim, workers, is_adjoint = _shape(dim), thread_count(), gradients is not None
-    options: dict[str, Any] = {"inputs": [0, 0 if device.is_cpu else -1, *arguments], "device": device}
-    if gradients is not None:
-        options |= {"adj_inputs": [None, None, *gradients], "adjoint": True}
+    dim, workers = _shape(dim), thread_count()
+    arguments = [0, 0 if device.is_cpu else -1, *arguments]
+    gradients = None if gradients is None else [None, None, *gradients]
     maximum = _SLICES_PER_THREAD * workers
     if summed:  # as many for any number of threads
         maximum = min(_SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed.values()))))
     is_divisible = device.is_cpu and not device.is_capturing
     slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / _LEAST_WORK)) if is_divisible else 1
     if slice_count <= 1 or (not summed and workers == 1):
-        wp.launch(kernel, dim=dim, **options, record_tape=False)
+        warp_internals.run_kernel(kernel, dim, arguments, device, gradients=gradients)
         return
-    own = {place: wp.zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
-    command = wp.launch(kernel, dim=dim, **options, record_tape=False, record_cmd=True)
+    own = {place: zeros((slice_count, *array.shape), array.dtype, device=device) for place, array in summed.items()}
+    kernel.module.load(device, 1)  # compiled here, not by each thread
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
-    slices: list[wp.Launch] = []
+    slices: list[Callable[[int], None]] = []
     for number, (first, end) in enumerate(itertools.pairwise(starts)):
-        piece = resized_launch(command, [end - first, *dim[1:]])
-        piece.set_param_at_index(0, first)
+        values, adjoints = list(arguments), None if gradients is None else list(gradients)
         for place, parts in own.items():
-            if is_adjoint:
-                piece.set_param_at_index(place, _with_gradient(arguments[place - 2], parts[number]))
-            piece.set_param_at_index(place, parts[number], adjoint=is_adjoint)
-        slices.append(piece)
+            if adjoints is None:
+                values[place] = parts[number]
+            else:
+                values[place], adjoints[place] = _with_gradient(values[place], parts[number]), parts[number]
+        slices.append(functools.partial(_run_slice, kernel, (end - first, *dim[1:]), first, values, adjoints, device))
     _share(slices, workers)
     for place, parts in own.items():
         summed[place].numpy()[...] += parts.numpy().sum(axis=0)
+
+
+def _run_slice(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    first_row: int,
+    arguments: list[Any],
+    gradients: Sequence[Any] | None,
+    device: wp.Device,
+    worker: int,
+) -> None:
+    warp_internals.run_kernel(kernel, dim, [first_row, worker, *arguments[2:]], device, gradients=gradients)
 
 
 def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
@@ -213,8 +226,8 @@ def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
     return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 
 
-def _share(slices: Sequence[wp.Launch], workers: int) -> None:
-    """Run slices on the calling thread and the threads of the pool.
+def _share(slices: Sequence[Callable[[int], None]], workers: int) -> None:
+    """Run slices, which get the number of their thread, on the calling thread and the threads of the pool.
 
     Each begins with a part of its own, the same in every launch, so that rows stay in the caches of one core from
     kernel to kernel; one that is done takes over from the end of another's part. Threads that got no core before all
@@ -232,8 +245,7 @@ def _share(slices: Sequence[wp.Launch], workers: int) -> None:
                     piece = take()
                 except IndexError:
                     break
-                piece.set_param_at_index(1, worker)
-                piece.launch()
+                piece(worker)
 
     others = [_pool(workers).submit(work, worker) for worker in range(1, count)]
     try:

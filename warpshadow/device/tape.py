@@ -6,11 +6,13 @@ the process's, as they were.
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import warp as wp
 
-from warpshadow.device.warp_internals import current_tape, own_tape
+from warpshadow.device import warp_internals
+from warpshadow.device.warp_internals import current_tape, own_tape, verify_access
 
 
 @contextlib.contextmanager
@@ -39,6 +41,33 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
     requested = [array for array in arrays if array is not None and array.requires_grad]
     if tape is not None and requested:
         tape.record_func(adjoint, requested)
+
+
+def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any], device: wp.Device) -> None:
+    """Record Warp's adjoint of a kernel that was launched on the tape that is recording, if one is."""
+    tape = current_tape()
+    if tape is None:
+        return
+    gradients_of(arguments, tape)  # which the tape zeroes
+
+    def play_back() -> None:
+        warp_internals.run_kernel(kernel, dim, arguments, device, gradients=gradients_of(arguments))
+
+    tape.record_func(play_back, [])
+    verify_access(tape, kernel, arguments)
+
+
+def gradients_of(arguments: Sequence[Any], tape: wp.Tape | None = None) -> list[Any]:
+    """Gradients of a kernel's arguments, None of an argument that has none; a tape that is given keeps them, too."""
+    tape = tape or wp.Tape()
+    return [
+        (tape.get_adjoint(value) if value.requires_grad else None)
+        if type(value) is wp.array
+        else None
+        if value is None or isinstance(value, (int, float))
+        else tape.get_adjoint(value)
+        for value in arguments
+    ]
 
 
 def record(function: Callable[[], None]) -> None:

@@ -5,7 +5,8 @@ have passed it.
 """
 
 import contextlib
-import copy
+import ctypes
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -53,13 +54,161 @@ def own_tape(tape: wp.Tape | None) -> Iterator[None]:
         own.pop()
 
 
-def resized_launch(command: wp.Launch, dim: Sequence[int]) -> wp.Launch:
-    """Copy a recorded launch, with other dimensions and arguments of its own."""
-    copied = copy.copy(command)
-    copied.params, copied.fwd_args = list(command.params), list(command.fwd_args)
-    copied.adj_args = None if command.adj_args is None else list(command.adj_args)
-    copied.set_dim(list(dim))
-    return copied
+_types = wp._src.types
+
+_NO_ARRAY = _types.array_t()
+"""The descriptor of an argument None."""
+
+
+@functools.cache
+def _cpu_signature(kernel: wp.Kernel) -> tuple[type, type, list[Any], dict] | None:
+    """How a CPU kernel takes its arguments.
+
+    Returns:
+        Structs of the arguments and of their gradients; dtype and dimensions of each array, None of a struct, and ()
+        of other values; and the loaded module with its entry points, as soon as one is. None for a kernel that Warp
+        itself has to launch.
+    """
+    if kernel.is_generic or not kernel.uses_warp_entry_point_abi:
+        return None
+    fields, kinds = [], []
+    for number, argument in enumerate(kernel.adj.args):
+        kind = argument.type
+        if _types.is_array(kind):
+            if type(kind) is not wp.array:
+                return None
+            field, known = _types.array_t, (kind.dtype, kind.ndim)
+        elif isinstance(kind, wp._src.codegen.Struct):
+            field, known = kind.ctype, None
+        elif isinstance(kind, type) and issubclass(kind, ctypes.Array):
+            field, known = kind, ()
+        elif kind in (wp.bool, wp.int32, wp.uint32, wp.int64, wp.uint64, wp.float32, wp.float64):
+            field, known = kind._type_, ()
+        else:
+            return None
+        fields.append((f"argument_{number}", field))
+        kinds.append(known)
+    structs = (type(name, (ctypes.Structure,), {"_fields_": fields}) for name in ("Arguments", "Gradients"))
+    return (*structs, kinds, {})
+
+
+def _packed(kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+    """Values as fields of a struct of arguments.
+
+    Raises:
+        TypeError: for an array that is not of the dtype and dimensions.
+    """
+    fields = []
+    for kind, value in zip(kinds, values, strict=True):
+        if kind is None:
+            fields.append(value.__ctype__())
+        elif not kind:
+            fields.append(value)
+        elif value is None:
+            fields.append(_NO_ARRAY)
+        elif type(value) is wp.array and value.dtype is kind[0] and value.ndim == kind[1]:
+            fields.append(value.ctype or value.__ctype__())
+        else:
+            raise TypeError
+    return fields
+
+
+@functools.lru_cache(maxsize=4096)
+def _cpu_bounds(dim: tuple[int, ...], kernel_dimensions: int) -> Any:
+    return ctypes.byref(wp._src.context._build_launch_bounds_from_tuple(dim, kernel_dimensions))
+
+
+def run_kernel(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    arguments: Sequence[Any],
+    device: wp.Device,
+    *,
+    gradients: Sequence[Any] | None = None,
+) -> None:
+    """Launch a kernel off the tape, or its adjoint where gradients of its arguments are given.
+
+    On a CPU arguments go straight to the compiled function: ``wp.launch`` takes ten times as long to look at them as
+    small kernels run. Warp launches what is unusual, such as an argument of a wrong type, of which it tells.
+    """
+    context, config = wp._src.context, wp.config
+    signature = _cpu_signature(kernel) if device.is_cpu else None
+    is_plain = context.runtime._apic_capture is None and not config.print_launches
+    if signature is not None and is_plain and (fields := _fields(signature, arguments, gradients)) is not None:
+        dim = tuple(dim)
+        if 0 in dim:
+            return
+        executable = kernel.module.load(device, 1)
+        if signature[3].get("executable") is not executable:
+            signature[3].update(executable=executable, hooks=executable.get_kernel_hooks(kernel))
+        hooks, bounds = signature[3]["hooks"], _cpu_bounds(dim, kernel.adj.kernel_dim)
+        if gradients is None:
+            hooks.forward(bounds, ctypes.byref(fields[0]))
+        else:
+            hooks.backward(bounds, *map(ctypes.byref, fields))
+        return
+    options = {} if gradients is None else {"adj_inputs": gradients, "adjoint": True}
+    wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False, **options)
+
+
+def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any] | None) -> list[Any] | None:
+    """Structs of arguments, and of their gradients if there are any; None where they are not as the kernel's are."""
+    arguments_type, gradients_type, kinds, _ = signature
+    if len(arguments) != len(kinds):
+        return None
+    try:
+        fields = [arguments_type(*_packed(kinds, arguments))]
+        if gradients is not None:
+            pairs = zip(kinds, gradients_type._fields_, gradients, strict=True)
+            values = [field() if not kind and value is None else value for kind, (_, field), value in pairs]
+            fields.append(gradients_type(*_packed(kinds, values)))
+    except (TypeError, AttributeError):
+        return None
+    return fields
+
+
+@functools.lru_cache(maxsize=4096)
+def _cpu_array(shape: Any, dtype: type) -> tuple[dict[str, Any], bytes, int]:
+    """Attributes of a new CPU array but for its memory, its descriptor, and its bytes, 0 where Warp is to make it."""
+    array = wp.empty(shape, dtype, device="cpu")
+    attributes = dict(vars(array)) | {"deleter": _free}
+    return attributes, bytes(array.__ctype__()), array.capacity if array.is_contiguous else 0
+
+
+def _free(pointer: int, size: int) -> None:
+    wp._src.context.runtime.core.wp_free_host(pointer)
+
+
+def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
+    """Make an array of memory that nobody has written to, as ``wp.empty`` does in three times the time."""
+    runtime = wp._src.context.runtime
+    if not device.is_cpu or runtime._apic_capture is not None:
+        return wp.empty(shape, dtype, device=device)
+    attributes, descriptor, size = _cpu_array(shape if isinstance(shape, int) else tuple(shape), dtype)
+    pointer = runtime.core.wp_alloc_host(size, None) if size else None
+    if not pointer:
+        return wp.empty(shape, dtype, device=device)
+    array = object.__new__(wp.array)
+    own = array.__dict__
+    own.update(attributes)
+    own["ptr"], own["ctype"] = pointer, _types.array_t.from_buffer_copy(descriptor)
+    own["ctype"].data = pointer
+    return array
+
+
+def set_gradient(array: wp.array, gradient: wp.array) -> None:
+    """Give an array a gradient of its own shape and dtype that was made for it."""
+    if array.ctype is None or not gradient.ptr:
+        array.grad = gradient
+        return
+    array._grad, array._requires_grad = gradient, True
+    array.ctype.grad = gradient.ptr
+
+
+def verify_access(tape: wp.Tape, kernel: wp.Kernel, arguments: Sequence[Any]) -> None:
+    """Warn of arrays that a recorded kernel writes to although another has read them, where Warp is to look for it."""
+    if wp.config.verify_autograd_array_access:
+        tape._check_kernel_array_access(kernel, arguments)
 
 
 def item_shape(dtype: type) -> tuple[int, ...]:

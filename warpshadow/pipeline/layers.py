@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.view import View
 from warpshadow.stages import film
@@ -96,12 +97,12 @@ def find_layer_arrays(view: View, size: tuple[int, int], *, supersampling: int) 
     if merged_scene.two_sided_faces.size:
         centers = find_sides(centers, merged_scene.faces, merged_scene.two_sided_faces, vertices, cameras)
     faces = centers.face_ids.numpy()
-    depths = wp.empty(clip.shape, dtype=wp.float32, device=device)
+    depths = empty(clip.shape, dtype=wp.float32, device=device)
     launch(_take_depths, clip.shape, inputs=[clip], outputs=[depths])
     sums = interpolate(centers, merged_scene.faces, view.normals.value(call))
     is_back = np.zeros(faces.shape, bool) if centers.sides is None else centers.sides.numpy() != faces
     signs = wp.array(np.broadcast_to(np.where(is_back, -1, 1), sums.shape), dtype=wp.float32, device=device)
-    normals = wp.empty(sums.shape, dtype=wp.vec3, device=device)
+    normals = empty(sums.shape, dtype=wp.vec3, device=device)
     launch(_orient, sums.shape, inputs=[sums, signs], outputs=[normals])
     bodies = wp.array(_bodies_of(merged_scene, faces), dtype=wp.int32, device=device)
     return LayerArrays(

@@ -9,6 +9,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import expand_rows
+from warpshadow.device.memory import zeros
 from warpshadow.maths import sh
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Transmittance
@@ -75,7 +76,7 @@ class LogSH(SphereMethod):
         if radii.shape[1]:
             log = self._logs(*group[:4], skip=group.skip, clusters=group.clusters)
         else:
-            log = wp.zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
+            log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:
             add_rows(cached_rows, log)
         return Transmittance(exponential.exponentiate(log, base=self.visibility.base))
@@ -101,7 +102,7 @@ class LogSH(SphereMethod):
         """
         if group.cached_rows is not None and group.cached_rows.rows.shape[1] == 2:
             assert seen.transmittance_total is not None
-            lobes = wp.zeros(seen.transmittance_total.shape, dtype=wp.float32, device=seen.transmittance_total.device)
+            lobes = zeros(seen.transmittance_total.shape, dtype=wp.float32, device=seen.transmittance_total.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
         if group.self_lookup is None or not group.points.size:

@@ -11,6 +11,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, concatenate
+from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.scene.blockers import scene_blockers
@@ -328,7 +329,7 @@ class MergedScene:
         if runs == [(0, spheres[1].shape[1])]:
             return spheres
         if not runs:
-            centers, radii = (wp.empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
+            centers, radii = (empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
             return centers, radii
         counts = [end - first for first, end in runs]
         centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)

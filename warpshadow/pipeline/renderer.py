@@ -17,6 +17,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.batch import common_batch
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.memory import empty
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
@@ -744,7 +745,7 @@ class SceneRenderer:
             view = self._own_view
             call = self._call(view)
             receivers = Node("", Receivers.without_owners, view.receivers_node)
-            none = tuple(wp.empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
+            none = tuple(empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
             spheres = Input("spheres", none)
             free = LitPoints(others._method, others._materials, self._vertices, spheres, receivers, call)
             images = (view.white_image(item.shading(None)).value(call) for item in (view, free))

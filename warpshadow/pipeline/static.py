@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.memory import empty
 from warpshadow.pipeline.merged_scene import Geometry, MergedScene, exchanged
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.stages.cached_cells import CachedRows
@@ -150,7 +151,7 @@ class StaticBodies:
 
 def _first_instance(array: wp.array) -> wp.array:
     """A copy of the first instance, which is there even where it is empty."""
-    first = wp.empty((1, *array.shape[1:]), dtype=array.dtype, device=array.device)
+    first = empty((1, *array.shape[1:]), dtype=array.dtype, device=array.device)
     if array.size:
         wp.copy(first, array[:1])
     return first
@@ -198,7 +199,7 @@ class VertexRows:
         count = self._count + rows.shape[0]
         if self._rows is None or self._rows.shape[0] < count:
             room = min(max(2 * self._count, count), self._most)
-            larger = wp.empty((room, *rows.shape[1:]), dtype=wp.float32, device=rows.device)
+            larger = empty((room, *rows.shape[1:]), dtype=wp.float32, device=rows.device)
             if self._rows is not None:
                 wp.copy(larger[: self._count], self._rows[: self._count])
             self._rows = larger

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, signed_distance
@@ -169,14 +170,14 @@ def cover_energy(
     device = mesh.device
     balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=device)
     shape = (len(spheres), len(samples))
-    volumes = wp.empty(shape, dtype=wp.float32, device=device)
-    by_volume = wp.empty(shape, dtype=wp.vec4, device=device)
+    volumes = empty(shape, dtype=wp.float32, device=device)
+    by_volume = empty(shape, dtype=wp.vec4, device=device)
     inputs = [mesh.mesh.id, mesh.is_sheet, balls, wp.array(samples.astype(np.float32), dtype=wp.vec3, device=device)]
     launch(_outside_volume, shape, inputs=inputs, outputs=[volumes, by_volume], cost=_QUERY_COST)
 
-    gaps = wp.empty(len(points), dtype=wp.float32, device=device)
-    nearest = wp.empty(len(points), dtype=wp.int32, device=device)
-    by_gap = wp.empty(len(points), dtype=wp.vec4, device=device)
+    gaps = empty(len(points), dtype=wp.float32, device=device)
+    nearest = empty(len(points), dtype=wp.int32, device=device)
+    by_gap = empty(len(points), dtype=wp.vec4, device=device)
     inputs = [wp.array(points.astype(np.float32), dtype=wp.vec3, device=device), balls]
     launch(_bare_gaps, len(points), inputs=inputs, outputs=[gaps, nearest, by_gap])
 

@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.assets.topology import CREASE, join_faces, part_at_creases, rounds_edges
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.normals import vertex_normals
 
@@ -142,7 +143,7 @@ class NormalizedMesh:
         inside = points[self.signed_distances(points)[0] < 0]
         if not len(inside):
             return True
-        counts = wp.empty(len(inside), dtype=wp.int32, device=self.device)
+        counts = empty(len(inside), dtype=wp.int32, device=self.device)
         array = partial(wp.array, dtype=wp.vec3, device=self.device)
         inputs = [self.mesh.id, array(inside.astype(np.float32)), array(fibonacci(_RAYS).astype(np.float32))]
         launch(_count_escaping, len(inside), inputs=inputs, outputs=[counts])
@@ -180,8 +181,8 @@ class NormalizedMesh:
         return self._distances(points, self.is_sheet)
 
     def _distances(self, points: np.ndarray, is_sheet: bool) -> tuple[np.ndarray, np.ndarray]:
-        distances = wp.empty(len(points), dtype=wp.float32, device=self.device)
-        slopes = wp.empty(len(points), dtype=wp.vec3, device=self.device)
+        distances = empty(len(points), dtype=wp.float32, device=self.device)
+        slopes = empty(len(points), dtype=wp.vec3, device=self.device)
         inputs = [self.mesh.id, is_sheet, wp.array(points.astype(np.float32), dtype=wp.vec3, device=self.device)]
         launch(_signed_distances, len(points), inputs=inputs, outputs=[distances, slopes])
         return distances.numpy().astype(np.float64), slopes.numpy().astype(np.float64)

@@ -5,6 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.visibility.cones import BLEND, make_cone
 
@@ -70,7 +71,7 @@ def exact_occlusion(points: wp.array, directions: wp.array, centers: wp.array, r
     check.shape("directions", directions.shape, ("direction",))
     check.shape("centers", centers.shape, (points.shape[0], "sphere"))
     check.shape("radii", radii.shape, centers.shape)
-    occlusion = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
+    occlusion = empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     inputs = [points, directions, centers, radii]
     cost = _TEST_COST * max(1, radii.shape[1])
     launch(_exact_occlusion, (points.size, *directions.shape), inputs=inputs, outputs=[occlusion], cost=cost)

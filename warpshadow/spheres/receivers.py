@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 
@@ -82,7 +83,7 @@ class FitReceivers:
         self.directions = hemisphere(self.DIRECTIONS)  # directions in the frame of each receiver [direction, 3]
         self.lights = _light_metric(self.directions)
         array = partial(wp.array, device=mesh.device)
-        visibility = wp.empty((count, self.DIRECTIONS), dtype=wp.uint8, device=mesh.device)
+        visibility = empty((count, self.DIRECTIONS), dtype=wp.uint8, device=mesh.device)
         rays = array(self.directions.astype(np.float32), dtype=wp.vec3)
         starts = array(points.astype(np.float32), dtype=wp.vec3), array(frames, dtype=wp.mat33)
         inputs = [mesh.mesh.id, *starts, rays]

@@ -24,6 +24,7 @@ from warpshadow.device.lanes import (
     vectors_type,
 )
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import bundle_cones
 from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
@@ -350,7 +351,7 @@ class Refinement:
         placed = wp.array(places, dtype=lane_type(lanes), device=self.device)
         balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
         shape = len(groups), len(spheres)
-        outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
+        outputs = [empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
         launch(
             _make_project(lanes),
             (placed.shape[1], len(spheres)),
@@ -362,7 +363,7 @@ class Refinement:
 
     def _see_through(self, view: _View) -> np.ndarray:
         count, sphere_count = view.axes.shape
-        transmittance = wp.empty((count, self.directions.shape[1]), dtype=_Bundle, device=self.device)
+        transmittance = empty((count, self.directions.shape[1]), dtype=_Bundle, device=self.device)
         launch(
             _transmit,
             transmittance.shape,
@@ -391,13 +392,13 @@ class Refinement:
         loss, by_errors = self._loss(passing, chosen)
         upstream[: len(chosen)] = (by_errors @ self.receivers.lights.T) * passing
         by_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
-        sums = wp.empty(view.axes.shape, dtype=_Sums, device=self.device)
+        sums = empty(view.axes.shape, dtype=_Sums, device=self.device)
         inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
         # every group of receivers has a gradient of its own: sums in a fixed order give the same bits on every run
         shape = view.places.shape[1], len(spheres)
-        by_balls = wp.empty(shape, dtype=wp.vec4, device=self.device)
+        by_balls = empty(shape, dtype=wp.vec4, device=self.device)
         inputs = [view.places, view.balls, np.cos(width), np.sin(width), view.edges, sums]
         lanes = lane_count(self.device)
         launch(_make_pull(lanes), shape, inputs=inputs, outputs=[by_balls], cost=2 * _SPHERE_COST * lanes)

@@ -5,6 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
 
@@ -159,6 +160,6 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
             inputs=[*inputs, rows(adj_barycentrics)],
             sums=[clip_positions.grad],
         ),
-        result=wp.zeros(face_ids.shape, dtype=wp.vec3, device=device),
+        result=zeros(face_ids.shape, dtype=wp.vec3, device=device),
         variables=[clip_positions],
     )

@@ -19,6 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 
 _REACH = 2.0  # a sphere follows vertices within so many radii, or distances of the nearest one if that is more
 _LEAST = 12  # and this many at least, or all
@@ -151,11 +152,11 @@ class SphereBinding:
         check.finite_arrays(arguments)
         shape, device = (common_batch(arguments), len(self.first) - 1), positions.device
         bound = [self.first, self.vertices]
-        centers = wp.empty(shape, dtype=wp.vec3, device=device)
+        centers = empty(shape, dtype=wp.vec3, device=device)
         inputs = [*bound, self.weights, positions, rest_positions, rest_centers]
         launch(_move_centers, shape, inputs=inputs, outputs=[centers])
         rest_spreads = self._spreads(rest_positions, rest_centers)
-        radii = wp.empty(shape, dtype=wp.float32, device=device)
+        radii = empty(shape, dtype=wp.float32, device=device)
         inputs = [rest_radii, rest_spreads, self._spreads(positions, centers), _SOFT]
         launch(_grow_radii, shape, inputs=inputs, outputs=[radii])
         return centers, radii
@@ -163,7 +164,7 @@ class SphereBinding:
     def _spreads(self, positions: wp.array, centers: wp.array) -> wp.array:
         """Mean square distances of vertices from centers, float32 of shape [batch, sphere]."""
         shape = max(len(positions), len(centers)), centers.shape[1]
-        spreads = wp.empty(shape, dtype=wp.float32, device=positions.device)
+        spreads = empty(shape, dtype=wp.float32, device=positions.device)
         inputs = [self.first, self.vertices, self.shares, positions, centers]
         launch(_sum_spreads, shape, inputs=inputs, outputs=[spreads])
         return spreads

@@ -6,6 +6,7 @@ import warp as wp
 
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 
 
 class CachedRows(NamedTuple):
@@ -79,7 +80,7 @@ def light_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
         outputs = [as_chunks(transmittance.grad)]
         launch(_light_cells_adjoint, adj_shading.shape, inputs=[*factors, adj_shading], outputs=outputs)
 
-    shading = wp.empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
+    shading = empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
     return differentiable(forward, adjoint, shading, variables=[transmittance])
 
 
@@ -122,7 +123,7 @@ def cell_transfer(transmittance: wp.array, cached: CachedRows) -> wp.array:
     return differentiable(
         lambda transfer: multiply(transmittance, transfer),
         lambda adj_transfer: multiply(adj_transfer, transmittance.grad),
-        result=wp.zeros(transmittance.shape, dtype=wp.float32, device=device),
+        result=zeros(transmittance.shape, dtype=wp.float32, device=device),
         variables=[transmittance],
     )
 

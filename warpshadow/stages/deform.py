@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.threads import one_at_a_time
 
 _SHARED = 0.02  # points that two neighboring nodes carry together, as a fraction of a node's points
@@ -157,7 +158,7 @@ class DeformationGraph:
         """
         self._check(matrices, translations)
         inputs = [self.rest, self.nodes, self.weights, self.node_positions, matrices, translations]
-        deformed = wp.empty((matrices.shape[0], self.rest.shape[0]), dtype=wp.vec3, device=matrices.device)
+        deformed = empty((matrices.shape[0], self.rest.shape[0]), dtype=wp.vec3, device=matrices.device)
         launch(_deform_points, deformed.shape, inputs=inputs, outputs=[deformed])
         return deformed
 
@@ -200,7 +201,7 @@ class DeformationGraph:
 
 def _energy(names: str, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[wp.array]) -> wp.array:
     """Launch a kernel whose threads add to the energy of their instance; ValueError where that is no float32."""
-    energy = wp.zeros(dim[0], dtype=wp.float32, device=inputs[0].device)
+    energy = zeros(dim[0], dtype=wp.float32, device=inputs[0].device)
     launch(kernel, dim, inputs=inputs, outputs=[energy])
     if not energy.device.is_capturing and not np.isfinite(energy.numpy()).all():
         raise ValueError(f"{names}: got an energy beyond float32's range, expected smaller numbers")

@@ -5,6 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.rasterize import Fragments
@@ -58,7 +59,7 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
     check.shape("albedo", albedo.shape, ("batch", height, width))
     count = common_batch({"fragments": fragments.face_ids, "shading": shading, "albedo": albedo})
     run = run_length(shading.device, width)
-    samples = wp.zeros((count, height * width), dtype=wp.vec4, device=shading.device)
+    samples = zeros((count, height * width), dtype=wp.vec4, device=shading.device)
     launch(
         _radiance,
         run_dimensions(shading.device, height * width // run, count),
@@ -100,7 +101,7 @@ def average(samples: wp.array, supersampling: int) -> wp.array:
     if supersampling == 1:
         return samples
     batch_count, height, width = samples.shape[0], samples.shape[1] // supersampling, samples.shape[2] // supersampling
-    pixels = wp.empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
+    pixels = empty((batch_count * height, width), dtype=wp.vec4, device=samples.device)
     parts = samples.reshape((batch_count * height, supersampling, width, supersampling))
     launch(_average, pixels.shape, inputs=[parts, supersampling], outputs=[pixels])
     return pixels.reshape((batch_count, height, width))

@@ -12,6 +12,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import zeros
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.rasterize import Fragments
@@ -100,7 +101,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     device, width = face_ids.device, face_ids.shape[2]
     run = run_length(device, width)
-    image = wp.zeros((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
+    image = zeros((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
     launch(
         _make_interpolate(attributes.dtype),
         run_dimensions(device, face_ids[0].size // run, instances),

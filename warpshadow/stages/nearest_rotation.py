@@ -6,6 +6,7 @@ It is a file, and so a module of Warp's, of its own: the singular value decompos
 import warp as wp
 
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 
 
 @wp.kernel(enable_backward=False)
@@ -60,7 +61,7 @@ def nearest_rotations(matrices: wp.array) -> wp.array:
     Differentiable: matrices.
     """
     # the caller may overwrite the gradients that it gets
-    cached = wp.empty(matrices.shape, dtype=wp.mat33, device=matrices.device)
+    cached = empty(matrices.shape, dtype=wp.mat33, device=matrices.device)
 
     def forward(rotations: wp.array) -> None:
         launch(_nearest_rotations, matrices.shape, inputs=[matrices], outputs=[rotations, cached])

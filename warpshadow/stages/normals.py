@@ -6,6 +6,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 
 _THINNEST = 1.0e-12  # faces of a smaller height, in their length, have no area: there gradients could overflow
 _SHORTEST = 1.0e-20  # so have faces of shorter edges [scene units]
@@ -130,7 +131,7 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
     """
     check.finite_arrays({"positions": positions})
     device, shape = positions.device, positions.shape
-    sums = wp.zeros(shape, dtype=wp.vec3d, device=device)
+    sums = zeros(shape, dtype=wp.vec3d, device=device)
     by_face, by_vertex = (shape[0], faces.shape[0]), shape
 
     def forward(normals: wp.array) -> None:
@@ -138,9 +139,9 @@ def vertex_normals(positions: wp.array, faces: wp.array) -> wp.array:
         launch(_normalize, by_vertex, inputs=[sums], outputs=[normals], cost=_VERTEX_COST)
 
     def adjoint(adj_normals: wp.array) -> None:
-        adj_sums = wp.empty(shape, dtype=wp.vec3d, device=device)
+        adj_sums = empty(shape, dtype=wp.vec3d, device=device)
         launch(_normalize_adjoint, by_vertex, inputs=[sums, adj_normals], outputs=[adj_sums], cost=_VERTEX_COST)
         inputs = [positions, faces, adj_sums]
         launch(_sum_face_normals_adjoint, by_face, inputs=inputs, outputs=[positions.grad], cost=2 * _FACE_COST)
 
-    return differentiable(forward, adjoint, wp.empty(shape, dtype=wp.vec3, device=device), variables=[positions])
+    return differentiable(forward, adjoint, empty(shape, dtype=wp.vec3, device=device), variables=[positions])

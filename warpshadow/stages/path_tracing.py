@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_tracing import RAY_COST, escapes, mesh_id, nearest, parts
@@ -178,7 +179,7 @@ def trace_bounces(
     count = samples.directions.shape[1]
     directions = wp.array(samples.directions.reshape(-1, 3), dtype=wp.vec3, device=device)
     radiance = wp.array(count / np.pi * samples.radiance.reshape(-1, 3), dtype=wp.vec3, device=device)
-    light = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    light = empty(points.shape, dtype=wp.vec3, device=device)
     traced, cost = _struct(surfaces), 2 * bounces * paths
     for part in parts(points.shape[0], 2**20 // cost, progress):
         launch(

@@ -20,6 +20,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 
 _FLOOR = 1.0 / 256.0
 
@@ -96,7 +97,7 @@ def find_ratio_image(face_ids: wp.array, catches: wp.array, reflected: wp.array,
     means = np.maximum(received[..., :3], 0).sum(axis=(1, 2, 3), dtype=np.float64) / (3 * covered)
     floors = wp.array(_FLOOR * means, dtype=float, device=device)
     size = count, face_ids[0].size
-    parts = [wp.empty(size, dtype=dtype, device=device) for dtype in (wp.vec3, wp.vec3, wp.vec4)]
+    parts = [empty(size, dtype=dtype, device=device) for dtype in (wp.vec3, wp.vec3, wp.vec4)]
     launch(_divide, size, inputs=[rows(face_ids), catches, rows(reflected), rows(unshadowed), floors], outputs=parts)
     return RatioImage(*(part.reshape((count, *face_ids.shape[1:])) for part in parts))
 
@@ -148,7 +149,7 @@ def over_nothing(drawn: wp.array, caught: wp.array, rest: wp.array) -> wp.array:
         Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]. Not differentiable.
     """
     count = common_batch({"drawn": drawn, "caught": caught, "rest": rest})
-    covered = wp.empty((count, *drawn.shape[1:]), dtype=wp.vec4, device=drawn.device)
+    covered = empty((count, *drawn.shape[1:]), dtype=wp.vec4, device=drawn.device)
     launch(_cover, covered.shape, inputs=[drawn, caught, rest], outputs=[covered])
     return covered
 
@@ -167,6 +168,6 @@ def compose(photograph: wp.array, drawn: wp.array, caught: wp.array, rest: wp.ar
     """
     count = common_batch({"photograph": photograph, "drawn": drawn, "caught": caught, "rest": rest})
     check.shape("photograph", photograph.shape, ("batch", *drawn.shape[1:]))
-    composed = wp.empty((count, *drawn.shape[1:]), dtype=wp.vec3, device=drawn.device)
+    composed = empty((count, *drawn.shape[1:]), dtype=wp.vec3, device=drawn.device)
     launch(_compose, composed.shape, inputs=[photograph, drawn, caught, rest], outputs=[composed])
     return composed

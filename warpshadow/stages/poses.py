@@ -8,6 +8,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.rotations import check_orthonormal
 
 
@@ -120,7 +121,7 @@ class Poses:
         check.shape("pivot", pivots.shape, ("batch", self.scales.shape[1]))
         arrays = {"rotations": self.rotations, "translations": self.translations, "scales": self.scales}
         check.finite_arrays(arrays | {"pivot": pivots})
-        moved = wp.empty((count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
+        moved = empty((count, pivots.shape[1]), dtype=wp.vec3, device=pivots.device)
         launch(_move_pivots, moved.shape, inputs=[pivots, *arrays.values(), sign], outputs=[moved])
         return Poses(expand(self.rotations, count), moved, expand(self.scales, count))
 
@@ -135,21 +136,21 @@ class Poses:
             vec3 of shape [batch, point].
         Differentiable: rest, rotations, translations, scales.
         """
-        posed = wp.empty(self._shape(rest, bodies), dtype=wp.vec3, device=rest.device)
+        posed = empty(self._shape(rest, bodies), dtype=wp.vec3, device=rest.device)
         inputs = [rest, bodies, self.rotations, self.translations, self.scales]
         launch(_pose_points, posed.shape, inputs=inputs, outputs=[posed])
         return posed
 
     def radii(self, rest: wp.array, bodies: wp.array) -> wp.array:
         """Scale radii, float32 of shape [batch, sphere], with their bodies. Differentiable: rest, scales."""
-        posed = wp.empty(self._shape(rest, bodies), dtype=wp.float32, device=rest.device)
+        posed = empty(self._shape(rest, bodies), dtype=wp.float32, device=rest.device)
         launch(_pose_radii, posed.shape, inputs=[rest, bodies, self.scales], outputs=[posed])
         return posed
 
     def turned(self, rest: wp.array) -> wp.array:
         """Turn bodies that are turned already, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
         count = common_batch({"rest": rest, "rotations": self.rotations})
-        turned = wp.empty((count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
+        turned = empty((count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
         launch(_turn, turned.shape, inputs=[rest, self.rotations], outputs=[turned])
         return turned
 

@@ -8,6 +8,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 
 
@@ -59,7 +60,7 @@ def compose_clip_matrices(
     variables = {"intrinsics": intrinsics, "rotations": rotations, "translations": translations}
     check.finite_arrays(variables)
     to_ndc = wp.mat33(2.0 / width, 0.0, -1.0, 0.0, 2.0 / height, -1.0, 0.0, 0.0, 1.0)
-    clip_matrices = wp.empty(common_batch(variables), dtype=wp.mat44, device=intrinsics.device)
+    clip_matrices = empty(common_batch(variables), dtype=wp.mat44, device=intrinsics.device)
     inputs = [*variables.values(), to_ndc, check.positive("near", near)]
     launch(_compose_clip_matrices, clip_matrices.shape, inputs=inputs, outputs=[clip_matrices])
     return clip_matrices
@@ -96,7 +97,7 @@ def to_clip(positions: wp.array, clip_matrices: wp.array) -> wp.array:
     """
     check.finite_arrays({"clip_matrices": clip_matrices})
     batch_count = common_batch({"positions": positions, "clip_matrices": clip_matrices})
-    clip_positions = wp.empty((batch_count, positions.shape[1]), dtype=wp.vec4, device=positions.device)
+    clip_positions = empty((batch_count, positions.shape[1]), dtype=wp.vec4, device=positions.device)
     launch(_to_clip, clip_positions.shape, inputs=[positions, clip_matrices], outputs=[clip_positions])
     return clip_positions
 

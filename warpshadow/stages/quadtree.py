@@ -19,6 +19,7 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 
 LARGEST = 4  # pixels of the side of the largest squares
 PROBE = 2  # pixels between probes
@@ -188,7 +189,7 @@ def find_quadtree(
     device, (view_count, height, width) = sides.device, sides.shape
     flat, shape = rows(sides), (view_count, height // supersampling, width // supersampling)
     keys_there = constant(keys, wp.int32, device)
-    sizes = wp.empty(shape, dtype=wp.int32, device=device)
+    sizes = empty(shape, dtype=wp.int32, device=device)
     probe_keys = keys_of(sides, keys, supersampling)
     inputs = [
         flat,

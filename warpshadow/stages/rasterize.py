@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import strip_count
 from warpshadow.stages.barycentrics import find_barycentrics
 
@@ -391,10 +392,10 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     """Nearest face over each sample, -1 where there is none, int32, shape [batch, height, width]."""
     device = clip_positions.device
     batch_count, vertex_count = clip_positions.shape
-    corners = wp.empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
-    depths = wp.empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = wp.zeros((batch_count, height, width), dtype=wp.int64, device=device)
-    face_ids = wp.empty((batch_count, height, width), dtype=wp.int32, device=device)
+    corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
+    depths = empty((batch_count, vertex_count), dtype=float, device=device)
+    keys = zeros((batch_count, height, width), dtype=wp.int64, device=device)
+    face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
     faults = wp.zeros((batch_count, 2), dtype=int, device=device)
     strips = strip_count(device)
     launch(

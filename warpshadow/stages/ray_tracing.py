@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import split_row
 from warpshadow.device.progress import progress_bar
 from warpshadow.stages.light_samples import CellSamples, LightSamples
@@ -184,7 +185,7 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
     check.shape("points", points.shape, ("batch", "vertex"))
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
-    visibility = wp.empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
+    visibility = empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
     inputs = [mesh_id(mesh), points, normals, directions]
     launch(_trace_visibility, (points.size, *directions.shape), inputs=inputs, outputs=[visibility], cost=RAY_COST)
     return visibility
@@ -239,7 +240,7 @@ def trace_shading(
     device = points.device
     directions = wp.array(samples.directions, dtype=wp.vec3, device=device)
     radiance = wp.array(samples.radiance, dtype=wp.vec3, device=device)
-    shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    shading = empty(points.shape, dtype=wp.vec3, device=device)
     for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_shading,
@@ -302,7 +303,7 @@ def trace_cells(
     Differentiable: no.
     """
     shape = points.shape[0], samples.radiance.shape[2], samples.cell_count
-    light = wp.zeros(shape, dtype=wp.float32, device=points.device)
+    light = zeros(shape, dtype=wp.float32, device=points.device)
     for part in parts(points.shape[0], 2**20 // samples.directions.shape[1], progress):
         launch(
             _trace_cells,

@@ -13,6 +13,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterize import Fragments
@@ -208,7 +209,7 @@ def find_receivers(
         moving_count = numbering.moving_count
         spans += tuple(Span(body, moving_count + first, moving_count + end) for body, first, end in own.spans)
         count = side_count + seen.face_ids.shape[1]
-        all_faces = wp.empty(count + len(own.triangles), dtype=wp.vec3i, device=device)
+        all_faces = empty(count + len(own.triangles), dtype=wp.vec3i, device=device)
         launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
         if len(own.triangles):
             wp.copy(all_faces[count:], wp.array(receiver_count + own.triangles, dtype=wp.vec3i, device=device))
@@ -229,9 +230,9 @@ def _points(
     """Points and normals of vertices and of fragments, for a number of instances. Differentiable: all but faces."""
     device = positions.device
     if seen is None:
-        seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
+        seen = Fragments(*(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
     shape = count, vertices.size + seen.face_ids.shape[1]
-    points, point_normals = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
+    points, point_normals = (empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
     inputs = [positions, normals, faces, vertices, seen.face_ids, seen.barycentrics]
     launch(_gather, shape, inputs=inputs, outputs=[points, point_normals])
     return points, point_normals

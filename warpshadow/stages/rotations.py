@@ -5,6 +5,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.stages.nearest_rotation import nearest_rotations
 
@@ -111,7 +112,7 @@ def rotation_matrices(parameters: wp.array) -> wp.array:
     _check_rotations(parameters)
     if parameters.dtype is wp.mat33:
         return nearest_rotations(parameters)
-    rotations = wp.empty(parameters.shape, dtype=wp.mat33, device=parameters.device)
+    rotations = empty(parameters.shape, dtype=wp.mat33, device=parameters.device)
     launch(_ROTATION_KERNELS[parameters.dtype], parameters.shape, inputs=[parameters], outputs=[rotations])
     return rotations
 

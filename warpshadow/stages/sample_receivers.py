@@ -14,6 +14,7 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.quadtree import Quadtree, sample_at
 from warpshadow.stages.rasterize import Fragments
@@ -339,9 +340,9 @@ def find_sample_receivers(
     if quadtree is not None:
         sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.keys
         is_corner = wp.array(quadtree.is_corner, dtype=wp.bool, device=device)
-    firsts, own_sides = (wp.empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
-    weights = wp.empty(sides.shape, dtype=wp.vec3, device=device)
-    is_first = wp.empty(sides.shape, dtype=wp.bool, device=device)
+    firsts, own_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
+    weights = empty(sides.shape, dtype=wp.vec3, device=device)
+    is_first = empty(sides.shape, dtype=wp.bool, device=device)
     run = run_length(device, width // supersampling)
     launch(
         _find_sharing,
@@ -387,7 +388,7 @@ def find_sample_receivers(
         inputs=[sides, firsts, is_first, numbers, constant(rooms, wp.int32, device), side_count, run],
         outputs=[own_sides, samples],
     )
-    seen_sides, counts = (wp.empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
+    seen_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
     on_surface = (surface.points, surface.positions, surface.faces) if surface else (None, None, None)
     inputs = [*on_surface, sides, barycentrics, firsts, is_corner, samples, width, supersampling]
     means = differentiable(
@@ -398,7 +399,7 @@ def find_sample_receivers(
             inputs=[sides, firsts, is_corner, samples, counts, width, supersampling, adj_means],
             outputs=[barycentrics.grad],
         ),
-        result=wp.empty(samples.shape, dtype=wp.vec3, device=device),
+        result=empty(samples.shape, dtype=wp.vec3, device=device),
         variables=[barycentrics],
     )
     return SampleReceivers(

@@ -10,6 +10,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.transfer import CellInputs, are_up, cell_inputs, cosines
@@ -161,7 +162,7 @@ def _shade_adjoint_light(
 
 def _channels(light: wp.array) -> wp.array:
     """Light [batch, coefficient] as float32 of shape [batch, channel, coefficient]."""
-    channels = wp.empty((light.shape[0], 3, light.shape[1]), dtype=wp.float32, device=light.device)
+    channels = empty((light.shape[0], 3, light.shape[1]), dtype=wp.float32, device=light.device)
     launch(_split_channels, channels.shape, inputs=[light], outputs=[channels])
     return channels
 
@@ -214,7 +215,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     return differentiable(
         lambda shading: launch(_shade, shading.size, inputs=[*seen, *lit], outputs=[shading], cost=cost),
         adjoint,
-        result=wp.empty((instances, transfer.shape[1]), dtype=wp.vec3, device=device),
+        result=empty((instances, transfer.shape[1]), dtype=wp.vec3, device=device),
         variables=[transfer, light],
     )
 
@@ -320,6 +321,6 @@ def shade_cells(
             outputs=[as_chunks(transmittance.grad), normals.grad],
             cost=2 * cost,
         ),
-        result=wp.empty(normals.shape, dtype=wp.vec3, device=device),
+        result=empty(normals.shape, dtype=wp.vec3, device=device),
         variables=[transmittance, normals],
     )

@@ -16,6 +16,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
@@ -88,9 +89,7 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     count = points.shape[0]
     chosen = np.arange(min(count, _PILOTS)) * count // max(min(count, _PILOTS), 1)
     at, facing = (wp.array(rows.numpy()[chosen], dtype=wp.vec3, device=points.device) for rows in (points, normals))
-    received = wp.zeros(
-        (len(chosen), samples.directions.shape[1] // PACKET, PACKET), dtype=wp.float32, device=at.device
-    )
+    received = zeros((len(chosen), samples.directions.shape[1] // PACKET, PACKET), dtype=wp.float32, device=at.device)
     _trace(tree, at, facing, samples, received)
     light = received.numpy().reshape(len(chosen), -1)
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-12)
@@ -114,8 +113,8 @@ def trace_shared(
 
     Differentiable: no.
     """
-    shading = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-    untracked = wp.zeros((0, 0, 0), dtype=wp.float32, device=points.device)
+    shading = empty(points.shape, dtype=wp.vec3, device=points.device)
+    untracked = zeros((0, 0, 0), dtype=wp.float32, device=points.device)
     for part in parts(points.shape[0], 2**24 // samples.directions.shape[1], progress):
         wp.copy(shading[part], _trace(tree, points[part], normals[part], samples, untracked))
     return shading
@@ -127,7 +126,7 @@ def _trace(tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSa
     packets = packets_of(samples.directions[0])
     directions = constant(packets, lane_type(PACKET), device)
     light = constant(samples.radiance[0].reshape(-1, PACKET, 3), wp.vec3, device)
-    shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+    shading = empty(points.shape, dtype=wp.vec3, device=device)
     launch(
         _make_trace(),
         len(points),

@@ -13,6 +13,7 @@ import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.rasterize import Fragments
 
@@ -118,8 +119,8 @@ def find_sides(
     """
     device = positions.device
     views, height, width = fragments.face_ids.shape
-    shows_back = wp.zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
-    is_any = wp.zeros(2, dtype=wp.bool, device=device)
+    shows_back = zeros((views, faces.shape[0]), dtype=wp.bool, device=device)
+    is_any = zeros(2, dtype=wp.bool, device=device)
     run = run_length(device, _FACE_RUN)
     launch(
         _find_backs,
@@ -129,7 +130,7 @@ def find_sides(
     )
     if not device.is_capturing and not is_any.numpy()[0]:
         return fragments
-    sides = wp.empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
+    sides = empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
     run = run_length(device, width)
     launch(
         _see_sides,

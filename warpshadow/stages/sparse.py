@@ -11,6 +11,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate, common_batch, expand
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
 if TYPE_CHECKING:
@@ -128,6 +129,6 @@ def multiply(matrix: SparseMatrix, values: wp.array, *, plus: wp.array | None = 
     return differentiable(
         lambda products: times(matrix.rows, values, plus, products),
         adjoint,
-        result=wp.empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
+        result=empty((values.shape[0], matrix.shape[0]), dtype=wp.vec3, device=values.device),
         variables=[values, plus],
     )

@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
@@ -89,7 +90,7 @@ def trace_transfer(
     tree = _tree(mesh, points.device)
     for part in parts(points.shape[0], 2**22 // len(directions), progress):
         shape = part.stop - part.start, len(directions)
-        cosines = wp.empty(shape, dtype=wp.float32, device=points.device)
+        cosines = empty(shape, dtype=wp.float32, device=points.device)
         inputs = [tree, points[part], normals[part], packets]
         launch(_make_trace_cosines(), shape[0], inputs=inputs, outputs=[cosines], cost=_RAY_COST * shape[1])
         transfer[part] = cosines.numpy() @ values

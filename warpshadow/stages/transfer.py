@@ -24,6 +24,7 @@ from warpshadow.device.lanes import (
     use_vector_registers,
 )
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, check_count
@@ -192,7 +193,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
             outputs=[None if variable is None else variable.grad for variable in variables],
             cost=2 * cost,
         ),
-        result=wp.empty((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        result=empty((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
         variables=variables,
     )
 
@@ -273,7 +274,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     return differentiable(
         lambda transfer: add_product(visibility, lobes, product_table(order, str(device), None, bands), transfer),
         adjoint,
-        result=wp.zeros((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        result=zeros((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
         variables=[visibility, lobes],
     )
 
@@ -385,6 +386,6 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
             outputs=[as_chunks(transmittance.grad), normals.grad],
             cost=2 * cost,
         ),
-        result=wp.empty(transmittance.shape, dtype=wp.float32, device=device),
+        result=empty(transmittance.shape, dtype=wp.float32, device=device),
         variables=[transmittance, normals],
     )

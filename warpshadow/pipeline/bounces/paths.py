@@ -5,6 +5,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import common_batch
+from warpshadow.device.memory import empty
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, map_of, receiver_words
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
@@ -56,7 +57,7 @@ def path_traced(
         texels = None if textures is None else textures.texels
         count = common_batch({"geometry": shading, "albedo": vertex_albedo, "textures": texels})
         drawn = sample_map(map_of(radiance), _LIGHT_SAMPLES, seed=1)
-        bounced = wp.empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
+        bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
         def of_instance(array: wp.array) -> wp.array:
             return array[min(instance, len(array) - 1)]

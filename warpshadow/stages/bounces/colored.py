@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import as_items
+from warpshadow.device.memory import as_items, empty
 from warpshadow.device.parallel import split_row
 
 _COEFFICIENT_COST, _ROW_COST = 1.0, 8.0  # nanoseconds that a coefficient of a receiver takes, and a receiver beside
@@ -93,6 +93,6 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     return differentiable(
         lambda lit: times(transfer.rows, light, None, lit),
         lambda adj_lit: times(transfer.columns, adj_lit, light.grad, light.grad),
-        result=wp.empty((len(light), transfer.rows.shape[0]), dtype=wp.vec3, device=light.device),
+        result=empty((len(light), transfer.rows.shape[0]), dtype=wp.vec3, device=light.device),
         variables=[light],
     )

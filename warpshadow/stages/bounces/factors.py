@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import zeros
 from warpshadow.stages.bounces.patches import Patches
 from warpshadow.stages.ray_tracing import RAY_COST, nearest, parts
 
@@ -120,7 +121,7 @@ def trace_factors(
     owners = wp.array(of_faces, dtype=wp.int32, device=device)
     factors = []
     for part in parts(len(points), _COUNTED // max(count, 1), progress):
-        counts = wp.zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
+        counts = zeros((part.stop - part.start, count), dtype=wp.int32, device=device)
         at = [wp.array(values[part], dtype=wp.vec3, device=device) for values in (points, normals)]
         inputs = [mesh.id, owners, *at, part.start, rays]
         launch(_count_hits, len(at[0]), inputs=inputs, outputs=[counts], cost=RAY_COST * rays)

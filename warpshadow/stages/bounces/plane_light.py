@@ -26,6 +26,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.planes.cells import (
@@ -483,7 +484,7 @@ def plane_light(
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "frames": frames}
     instances = common_batch({**arguments, "radiosity": radiosity, "fronts": fronts})
     if planes.count == (skip is not None):
-        return wp.zeros((instances, points.shape[1]), wp.vec3, points.device)
+        return zeros((instances, points.shape[1]), wp.vec3, points.device)
     assert planes.texels_of_patches is not None
     points, normals = (expand(array, instances) for array in (points, normals))
     transmittance = expand_rows(transmittance, instances)
@@ -514,6 +515,6 @@ def plane_light(
             sums=[frames.grad, texels.grad],
             cost=2 * _CELL_COST * len(directions),
         ),
-        result=wp.empty(points.shape, dtype=wp.vec3, device=points.device),
+        result=empty(points.shape, dtype=wp.vec3, device=points.device),
         variables=variables,
     )

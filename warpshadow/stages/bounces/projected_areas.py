@@ -30,6 +30,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import check_directions
 from warpshadow.stages.planes.cells import step
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
@@ -116,7 +117,7 @@ def turn_from_planes(
     check.shape("fronts", fronts.shape, ("batch", points.shape[1], planes.count))
     arguments = {"points": points, "normals": normals, "radii": radii, "fronts": fronts, "frames": frames}
     count = common_batch(arguments)
-    turned = wp.empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
+    turned = empty((count, points.shape[1]), dtype=wp.vec3, device=points.device)
     numbers = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
     launch(
         _turn_from_planes,
@@ -175,6 +176,6 @@ def find_projected_areas(
     opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
     device = normals.device
     cells = constant(directions, wp.vec3, device), constant(opposite, wp.int32, device)
-    shown = wp.empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
+    shown = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
     launch(_show, shown.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[shown])
     return shown

@@ -16,6 +16,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -64,8 +65,8 @@ def place_proxies(
     check.shape("ratios", ratios.shape, (mean.shape[0],))
     count = common_batch({"sources": sources.points, "normals": sources.normals, "radii": blocker_radii})
     device = blocker_radii.device
-    centers = wp.empty((count, len(numbers)), dtype=wp.vec3, device=device)
-    radii = wp.empty((count, len(numbers)), dtype=wp.float32, device=device)
+    centers = empty((count, len(numbers)), dtype=wp.vec3, device=device)
+    radii = empty((count, len(numbers)), dtype=wp.float32, device=device)
     means = multiply(mean, sources.points), multiply(mean, sources.normals)
     fixed = constant(np.asarray(numbers, np.int32), wp.int32, device), constant(ratios, wp.float32, device)
     launch(_place, centers.shape, inputs=[*means, blocker_radii, *fixed], outputs=[centers, radii])

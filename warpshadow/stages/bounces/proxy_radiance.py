@@ -23,6 +23,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.merging import MERGING, QUAD, merged_count
 
 _HIDDEN = wp.constant(0.01)  # part of its area that a patch counts for where it shows none
@@ -117,6 +118,6 @@ def find_proxy_radiance(
     integers = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, numbers)]
     floats = [shares, np.where(totals > 0, 0.0, _SHOWN)]
     tables = [*integers, *(constant(values.astype(np.float32), wp.float32, device) for values in floats)]
-    proxy_radiance = wp.empty((batch_count, len(starts) - 1, shown.shape[2]), dtype=wp.vec4, device=device)
+    proxy_radiance = empty((batch_count, len(starts) - 1, shown.shape[2]), dtype=wp.vec4, device=device)
     launch(_tabulate, proxy_radiance.shape, inputs=[radiosity, shown, *tables], outputs=[proxy_radiance])
     return proxy_radiance

@@ -6,6 +6,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 
@@ -63,6 +64,6 @@ def reflect(albedo: wp.array, light: wp.array) -> wp.array:
     """
     check.shape("albedo", albedo.shape, ("batch", light.shape[1]))
     instances = common_batch({"albedo": albedo, "light": light})
-    radiosity = wp.empty((instances, light.shape[1]), dtype=wp.vec3, device=light.device)
+    radiosity = empty((instances, light.shape[1]), dtype=wp.vec3, device=light.device)
     launch(_reflect, radiosity.shape, inputs=[albedo, light], outputs=[radiosity])
     return radiosity

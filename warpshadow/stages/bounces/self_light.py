@@ -5,6 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -42,6 +43,6 @@ def self_light(factors: SparseMatrix, radiosity: wp.array, rows: wp.array, weigh
     check.shape("weights", weights.shape, rows.shape)
     probe_light = multiply(factors, radiosity)
     instances = common_batch({"radiosity": radiosity, "rows": rows})
-    light = wp.empty((instances, rows.shape[1]), dtype=wp.vec3, device=radiosity.device)
+    light = empty((instances, rows.shape[1]), dtype=wp.vec3, device=radiosity.device)
     launch(_mix_probes, light.shape, inputs=[probe_light, rows, weights], outputs=[light])
     return light

@@ -34,6 +34,7 @@ from warpshadow.device.lanes import (
     vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
@@ -459,7 +460,7 @@ def sphere_light(
     stores_sums = varies(variables)
     scratch = [Scratch((2, own_count), lane_type(lanes)), Scratch((3, own_count // BUNDLE), wp.int32)]
     sums = (own_count * _SUMS,), lane_type(lanes)
-    cached = [wp.empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
+    cached = [empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
     inputs = LightInputs()
     inputs.traversed, inputs.cells = traversed, make_cells(directions, width, device)
     inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
@@ -489,6 +490,6 @@ def sphere_light(
             outputs=[*cached, light],
         ),
         adjoint,
-        result=wp.zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),
+        result=zeros((batch_count, vertex_count), dtype=wp.vec3, device=device),
         variables=variables,
     )

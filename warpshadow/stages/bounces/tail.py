@@ -30,6 +30,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 
 TERM_COUNT = 5  # radiosities from which the tail is found
 
@@ -162,9 +163,9 @@ def with_tail(radiosities: Sequence[wp.array], areas: np.ndarray) -> wp.array:
     count = common_batch({f"radiosity after {number} bounces": array for number, array in enumerate(radiosities)})
     device = radiosities[0].device
     parts = constant(np.asarray(areas / max(areas.sum(), 1e-30), np.float32), wp.float32, device)
-    sums = wp.zeros((count, 3, 3), dtype=wp.vec4d, device=device)
-    coefficients = wp.empty((count, 3), dtype=wp.vec3d, device=device)
-    total = wp.empty((count, patch_count), dtype=wp.vec3, device=device)
+    sums = zeros((count, 3, 3), dtype=wp.vec4d, device=device)
+    coefficients = empty((count, 3), dtype=wp.vec3d, device=device)
+    total = empty((count, patch_count), dtype=wp.vec3, device=device)
     launch(_sum_up, (count, patch_count, 3), inputs=[*radiosities, parts], outputs=[sums])
     launch(_solve, (count, 3), inputs=[sums], outputs=[coefficients])
     launch(_add_tail, total.shape, inputs=[*radiosities, coefficients], outputs=[total])

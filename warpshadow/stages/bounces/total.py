@@ -7,6 +7,7 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 
 
 @wp.kernel
@@ -31,6 +32,6 @@ def total_light(parts: Sequence[wp.array]) -> wp.array:
 
 def _sum(some: wp.array, more: wp.array) -> wp.array:
     count = common_batch({"light": some, "more light": more})
-    total = wp.empty((count, some.shape[1]), dtype=wp.vec3, device=some.device)
+    total = empty((count, some.shape[1]), dtype=wp.vec3, device=some.device)
     launch(_add, total.shape, inputs=[some, more], outputs=[total])
     return total

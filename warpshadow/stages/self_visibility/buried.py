@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.ray_tracing import nearest
 from warpshadow.stages.self_visibility.probes import VisibilityProbes
@@ -69,7 +70,7 @@ def find_buried(
     places, facing, directions = (
         wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
     )
-    is_buried = wp.empty(len(points), dtype=wp.bool, device=device)
+    is_buried = empty(len(points), dtype=wp.bool, device=device)
     inputs = [mesh.id, places, facing, probe_count, directions, None if rows is None else rows.bits]
     launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
     return is_buried.numpy()

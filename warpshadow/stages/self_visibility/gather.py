@@ -26,7 +26,7 @@ from warpshadow.device.lanes import (
     use_vector_registers,
 )
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import as_items
+from warpshadow.device.memory import as_items, empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
@@ -315,7 +315,7 @@ def gather_self_transmittance(
             sums=[lookup.weights.grad],
             cost=2 * cost,
         ),
-        result=wp.empty(shape, dtype=wp.float32, device=normals.device),
+        result=empty(shape, dtype=wp.float32, device=normals.device),
         variables=[places.weights, lookup.weights],
     )
 
@@ -356,6 +356,6 @@ def multiply_transmittances(own: wp.array, others: wp.array) -> wp.array:
     return differentiable(
         lambda product: add_product(own, others, product),
         adjoint,
-        result=wp.zeros(own.shape, dtype=wp.float32, device=own.device),
+        result=zeros(own.shape, dtype=wp.float32, device=own.device),
         variables=[own, others],
     )

@@ -21,6 +21,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, vectors_type
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
@@ -122,8 +123,8 @@ def find_turned(rotations: wp.array, body: int, order: int) -> BodyRotation:
     count, device = len(rotations), rotations.device
     directions, weights = sh.quadrature(2 * order - 2)
     weighted = constant((weights[:, None] * sh.evaluate(order, directions)).astype(np.float32), wp.float32, device)
-    basis = wp.zeros((count, len(weights), order**2), dtype=wp.float32, device=device)
-    turns = wp.empty((count, order**2, order**2), dtype=wp.float32, device=device)
+    basis = zeros((count, len(weights), order**2), dtype=wp.float32, device=device)
+    turns = empty((count, order**2, order**2), dtype=wp.float32, device=device)
     inputs = [rotations, body, constant(directions, wp.vec3, device)]
     launch(_make_evaluate(order), basis.shape[:2], inputs=inputs, outputs=[basis.view(lane_type(1))])
     launch(_find_turns, turns.shape[:2], inputs=[weighted, basis, order], outputs=[turns])
@@ -258,7 +259,7 @@ def self_visibility_lobes(
     shape, device = (count, places.rows.shape[1], bands**2), lobes.device
     if places.weights.requires_grad:
         places = ProbeWeights(places.rows, expand(places.weights, count))  # whose gradients are apart
-    result = wp.empty(shape, dtype=wp.float32, device=device)
+    result = empty(shape, dtype=wp.float32, device=device)
     cost = _TURN_COST * bands**3
 
     def forward(open_rays: wp.array) -> None:
@@ -273,7 +274,7 @@ def self_visibility_lobes(
         )
         torques = None
         if rotations.requires_grad:
-            torques = wp.zeros(len(rotations), dtype=wp.vec3, device=device)
+            torques = zeros(len(rotations), dtype=wp.vec3, device=device)
         launch(
             _turn_lobes_adjoint,
             shape[0] * shape[1],

@@ -18,6 +18,7 @@ import warp as wp
 
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.trace import RUN
 
@@ -199,8 +200,8 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     """
     shape = len(rotations), kernels.directions.size
     device = rotations.device
-    counts = wp.empty(shape, dtype=wp.int32, device=device)
-    indices = wp.empty((*shape, kernels.most), dtype=wp.int32, device=device)
+    counts = empty(shape, dtype=wp.int32, device=device)
+    indices = empty((*shape, kernels.most), dtype=wp.int32, device=device)
     arrays = KernelArrays()
     arrays.directions, arrays.reaches, arrays.looks_at_rays, arrays.rays, arrays.cells = kernels[:5]
     inputs = [rotations, body, arrays]
@@ -214,7 +215,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
             inputs=[*inputs, counts, indices, weights, adj_weights],
             outputs=[rotations.grad],
         ),
-        result=wp.empty((*shape, kernels.most), dtype=wp.float32, device=device),
+        result=empty((*shape, kernels.most), dtype=wp.float32, device=device),
         variables=[rotations],
     )
     return ResamplingWeights(counts, indices, weights)

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.sides import split_side
 
@@ -262,4 +263,4 @@ class ProbeTable(NamedTuple):
 
 def _empty_weights(batch_count: int, count: int, device: wp.Device) -> ProbeWeights:
     shape = batch_count, count
-    return ProbeWeights(wp.empty(shape, dtype=wp.vec3i, device=device), wp.empty(shape, dtype=wp.vec3, device=device))
+    return ProbeWeights(empty(shape, dtype=wp.vec3i, device=device), empty(shape, dtype=wp.vec3, device=device))

@@ -20,6 +20,7 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
@@ -151,7 +152,7 @@ def trace_sun_cells(
     """
     device, cell_count = rotations.device, int((cells.places >= 0).sum())
     count = common_batch({"places": places.rows, "rotations": rotations})
-    passing = wp.empty((count, places.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device)
+    passing = empty((count, places.rows.shape[1], len(cells.directions)), dtype=wp.float32, device=device)
     lanes = constant(cells.directions.swapaxes(1, 2), lane_type(PACKET), device)
     starts = np.sort(cells.places[cells.places >= 0])
     firsts = constant(starts[np.searchsorted(starts, np.arange(CHUNK), side="right") - 1], wp.int32, device)

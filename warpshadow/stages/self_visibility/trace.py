@@ -17,6 +17,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
@@ -204,8 +205,8 @@ def trace_rows(
     directions = wp.array(fibonacci(count), dtype=wp.vec3, device=device)
     packets = wp.array(packets_of(fibonacci(count)), dtype=lane_type(PACKET), device=device)
     rows = VisibilityRows(
-        wp.zeros((row_count, count // 32), dtype=wp.uint32, device=device),
-        wp.empty((row_count, count // RUN), dtype=wp.uint8, device=device),
+        zeros((row_count, count // 32), dtype=wp.uint32, device=device),
+        empty((row_count, count // RUN), dtype=wp.uint8, device=device),
     )
     lowest = float(np.sin(min(_MIRRORED * cell_radius(count // RUN), np.pi / 2)))
     level = float(np.sin(min(_LEVEL * cell_radius(count), np.pi / 2)))

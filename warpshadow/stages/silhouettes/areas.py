@@ -20,6 +20,7 @@ rigid motion), and at edges far below a sample it would outweigh the rest, pulli
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.screen import (
     distance,
     half_size,
@@ -135,7 +136,7 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, seen: F
         The area e beyond each line, how much it counts, ω, and whether a surface ends there, 1, or has a crease, 0;
         vec3 of shape [entry, 4], zero where there is no line.
     """
-    shares = wp.empty(edges.shape, dtype=wp.vec3, device=edges.device)
+    shares = empty(edges.shape, dtype=wp.vec3, device=edges.device)
     launch(_measure, edges.shape, inputs=[samples, edges, entries, seen], outputs=[shares])
     return shares
 

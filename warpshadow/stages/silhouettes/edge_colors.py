@@ -4,6 +4,7 @@ import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import zeros
 from warpshadow.stages.screen import (
     distance,
     ends_before,
@@ -102,7 +103,7 @@ def find_edge_colors(
     Not differentiable.
     """
     fragments, shape = silhouettes.fragments, silhouettes.flat_shape(image)
-    edge_colors = wp.zeros((shape[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
+    edge_colors = zeros((shape[0], *silhouettes.edges.shape), dtype=wp.vec4, device=image.device)
     launch(
         _find_edge_colors,
         edge_colors.shape[:2],

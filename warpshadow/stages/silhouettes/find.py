@@ -14,6 +14,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import run_length, strip_count
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import (
@@ -452,10 +453,10 @@ def find_silhouettes(
     device, sample_count = faces.device, fragments.face_ids.size
     seen, crossings, strips = make_fragment_arrays(fragments, faces, clip_positions), _Crossings(), strip_count(device)
     image_count = len(clip_positions)
-    crossings.counts = wp.zeros(image_count, dtype=wp.int32, device=device)
+    crossings.counts = zeros(image_count, dtype=wp.int32, device=device)
     crossings.room = 2 * sample_count // image_count
-    crossings.items = wp.empty(2 * sample_count, dtype=_Crossing, device=device)
-    crossings.claims = wp.empty(sample_count, dtype=wp.int32, device=device)
+    crossings.items = empty(2 * sample_count, dtype=_Crossing, device=device)
+    crossings.claims = empty(sample_count, dtype=wp.int32, device=device)
     between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)

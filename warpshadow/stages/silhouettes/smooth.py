@@ -19,6 +19,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import zeros
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.interpolate import inner
 from warpshadow.stages.screen import neighbor, opposite
@@ -162,7 +163,7 @@ def smooth_silhouettes(
             adj_image = image.grad.reshape(shape)
             accumulate(adj_smoothed, adj_image)
         if clip_positions.requires_grad:
-            adj_areas = wp.zeros(shares.shape, dtype=wp.float32, device=shares.device)
+            adj_areas = zeros(shares.shape, dtype=wp.float32, device=shares.device)
         launch(
             _make_blend_adjoint(image.dtype),
             dim,

@@ -14,6 +14,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import center, relative, volumes
 from warpshadow.stages.textures.pyramid import Textures
@@ -200,9 +201,9 @@ def find_footprints(
     batch_count = common_batch({"fragments": fragments.barycentrics, "clip_positions": clip_positions, "uvs": uvs})
     _, height, width = fragments.face_ids.shape
     count, shape = batch_count * height * width, (batch_count, height, width)
-    texture_ids = wp.empty(count, dtype=wp.int32, device=faces.device)
-    sample_uvs = wp.zeros(count, dtype=wp.vec2, device=faces.device)
-    probes = wp.zeros(count, dtype=wp.vec4, device=faces.device)
+    texture_ids = empty(count, dtype=wp.int32, device=faces.device)
+    sample_uvs = zeros(count, dtype=wp.vec2, device=faces.device)
+    probes = zeros(count, dtype=wp.vec4, device=faces.device)
     launch(
         _find_footprints,
         count,

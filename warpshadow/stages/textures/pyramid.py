@@ -18,6 +18,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate, common_batch, rows
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import unrecorded
 
@@ -219,7 +220,7 @@ def mip_pyramids(images: Sequence[wp.array], *, coarsest: int | None = None) -> 
     texels = differentiable(
         fill,
         lambda adj_texels: gather_levels(adj_texels, [image.grad for image in images], sizes, coarsest=coarsest),
-        result=wp.empty((batch_count, layout.texel_count), dtype=wp.vec3, device=device),
+        result=empty((batch_count, layout.texel_count), dtype=wp.vec3, device=device),
         variables=images,
     )
     return Textures(texels, layout.device_levels, layout.device_level_counts, sizes)

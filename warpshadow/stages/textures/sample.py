@@ -13,6 +13,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.interpolate import add_to_corners, adj_weights, at_point
 from warpshadow.stages.rasterize import Fragments
@@ -366,7 +367,7 @@ def sample_albedo(
     return differentiable(
         lambda albedo: _launch_sample([sampled, *colors, None], albedo, [rows(albedo), None]),
         adjoint,
-        result=wp.empty(shape, dtype=wp.vec3, device=faces.device),
+        result=empty(shape, dtype=wp.vec3, device=faces.device),
         variables=[*colors, *places],
     )
 
@@ -405,7 +406,7 @@ def textured_radiance(
             inputs=[sampled, rows(white), None, rows(adj_radiance)],
             outputs=[array.grad for array in colors],
         ),
-        result=wp.empty(shape, dtype=wp.vec4, device=faces.device),
+        result=empty(shape, dtype=wp.vec4, device=faces.device),
         variables=colors,
     )
 

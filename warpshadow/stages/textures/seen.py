@@ -5,6 +5,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch
+from warpshadow.device.memory import zeros
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures, gather_levels
 from warpshadow.stages.textures.sample import add_to_texels
@@ -22,10 +23,10 @@ def seen_texels(textures: Textures, footprints: Footprints) -> list[np.ndarray]:
     """
     device = footprints.uvs.device
     batch_count = common_batch({"textures": textures.texels, "footprints": footprints.uvs})
-    weights = wp.zeros(textures.texels.shape, dtype=wp.vec3, device=device)
+    weights = zeros(textures.texels.shape, dtype=wp.vec3, device=device)
     ones = wp.ones((batch_count, *footprints.uvs.shape[1:]), dtype=wp.vec3, device=device)
     add_to_texels(weights, textures, footprints, ones)
-    images = [wp.zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
+    images = [zeros((weights.shape[0], *size), dtype=wp.vec3, device=device) for size in textures.sizes]
     gather_levels(weights, images, textures.sizes, coarsest=footprints.coarsest_level())
     return [image.numpy()[..., 0].copy() for image in images]
 

@@ -25,6 +25,7 @@ from warpshadow.device.lanes import (
     vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres
@@ -313,8 +314,8 @@ def transmittance(
     nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
     dim = batch_count * block_count(vertex_count, lanes), span_count
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
-    ends = wp.empty((*dim, bundle_count), dtype=wp.int32, device=device)
-    result = wp.empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
+    ends = empty((*dim, bundle_count), dtype=wp.int32, device=device)
+    result = empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
     cost = PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
     return differentiable(
         lambda result: launch(

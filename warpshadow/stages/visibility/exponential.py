@@ -23,6 +23,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.stages.sh_kernels import ProductTable, make_multiply, product_table
@@ -404,9 +405,9 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # memory that no squaring reaches is never touched
     powers_shape = batch_count, groups, MOST_SQUARINGS + 1, order**2
-    powers = wp.empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
+    powers = empty(powers_shape, dtype=lane_type(lanes), device=device) if log_sh.requires_grad else None
     optimal = _optimal_table(order, str(device)) if base == "optimal_linear" else None
-    faults = wp.zeros(2, dtype=wp.int32, device=device)
+    faults = zeros(2, dtype=wp.int32, device=device)
     cost = _SQUARING_COST * lanes * order**4
     visibility = differentiable(
         lambda visibility: launch(
@@ -426,7 +427,7 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             scratch=scratch,
             outputs=[log_sh.grad],
         ),
-        result=wp.empty(log_sh.shape, dtype=wp.float32, device=device),
+        result=empty(log_sh.shape, dtype=wp.float32, device=device),
         variables=[log_sh],
     )
     if not device.is_capturing:

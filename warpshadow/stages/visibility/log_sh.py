@@ -11,6 +11,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
@@ -286,6 +287,6 @@ def accumulate(
             outputs=[points.grad, None if normals is None else normals.grad],
             sums=[array.grad for array in nodes],
         ),
-        result=wp.empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device),
+        result=empty((batch_count, vertex_count, order**2), dtype=wp.float32, device=device),
         variables=[points, normals, *nodes],
     )

@@ -25,6 +25,7 @@ from warpshadow import check
 from warpshadow.device.batch import concatenate
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 
 QUAD = 4  # spheres that merge, in the order in which they are given: best near each other
@@ -127,8 +128,8 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     """
     batch_count, sphere_count = radii.shape
     shape = batch_count, sphere_count // QUAD
-    merged_centers = wp.empty(shape, dtype=wp.vec3, device=radii.device)
-    merged_radii, extents = (wp.empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
+    merged_centers = empty(shape, dtype=wp.vec3, device=radii.device)
+    merged_radii, extents = (empty(shape, dtype=wp.float32, device=radii.device) for _ in range(2))
     launch(_merge, shape, inputs=[centers, radii], outputs=[merged_centers, merged_radii, extents])
     counts = [sphere_count, shape[1]]
     return ClusterNodes(
@@ -145,7 +146,7 @@ def merge_where_far(centers: wp.array, radii: wp.array, merging: float) -> Clust
     """
     if merged_count(radii.shape[1], merging):
         return merge(centers, radii)
-    return ClusterNodes(centers, radii, wp.empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
+    return ClusterNodes(centers, radii, empty((radii.shape[0], 0), dtype=wp.float32, device=radii.device))
 
 
 @wp.struct

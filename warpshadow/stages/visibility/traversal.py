@@ -12,6 +12,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.visibility.cones import TINY_RADIUS, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
     ITEMS,
@@ -143,7 +144,7 @@ def make_inputs(
 def _find_bounds(nodes: ClusterNodes, sphere_count: int, quad_count: int) -> wp.array:
     """Spheres around runs of quads, vec4 of shape [batch, run]."""
     shape = nodes.radii.shape[0], -(-sphere_count // (QUAD * quad_count))
-    bounds = wp.empty(shape, dtype=wp.vec4, device=nodes.radii.device)
+    bounds = empty(shape, dtype=wp.vec4, device=nodes.radii.device)
     launch(_bound, shape, inputs=[nodes.centers, nodes.radii, sphere_count, quad_count], outputs=[bounds])
     return bounds
 
