@@ -2,12 +2,70 @@
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import warp as wp
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
+_MOST_RESULTS = 256
+"""Results of a function that are cached; the oldest go first."""
+
+_collections: dict[int, list[wp.array]] = {}  # by their identity
+
+
+@contextlib.contextmanager
+def collected() -> Iterator[list[wp.array]]:
+    """Collect the constants that are used meanwhile. Whoever reads them later, as a graph does, must hold them."""
+    arrays: list[wp.array] = []
+    _collections[id(arrays)] = arrays
+    try:
+        yield arrays
+    finally:
+        del _collections[id(arrays)]
+
+
+def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function of NumPy arrays and other values that computes once for equal values.
+
+    Nobody may change a result. The constants that it used count as used at every call.
+    """
+    results: dict[Hashable, tuple[R, list[wp.array]]] = {}
+
+    @functools.wraps(function)
+    def cached(*args: P.args, **kwargs: P.kwargs) -> R:
+        assert not kwargs
+        key = tuple(map(_key, args))
+        found = results.get(key)
+        if found is None:
+            with collected() as arrays:
+                found = function(*args), arrays  # type: ignore[call-arg]
+            while len(results) >= _MOST_RESULTS:
+                results.pop(next(iter(results)), None)
+            results[key] = found
+        elif _collections:
+            use(*found[1])
+        return found[0]
+
+    return cached
+
+
+def _key(value: Any) -> Hashable:
+    if isinstance(value, np.ndarray):
+        return value.tobytes(), value.dtype.str, value.shape
+    return str(value) if isinstance(value, wp.Device) else value
+
+
+def use(*arrays: wp.array) -> None:
+    """Note that constants are used."""
+    for each in list(_collections.values()):
+        each.extend(arrays)
+
+
+@cached_by_values
 def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array:
     """Give constants to a device: equal values give the same array, which must not be written to.
 
@@ -20,29 +78,8 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
     Raises:
         RuntimeError: for new values while a graph is captured: only a replay of the graph would fill the array.
     """
-    values = np.ascontiguousarray(values)
-    array = _constant(values.tobytes(), values.dtype.str, values.shape, dtype, str(device))
-    for arrays in _collections:
-        arrays.append(array)
-    return array
-
-
-_collections: list[list[wp.array]] = []
-
-
-@contextlib.contextmanager
-def collected() -> Iterator[list[wp.array]]:
-    """Collect the constants that are used meanwhile. Whoever reads them later, as a graph does, must hold them."""
-    arrays: list[wp.array] = []
-    _collections.append(arrays)
-    try:
-        yield arrays
-    finally:
-        _collections.remove(arrays)
-
-
-@functools.lru_cache(maxsize=256)
-def _constant(values: bytes, kind: str, shape: tuple[int, ...], dtype: type, device: str) -> wp.array:
     if wp.get_device(device).is_capturing:
         raise RuntimeError("a graph is captured that needs new constants: call what it captures once before")
-    return wp.array(np.frombuffer(values, kind).reshape(shape), dtype=dtype, device=device)
+    array = wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+    use(array)
+    return array

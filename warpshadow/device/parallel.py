@@ -42,10 +42,16 @@ def thread_count() -> int:
         return _thread_count
     text = os.environ.get(ENVIRONMENT_VARIABLE, "")
     if not text:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return _core_count()
     if not text.isdecimal() or int(text) < 1:
         raise ValueError(f"{ENVIRONMENT_VARIABLE}: got {text!r}, expected a positive whole number")
     return int(text)
+
+
+@functools.cache
+def _core_count() -> int:
+    """Cores that this process may use, as it had them at the first launch."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def set_thread_count(count: int | None) -> None:

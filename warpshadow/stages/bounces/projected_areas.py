@@ -28,7 +28,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import check_directions
@@ -155,6 +155,14 @@ def _show(
     shown[batch, patch, direction] = total
 
 
+@cached_by_values
+def _cells_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array]:
+    """Directions of cells, and the cell that is nearest to the opposite of each."""
+    check_directions(directions)
+    opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
+    return constant(directions, wp.vec3, device), constant(opposite, wp.int32, device)
+
+
 def find_projected_areas(
     normals: wp.array, transmittance: wp.array, mean: SparseMatrix, directions: np.ndarray
 ) -> wp.array:
@@ -169,13 +177,11 @@ def find_projected_areas(
         g, float32 of shape [batch, patch, direction]. Any batch may be 1.
     Differentiable: normals, transmittance.
     """
-    check_directions(directions)
+    cells = _cells_and_opposites(directions, normals.device)
     check.shape("normals", normals.shape, ("batch", mean.shape[1]))
     check.shape("passing", transmittance.shape, ("batch", mean.shape[1], len(directions)))
     count = common_batch({"normals": normals, "passing": transmittance})
-    opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
     device = normals.device
-    cells = constant(directions, wp.vec3, device), constant(opposite, wp.int32, device)
     shown = empty((count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
     launch(_show, shown.shape, inputs=[normals, transmittance, *mean.rows, *cells], outputs=[shown])
     return shown

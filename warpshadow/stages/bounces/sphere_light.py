@@ -36,7 +36,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
+from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, falloff_width
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
@@ -438,7 +438,6 @@ def sphere_light(
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, unblocked. (The derivative in T is
     that at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """
-    check_directions(directions)
     width = falloff_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     common_batch({"points": points, "proxy_radiance": proxy_radiance, "unblocked": unblocked})

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius, fibonacci
@@ -46,6 +46,7 @@ class ResamplingKernels(NamedTuple):
     most: int
 
 
+@cached_by_values
 def find_resampling_kernels(
     directions: np.ndarray, spreads: np.ndarray | None, ray_count: int, device: wp.Device
 ) -> ResamplingKernels:

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
-from warpshadow.maths.directions import bundle_cones
+from warpshadow.maths.directions import bundle_cones, check_directions
 from warpshadow.stages.visibility.cones import BLEND
 from warpshadow.stages.visibility.traversal import ALL, receiver_lanes_type
 
@@ -32,8 +32,14 @@ class DirectionCells:
     sin_width: float
 
 
+@cached_by_values
 def make_cells(directions: np.ndarray, width: float, device: wp.Device) -> DirectionCells:
-    """Put cells together with the cones around their bundles."""
+    """Put cells together with the cones around their bundles.
+
+    Raises:
+        ValueError: for directions for which there are no cells.
+    """
+    check_directions(directions)
     axes, cosine, sine = bundle_cones(directions, width)
     cells = DirectionCells()
     cells.directions = constant(directions, wp.vec3, device)

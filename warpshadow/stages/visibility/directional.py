@@ -27,7 +27,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, check_directions, falloff_width
+from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
@@ -301,7 +301,6 @@ def transmittance(
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
     clusters.
     """
-    check_directions(directions)
     width = falloff_width(softness, len(directions))
     check_spheres(points, normals, centers, radii)
     device = points.device
