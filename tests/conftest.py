@@ -1,5 +1,9 @@
 """What the tests share: devices, golden values, and the optional data of real meshes and maps."""
 
+import importlib
+import math
+import pkgutil
+import sys
 import time
 from pathlib import Path
 
@@ -7,7 +11,7 @@ import pytest
 import warp as wp
 
 import warpshadow
-from warpshadow.device import progress
+from warpshadow.device import cuda_graph, lanes, parallel, progress
 from warpshadow.device.warp_internals import scalar_type
 
 warpshadow.quiet()
@@ -94,3 +98,41 @@ def poisoned_outputs(monkeypatch):
         "empty_like",
         lambda a, **options: poisoned(a.shape, **{"dtype": a.dtype, "device": a.device} | options),
     )
+
+
+@pytest.fixture
+def gpu_branches(monkeypatch):
+    """Let the CPU launch what a GPU would: a lane a thread, a thread a sample, nothing that can be read for free.
+
+    Arguments of kernels are those of a GPU, too. The order of threads is not: the CPU runs one after another.
+    """
+    for info in pkgutil.walk_packages(warpshadow.__path__, "warpshadow."):
+        if not info.name.endswith("__main__"):
+            importlib.import_module(info.name)
+
+    def launch_whole(kernel, dim, *, cost, inputs, outputs, scratch=(), sums=(), device):
+        dim = (dim,) if isinstance(dim, int) else dim
+        rows = [wp.empty((math.prod(dim), *shape), dtype=dtype, device=device) for shape, dtype in scratch]
+        arguments = [0, -1, *inputs, *rows, *outputs, *sums]
+        wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False)
+
+    def launch_whole_adjoint(kernel, dim, *, cost, inputs, outputs, shared, device):
+        arguments = [*inputs, *outputs]
+        gradients = [value.grad if isinstance(value, wp.array) else wp.Tape().get_adjoint(value) for value in arguments]
+        options = {"adj_inputs": [None, None, *gradients], "adjoint": True, "record_tape": False}
+        wp.launch(kernel, dim=dim, inputs=[0, -1, *arguments], device=device, **options)
+
+    replaced = {
+        parallel.run_length: lambda device, width: 1,
+        parallel.run_dimensions: lambda device, runs, instances: (instances, runs),
+        parallel.strip_count: lambda device: 16,
+        parallel.launch_slices: launch_whole,
+        parallel.launch_adjoint_slices: launch_whole_adjoint,
+        lanes.lane_count: lambda device: 1,
+        lanes.span_count: lambda device, direction_count: direction_count // lanes.CHUNK,
+        cuda_graph.is_readable: lambda device: False,
+    }
+    for module in [module for name, module in sys.modules.items() if name.startswith("warpshadow")]:
+        for old, new in replaced.items():
+            if getattr(module, old.__name__, None) is old:
+                monkeypatch.setattr(module, old.__name__, new)

@@ -143,6 +143,26 @@ def test_one_lane_gives_what_sixteen_give(monkeypatch, device):
     assert np.abs(one - many)[above].max() < OPAQUE
 
 
+def test_the_threads_of_a_gpu_give_what_those_of_a_cpu_give(request):
+    values, directions = twins.random_scene(6), cells.fibonacci(64)
+    above = values[1] @ directions.T > 0
+    weights = np.where(above, np.random.default_rng(0).normal(size=above.shape), 0.0)
+
+    def result_and_gradients():
+        arrays = [wp.array(v[None], dtype=wp.vec3 if v.ndim == 2 else float, requires_grad=True) for v in values]
+        with wp.Tape() as tape:
+            result = directional.transmittance(*arrays, directions)
+        tape.backward(grads={result: wp.array(weights[None], dtype=float)})
+        return result.numpy()[0], [arrays[k].grad.numpy() for k in (0, 2, 3)]
+
+    on_cpu, gradients_on_cpu = result_and_gradients()
+    request.getfixturevalue("gpu_branches")
+    as_on_gpu, gradients_as_on_gpu = result_and_gradients()
+    assert np.abs(as_on_gpu - on_cpu)[above].max() < OPAQUE
+    for ours, theirs in zip(gradients_as_on_gpu, gradients_on_cpu, strict=True):
+        assert np.linalg.norm(ours - theirs) < 1e-4 * np.linalg.norm(theirs)
+
+
 @pytest.mark.parametrize("vertex_count", [1, 15, 16, 17])
 def test_any_number_of_vertices_gives_each_its_own(vertex_count, device):
     """Not bit by bit: a group goes on past the opaque while one of its receivers is bright."""

@@ -274,12 +274,12 @@ def test_results_are_the_same_bits_for_any_number_of_threads(monkeypatch):
         np.testing.assert_array_equal(one, three)
 
 
-def test_one_lane_gives_what_sixteen_give(monkeypatch, device):
-    values = [value[None] for value in scene(12, 16)]
+def test_the_threads_of_a_gpu_give_what_those_of_a_cpu_give(request):
+    values = [value[None] for value in scene(12, 64)]
     weights = np.random.default_rng(0).normal(size=(1, 19, 3))
-    many = gradients(values, weights, 16, device)
-    monkeypatch.setattr(stage, "lane_count", lambda _: 1)
-    one = gradients(values, weights, 16, device)
+    many = gradients(values, weights, 64, "cpu")
+    request.getfixturevalue("gpu_branches")
+    one = gradients(values, weights, 64, "cpu")
     np.testing.assert_allclose(one[0], many[0], rtol=1e-5, atol=1e-6)
     for ours, theirs in zip(one[1], many[1], strict=True):
         assert np.linalg.norm(ours - theirs) < ADJOINT * np.linalg.norm(theirs)

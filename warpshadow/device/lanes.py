@@ -168,6 +168,11 @@ def block_count(vertex_count: int, lanes: int) -> int:
     return -(-vertex_count // lanes)
 
 
+def span_count(device: wp.Device, direction_count: int) -> int:
+    """Threads of a group of receivers, a span of directions each: on a CPU one, which finds a sphere's cone once."""
+    return 1 if device.is_cpu else direction_count // CHUNK
+
+
 @functools.cache
 def lane_type(lanes: int) -> type:
     """Vector of float32 with a lane for each receiver of a thread."""

@@ -222,9 +222,7 @@ class InParts(Node):
         place = functools.partial(method.planes.frames, planes) if planes else lambda _: None
         frames = Node("", place, points.vertices)
         convex = points.blocking.convex
-        parts = Node(
-            "", functools.partial(method.parts.placed, convex) if convex else lambda _: None, points.vertices
-        )
+        parts = Node("", functools.partial(method.parts.placed, convex) if convex else lambda _: None, points.vertices)
         corners = Node("", method.planes.corners if method.planes.numbers else lambda _: None, points.vertices)
         self._passing = Node(
             f"planes{where}",
@@ -297,7 +295,9 @@ class InParts(Node):
 def _sphere_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:
     """Number of spheres by which each body blocks the light of others."""
     bodies = np.arange(len(method.merged_scene.scene.bodies))
-    return np.where(np.isin(bodies, (*points.blocking.planes, *points.blocking.convex)), 0, method.merged_scene.sphere_counts)
+    return np.where(
+        np.isin(bodies, (*points.blocking.planes, *points.blocking.convex)), 0, method.merged_scene.sphere_counts
+    )
 
 
 def _part_counts(method: SphereMethod, points: LitPoints) -> np.ndarray:

@@ -31,12 +31,13 @@ from warpshadow.device.lanes import (
     lane_type,
     make_lane_functions,
     module_options,
+    span_count,
     vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, falloff_width
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.maths.directions import BUNDLE, cell_radius, falloff_width
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
@@ -223,8 +224,9 @@ def _make_light(lanes: int) -> wp.Kernel:
         light: wp.array2d(dtype=wp.vec3),
     ):
         """A thread owns a group of receivers and a span of bundles, and adds to the light."""
-        item, span = wp.tid()
-        batch, group, receivers, task = begin(first_row + item, span, worker, inputs, scratch, reached_bundles, sums)
+        i, j = wp.tid()
+        span, row = find_run(worker, first_row + i, j)
+        batch, group, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.ends.shape[0]):
             if task.ends[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
@@ -358,8 +360,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
 
         T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
         """
-        item, span = wp.tid()
-        batch, group, receivers, task = begin(first_row + item, span, worker, inputs, scratch, reached_bundles, sums)
+        i, j = wp.tid()
+        span, row = find_run(worker, first_row + i, j)
+        batch, group, receivers, task = begin(row, span, worker, inputs, scratch, reached_bundles, sums)
         task.adj_light = load(adj_light[batch], group)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
@@ -449,21 +452,21 @@ def sphere_light(
         check.shape("unblocked", unblocked.shape, (unblocked.shape[0], vertex_count, len(directions)))
     device = points.device
     lanes = lane_count(device)
-    # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
-    span_count = 1 if device.is_cpu else len(directions) // CHUNK
-    own_count = len(directions) // span_count
+    spans = span_count(device, len(directions))
+    own_count = len(directions) // spans
     cell = cell_radius(len(directions))
     nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell, skip, clusters)
-    dim = batch_count * block_count(vertex_count, lanes), span_count
+    row_count = batch_count * block_count(vertex_count, lanes)
+    dim = run_dimensions(device, row_count, spans)
     variables = [points, normals, *nodes, proxy_radiance, transmittance, unblocked]
     stores_sums = varies(variables)
     scratch = [Scratch((2, own_count), lane_type(lanes)), Scratch((3, own_count // BUNDLE), wp.int32)]
     sums = (own_count * _SUMS,), lane_type(lanes)
-    cached = [empty((dim[0] * span_count, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
+    cached = [empty((row_count * spans, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
     inputs = LightInputs()
     inputs.traversed, inputs.cells = traversed, make_cells(directions, width, device)
     inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
-    inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), span_count, stores_sums
+    inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * own_count
     is_shared = unblocked is not None and len(unblocked) < batch_count
 

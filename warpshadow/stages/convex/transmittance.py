@@ -102,8 +102,7 @@ class Chord:
 
 @wp.func
 def _along_line(end: wp.vec3, along: wp.vec3, direction: wp.vec3, half: float, behind: float):
-    """Where an end of an edge lies on its line, no farther than the disc reaches; which way an end behind is, is known.
-    """
+    """Where an end of an edge lies on its line, no farther than the disc reaches; which way an end behind is, is known."""
     ahead = wp.dot(end, direction)
     if ahead <= 0.0:
         return behind
@@ -148,8 +147,7 @@ def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, 
                 d = wp.abs(chord.distance)
                 angle = wp.atan2(chord.end, d) - wp.atan2(chord.begin, d)
                 area += 0.5 * (
-                    chord.distance * (chord.end - chord.begin)
-                    - radius * radius * wp.where(cosine > 0.0, angle, -angle)
+                    chord.distance * (chord.end - chord.begin) - radius * radius * wp.where(cosine > 0.0, angle, -angle)
                 )
     return wp.clamp(inside + area / (wp.pi * radius * radius), 0.0, 1.0)
 
@@ -288,18 +286,22 @@ def _pass(
     for q in range(directions.shape[0]):
         passing[batch, receiver, q] = 1.0
     for body in range(parts.first_part.shape[0] - 1):
-        if body != skip and parts.blocks[body] == 1 and _add_coverage(
-            points[batch, receiver],
-            normal,
-            corners[instance],
-            planes[instance],
-            bounds[instance],
-            parts,
-            body,
-            directions,
-            radius,
-            silhouettes[place],
-            coverages[place],
+        if (
+            body != skip
+            and parts.blocks[body] == 1
+            and _add_coverage(
+                points[batch, receiver],
+                normal,
+                corners[instance],
+                planes[instance],
+                bounds[instance],
+                parts,
+                body,
+                directions,
+                radius,
+                silhouettes[place],
+                coverages[place],
+            )
         ):
             for q in range(directions.shape[0]):
                 passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
@@ -337,18 +339,22 @@ def _pass_adjoint(
     point, normal = points[batch, receiver], _facing(facing, batch, receiver)
     adj_point = wp.vec3()
     for body in range(parts.first_part.shape[0] - 1):
-        if body != skip and parts.blocks[body] == 1 and _add_coverage(
-            point,
-            normal,
-            corners[instance],
-            planes[instance],
-            bounds[instance],
-            parts,
-            body,
-            directions,
-            radius,
-            silhouettes[place],
-            coverages[place],
+        if (
+            body != skip
+            and parts.blocks[body] == 1
+            and _add_coverage(
+                point,
+                normal,
+                corners[instance],
+                planes[instance],
+                bounds[instance],
+                parts,
+                body,
+                directions,
+                radius,
+                silhouettes[place],
+                coverages[place],
+            )
         ):
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[instance, part], radius)
@@ -403,8 +409,9 @@ def transmittance_past_parts(
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
-    own_radius, cells = cell_radius(len(directions)) if radius is None else radius, constant(
-        directions, wp.vec3, points.device
+    own_radius, cells = (
+        cell_radius(len(directions)) if radius is None else radius,
+        constant(directions, wp.vec3, points.device),
     )
     inputs = [points, facing, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]

@@ -22,12 +22,13 @@ from warpshadow.device.lanes import (
     lane_type,
     make_lane_functions,
     module_options,
+    span_count,
     vectors_type,
 )
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, scratch_place
-from warpshadow.maths.directions import BUNDLE, CHUNK, cell_radius, falloff_width
+from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
+from warpshadow.maths.directions import BUNDLE, cell_radius, falloff_width
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
@@ -155,10 +156,9 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
         transmittance: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers and a span of bundles; ends are the spheres where it stopped looking."""
-        item, span = wp.tid()
-        batch, group, receivers, task = begin(
-            first_row + item, span, worker, inputs, cells, all_ends, scratch, reached_bundles
-        )
+        i, j = wp.tid()
+        span, row = find_run(worker, first_row + i, j)
+        batch, group, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         for bundle in range(task.ends.shape[0]):
             for i in range(BUNDLE):
                 task.passing[bundle * BUNDLE + i] = Lane(1.0)
@@ -254,10 +254,9 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
         """A thread owns a group of receivers and a span of bundles."""
-        item, span = wp.tid()
-        batch, group, receivers, task = begin(
-            first_row + item, span, worker, inputs, cells, all_ends, scratch, reached_bundles
-        )
+        i, j = wp.tid()
+        span, row = find_run(worker, first_row + i, j)
+        batch, group, receivers, task = begin(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
         begin_column, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
         load_products(transmittance[batch], adj_transmittance[batch], begin_column, count, group, task.passing)
         adj = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
@@ -307,13 +306,13 @@ def transmittance(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     cells = make_cells(directions, width, device)
-    # threads for a group: on a CPU one, which finds a sphere's cone once for all directions
-    span_count = 1 if device.is_cpu else len(directions) // CHUNK
-    bundle_count = len(directions) // (BUNDLE * span_count)
+    spans = span_count(device, len(directions))
+    bundle_count = len(directions) // (BUNDLE * spans)
     nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
-    dim = batch_count * block_count(vertex_count, lanes), span_count
+    row_count = batch_count * block_count(vertex_count, lanes)
+    dim = run_dimensions(device, row_count, spans)
     scratch = [Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)]
-    ends = empty((*dim, bundle_count), dtype=wp.int32, device=device)
+    ends = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
     result = empty((batch_count, vertex_count, len(directions)), dtype=wp.float32, device=device)
     cost = PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE
     return differentiable(
