@@ -21,6 +21,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.diagnostics import warn_of
 from warpshadow.inverse.found_light import FoundLight, found_light
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, make_model
@@ -464,6 +465,8 @@ def fit(
         )
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()
+    if reason in GOOD_ENDINGS and durations:  # not of one that had ended before
+        warn_of(problem, descent.setting, values, descent.losses[-1], reason)
     return Result(problem, descent.setting, values, descent.losses, reason, seconds)
 
 

@@ -42,14 +42,7 @@ class Loss:
         if check.number("alpha", self.alpha) > 2:
             raise ValueError(f"alpha: got {self.alpha:g}, expected 2 or less")
 
-    def __call__(
-        self,
-        images: torch.Tensor,
-        targets: torch.Tensor,
-        weights: torch.Tensor,
-        unit: float,
-        saturated: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+    def __call__(self, images: torch.Tensor, targets: torch.Tensor, weights: torch.Tensor, unit: float) -> torch.Tensor:
         """Compare images.
 
         Args:
@@ -57,11 +50,10 @@ class Loss:
             targets: [view, height, width, 3 or 4].
             weights: Of the pixels, [view, height, width].
             unit: Radiance that counts as 1.
-            saturated: Where a target is a lower bound of the radiance, bool of shape [view, height, width, 3].
 
         Differentiable: images.
         """
-        costs = self._costs(differences(images, targets, unit, saturated))
+        costs = self._costs((images[..., :3] - targets[..., :3]) / unit)
         if targets.shape[-1] == 4 and self.coverage:
             costs = costs + self.coverage * self._costs(images[..., 3:] - targets[..., 3:])
         total = (weights * costs).sum()
@@ -96,7 +88,7 @@ class Loss:
         They tell which pixels a fit believes: about 0 where a redescending loss takes a pixel for an occluder's.
 
         Args:
-            x: Differences as :func:`differences` makes them, [..., channel].
+            x: Differences of colors in units of radiance, [..., channel].
 
         Returns:
             [..., channel].
@@ -114,9 +106,17 @@ class Loss:
         return torch.ones_like(x) if self.alpha == 2 else (squares / (2 - self.alpha) + 1) ** (self.alpha / 2 - 1)
 
 
-def differences(
-    images: torch.Tensor, targets: torch.Tensor, unit: float, saturated: torch.Tensor | None
-) -> torch.Tensor:
-    """Colors of images minus those of targets, in units of radiance; none above a target that is saturated."""
-    x = (images[..., :3] - targets[..., :3]) / unit
-    return x if saturated is None else torch.where(saturated, x.clamp_max(0), x)
+def bounded(images: torch.Tensor, targets: torch.Tensor, saturated: torch.Tensor | None) -> torch.Tensor:
+    """Images to compare with targets: no brighter than these where they are saturated, and so lower bounds.
+
+    Args:
+        images: [view, height, width, 4].
+        targets: [view, height, width, 3 or 4].
+        saturated: Bool of shape [view, height, width, 3]; None for nowhere.
+
+    Differentiable: images, below the bounds.
+    """
+    if saturated is None:
+        return images
+    color = torch.where(saturated, torch.minimum(images[..., :3], targets[..., :3]), images[..., :3])
+    return torch.cat([color, images[..., 3:]], dim=-1)

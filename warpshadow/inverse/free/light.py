@@ -28,6 +28,7 @@ class Light(Free):
         directions: In place of ``order`` the number of cells, whose radiance is the exponential of a value and so never
             negative: sharper light, and a longer way to it.
         nonnegativity: Weight of the mean square of negative radiance in spherical harmonics [targets' radiance].
+            Without it light that images do not determine takes any value.
         smoothness: Weight of the mean square of differences between neighboring cells [targets' radiance].
     """
 
@@ -35,7 +36,7 @@ class Light(Free):
 
     order: int | None = 5
     directions: int | None = None
-    nonnegativity: float = 0.0
+    nonnegativity: float = 0.01
     smoothness: float = 1e-4
 
     def __post_init__(self) -> None:

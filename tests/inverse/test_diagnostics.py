@@ -1,0 +1,58 @@
+"""Warnings of fits that ended: pixels without a body, and light that has not converged."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import warpshadow as ws
+from warpshadow.inverse import DiagnosticWarning, Light, Problem, Stage, Target, fit
+from warpshadow.inverse.diagnostics import gain_of_last
+
+
+def scene(size: float = 4.0) -> ws.Scene:
+    ground = ws.Body(ws.plane(size, 4), blockers=0)
+    camera = ws.Camera.look_at((0, 4, 0.1), (0, 0, 0), fov_y=40, size=(16, 16))
+    light = np.zeros((4, 3))
+    light[0], light[1] = 3.0, 1.0
+    return ws.Scene((ground,), light, camera, ws.Visibility("none"))
+
+
+def messages(problem: Problem, stage: Stage) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit(problem, [stage], progress=False)
+    return [str(item.message) for item in caught if item.category is DiagnosticWarning]
+
+
+def test_pixels_that_see_no_body_are_told():
+    small = scene(2.0)
+    seen = ws.render(small)
+    share = 1 - seen[..., 3].mean()
+    assert 0.3 < share < 0.7
+    stage = Stage(3, 0.05)
+    (message,) = messages(Problem(small, Target(seen[..., :3] + 0.1), Light(2)), stage)
+    assert abs(float(message.split("%")[0]) / 100 - share) < 0.1 and "of the counted pixels see no body" in message
+    mask = seen[..., 3] == 1
+    assert not messages(Problem(small, Target(seen[..., :3], mask), Light(2)), stage)
+    assert not messages(Problem(small, Target(seen), Light(2)), stage)  # its coverage is compared
+
+
+def test_light_that_has_not_converged_is_told():
+    problem = Problem(scene(), Target(np.full((16, 16, 3), 5.0)), Light(None, 64))
+    assert "light has not converged" in messages(problem, Stage(40, 1e-2))[0]
+    assert not messages(Problem(scene(), Target(ws.render(scene())[..., :3]), Light(2)), Stage(60, 0.05))
+
+
+@pytest.mark.parametrize(("losses", "gain"), [([1.0] * 30, 0.0), ([2.0] * 10 + [1.0] * 10, 0.5), ([9.0, 1.0], 0.0)])
+def test_the_gain_is_that_of_the_last_iterations(losses, gain):
+    assert gain_of_last(losses) == pytest.approx(gain)
+
+
+def test_light_is_kept_from_being_negative_by_default():
+    setting = Problem(scene(), Target(np.ones((16, 16, 3))), Light(2)).setting(torch.device("cpu"))
+    values = Light(2).start(setting)
+    assert float(Light(2).regularizer(values, setting)) == 0
+    values["coefficients"][1] = 5.0
+    assert float(Light(2).regularizer(values, setting)) > 0.01
