@@ -13,7 +13,7 @@ from warpshadow.spheres import Spheres
 from warpshadow.stages.light_samples import cut_map
 from warpshadow.stages.ray_packets import build_face_tree
 from warpshadow.stages.ray_tracing import trace_visibility
-from warpshadow.stages.shared_rays import find_shares, trace_shared
+from warpshadow.stages.shared_rays import TOLERANCE, Corners, find_shares, trace_shared
 
 # Error of a still, 512 directions, against 4096 independent rays.
 STILL_ERROR = 0.03
@@ -59,6 +59,33 @@ def test_packets_give_each_receiver_what_single_rays_do(device):
     visible = trace_visibility(traced, at.reshape((1, -1)), facing.reshape((1, -1)), towards).numpy()[0]
     cosine = np.maximum(normals @ samples.directions[0].T, 0)
     np.testing.assert_allclose(shading, (visible * cosine) @ samples.radiance[0] / np.pi, rtol=1e-3, atol=1e-3)
+
+
+def test_receivers_between_corners_get_the_light_that_they_get_alone(device):
+    """In a square under a ball's edge."""
+    ball = ws.icosphere(0.5, 3)
+    tree = build_face_tree(ball.positions + np.float32([0, 1, 0]), ball.faces, device)
+    x, z = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5), indexing="ij"))
+    corner = np.flatnonzero(np.isin(x, (0, 1)) & np.isin(z, (0, 1)))
+    points = np.stack([0.3 + 0.1 * x, 0 * x, 0.1 * z], axis=1).astype(np.float32)
+    weights = np.stack([(1 - x) * (1 - z), (1 - x) * z, x * (1 - z), x * z], axis=1)
+    receivers = np.tile(corner, (len(x), 1))
+    receivers[corner] = -1
+    at, up = (wp.array(v, dtype=wp.vec3, device=device) for v in (points, np.tile([[0, 1, 0]], (len(x), 1))))
+    samples = cut_map(SKY.radiance, 512)
+    alone = trace_shared(tree, at, up, samples).numpy()
+    together = trace_shared(tree, at, up, samples, corners=Corners(receivers, weights)).numpy()
+    np.testing.assert_allclose(together[corner], alone[corner], rtol=1e-5)
+    assert np.abs(together - alone).sum(axis=1).max() < TOLERANCE * alone.sum(axis=1).max()
+    assert np.abs(together - alone).max() > 1e-5  # some visibility is interpolated
+    wrong = trace_shared(tree, at, up, samples, corners=Corners(receivers, 0 * weights)).numpy()
+    np.testing.assert_allclose(wrong, alone, rtol=1e-4)  # nothing is, where the tolerance is 0: all doubts are traced
+
+
+def test_a_still_is_that_of_all_rays_at_all_receivers(monkeypatch):
+    image = ws.render(scene(64))
+    monkeypatch.setattr("warpshadow.pipeline.rays.find_corners", lambda *_: None)
+    assert 0 < error(image, ws.render(scene(64))) < 0.005
 
 
 def test_directions_go_where_receivers_see_light():

@@ -15,7 +15,7 @@ from warpshadow.stages.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.ray_tracing import trace_shading
 from warpshadow.stages.receivers import Receivers
-from warpshadow.stages.shared_rays import find_shares, trace_shared
+from warpshadow.stages.shared_rays import find_corners, find_shares, trace_shared
 from warpshadow.stages.traced_transfer import trace_transfer
 
 if TYPE_CHECKING:  # it is imported where light bounces
@@ -170,7 +170,10 @@ class Rays(Method):
             # a ratio image has the same directions with the bodies and without
             pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points)
             samples = cut_map(map_of(light), count, pilots)
-            wp.copy(traced[instance], trace_shared(*lit_points, samples, progress=progress))
+            corners = None
+            if receivers.fragments.face_ids.ndim == 3:  # of an image
+                corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
+            wp.copy(traced[instance], trace_shared(*lit_points, samples, corners=corners, progress=progress))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers) -> list[wp.array]:

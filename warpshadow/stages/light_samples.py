@@ -111,25 +111,20 @@ def cut_map(
         power[is_sun] *= min(_SUN_SHARE / max(share, _SUN_SHARE), 1.0)
         importance += (1 - _UNIFORM_SHARE) * power / power.sum()
 
-    def cut(importance: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def cut(importance: np.ndarray) -> np.ndarray:
         table = np.zeros((height + 1, width + 1))
         table[1:, 1:] = importance.cumsum(axis=0).cumsum(axis=1)
-        return list(_cut(table, np.array([0.0, height]), np.array([0.0, width]), count))
-
-    def sample(cuts: list[tuple[np.ndarray, np.ndarray]]) -> LightSamples:
-        means = (_mean_light(radiance, solid_angle, rows, columns) for rows, columns in cuts)
-        directions, light = (np.stack(item) for item in zip(*means, strict=True))
-        return LightSamples(directions[None], light[None])
+        return np.array([*_cut(table, np.array([0.0, height]), np.array([0.0, width]), count)])
 
     cuts = cut(importance)
-    samples = sample(cuts)
+    samples = _mean_light(radiance, solid_angle, cuts)
     if find_shares is not None:
         weighted = importance.copy()
-        for (rows, columns), share in zip(cuts, find_shares(samples), strict=True):
-            (top, bottom), (left, right) = rows.round().astype(int), columns.round().astype(int)
+        pixels = cuts.round().astype(int).reshape(-1, 4).tolist()
+        for (top, bottom, left, right), share in zip(pixels, find_shares(samples), strict=True):
             weighted[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * share
         weighted *= importance[~is_sun].sum() / max(weighted[~is_sun].sum(), 1e-300)
-        samples = sample(cut(np.where(is_sun, importance, weighted)))
+        samples = _mean_light(radiance, solid_angle, cut(np.where(is_sun, importance, weighted)))
     order = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
     return LightSamples(samples.directions[:, order], samples.radiance[:, order])
 
@@ -186,33 +181,33 @@ def _between(values: np.ndarray, place: float) -> np.ndarray:
     return values[item] + (place - item) * (values[item + 1] - values[item])
 
 
-def _mean_light(
-    radiance: np.ndarray, solid_angle: np.ndarray, rows: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mean direction of the light of a rectangle of a map, and its light in that direction, ∫ L d·ω dω."""
-    height = len(radiance)
-    row_parts, column_parts = _parts(rows), _parts(columns)
-    column_grid, row_grid = np.meshgrid((column_parts[0] + column_parts[1]) / 2, row_parts[0])
-    directions = _map_directions(
-        row_grid.astype(int), (row_parts[0] + row_parts[1])[:, None] / 2 % 1, column_grid, height
-    )
-    pixels = np.ix_(row_parts[0].astype(int), column_parts[0].astype(int))
-    weights = np.outer(np.diff(row_parts, axis=0), np.diff(column_parts, axis=0)) * solid_angle[pixels]
-    light = radiance[pixels] * weights[..., None]
-    moments = np.einsum("ijk,ijc->ck", directions, light)
-    brightness = np.abs(light).mean(axis=2)
-    if not brightness.any():
-        brightness = weights
-    mean = np.einsum("ijk,ij->k", directions, brightness)
-    mean /= max(np.linalg.norm(mean), 1e-300)
-    return mean, moments @ mean
+def _mean_light(radiance: np.ndarray, solid_angle: np.ndarray, cuts: np.ndarray) -> LightSamples:
+    """The mean direction of the light of each rectangle of a map, and its light in that direction, ∫ L d·ω dω.
 
-
-def _parts(ends: np.ndarray) -> np.ndarray:
-    """Cut what lies between two places at whole numbers: where each part begins and ends, shape [2, part]."""
-    whole = np.arange(np.floor(ends[0]) + 1, np.ceil(ends[1]))
-    places = np.concatenate([ends[:1], whole, ends[1:]])
-    return np.stack([places[:-1], places[1:]])
+    Args:
+        radiance, solid_angle: Of the pixels, [row, column, 3] and [row, column].
+        cuts: Where the rows and the columns of each rectangle begin and end, [rectangle, 2, 2].
+    """
+    (first_row, first_column), ends = np.floor(cuts[..., 0]).T.astype(int), np.ceil(cuts[..., 1]).astype(int)
+    tall, wide = (ends - np.floor(cuts[..., 0]).astype(int)).T
+    starts = np.cumsum(tall * wide) - tall * wide
+    rectangle = np.repeat(np.arange(len(cuts)), tall * wide)
+    place = np.arange(len(rectangle)) - starts[rectangle]
+    row, column = first_row[rectangle] + place // wide[rectangle], first_column[rectangle] + place % wide[rectangle]
+    # the parts of pixels in rectangles
+    low = np.maximum(cuts[rectangle, :, 0], np.stack([row, column], axis=-1))
+    high = np.minimum(cuts[rectangle, :, 1], np.stack([row + 1, column + 1], axis=-1))
+    middle = (low + high) / 2
+    directions = _map_directions(row, middle[:, 0] - row, middle[:, 1], len(radiance))
+    weights = (high - low).prod(axis=1) * solid_angle[row, column]
+    light = radiance[row, column] * weights[:, None]
+    moments = np.add.reduceat(directions[:, :, None] * light[:, None, :], starts)
+    brightness = np.abs(light).mean(axis=1)
+    is_dark = np.add.reduceat(brightness, starts) == 0
+    brightness = np.where(is_dark[rectangle], weights, brightness)
+    means = np.add.reduceat(directions * brightness[:, None], starts)
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-300)
+    return LightSamples(means[None], np.einsum("rk,rkc->rc", means, moments)[None])
 
 
 class CellSamples(NamedTuple):
