@@ -28,6 +28,7 @@ import torch
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos import problems
+from demos.mitsuba_gloss import surface
 from demos.problems import Case
 from demos.scenes import image_error, shipped_mesh
 from warpshadow import inverse
@@ -224,8 +225,8 @@ def _mesh(body: ws.Body, number: int) -> Any:
     positions, faces = mesh.positions, mesh.faces
     normals = vertex_normals(torch.tensor(positions), mesh.surface.faces).numpy()
     properties = mi.Properties()
-    diffuse = {"type": "diffuse", "reflectance": _reflectance(body)}
-    properties["bsdf"] = mi.load_dict({"type": "twosided", "side": diffuse})
+    side = surface(body) if body.is_glossy else {"type": "diffuse", "reflectance": _reflectance(body)}
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "side": side})
     if body.texture is not None:
         positions, normals = positions[faces.ravel()], normals[faces.ravel()]
         faces = np.arange(len(positions)).reshape(-1, 3)

@@ -134,9 +134,13 @@ class SphereMethod(Method):
     def _projected_from_scene(self) -> Node:
         return Node("", self.project_light, self.light)
 
+    def projected(self, light: Input) -> Node:
+        """Node of known light, projected; the scene's is cached."""
+        return self._projected_from_scene if light is self.light else Node("", self.project_light, light)
+
     def shading(self, points: LitPoints, light: Input, materials: Materials) -> Node:
         """Shading of points in known light, which bounces from the materials."""
-        projected_light = self._projected_from_scene if light is self.light else Node("", self.project_light, light)
+        projected_light = self.projected(light)
         if self.bounces is not None:
             is_cached = points.is_static and materials is not points.materials
             return (self.bounces.cached_shading if is_cached else self.bounces.shading)(

@@ -115,7 +115,7 @@ def choose_receivers(
         cameras: The cameras that see them.
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
     """
-    requested = [body.receivers for body in merged_scene.scene.bodies]
+    requested = ["pixel" if body.is_glossy else body.receivers for body in merged_scene.scene.bodies]
     if AUTO not in requested:
         return [Choice(receivers, None) for receivers in requested]
     sizes = face_sizes((_seen_faces(merged_scene, camera) for camera in cameras), merged_scene, cameras[0])

@@ -12,19 +12,21 @@ from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
-from warpshadow.pipeline.by_spheres import SphereMethod
+from warpshadow.pipeline.by_spheres import InParts, SphereMethod
 from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, Transmittance
-from warpshadow.pipeline.lighting import LARGEST_COEFFICIENT, KnownLight, map_of
+from warpshadow.pipeline.lighting import LARGEST_COEFFICIENT, KnownLight, LitPoints, joined, map_of, receiver_words
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Input
+from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.self_visibility import Blocking, SelfVisibilityLookup
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
+from warpshadow.stages.gloss.transmittance import transmittance_towards
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
 from warpshadow.stages.ray_tracing import trace_cells
+from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance, multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells, trace_sun_cells
 from warpshadow.stages.shading import shade_cells
@@ -266,6 +268,20 @@ class Directional(SphereMethod):
         unblocked = np.where((facing * plane_normals).sum(axis=2) > 0, *whole)
         return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
 
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+        """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
+        is_free = isinstance(light.value(), wp.array)
+        make = functools.partial(self.projected, light)
+        projected_light = self.free_projection if is_free else points.cached("projected", light, make)
+        words = functools.partial(receiver_words, points)
+
+        def in_cells() -> Node:
+            return CellTransmittances(self, points, projected_light, None, list, where=" of gloss", is_shaded=False)
+
+        cells = points.cached("cells", None if is_free else light, in_cells)
+        arguments = cells, points.receivers_node, directions, projected_light
+        return Node("transmittance of lobes", _towards, *arguments, items=words)
+
     def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
         is_scenes = light is self.light
@@ -286,6 +302,27 @@ class Directional(SphereMethod):
     def _even_samples(self) -> CellSamples:
         samples = even_samples(self.visibility.ray_count, self._directions)
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
+
+
+class CellTransmittances(InParts):
+    """Transmittance of receivers past all bodies, in parts, float32 of shape [batch, receiver, direction]."""
+
+    def find(
+        self, call: Call, part: Group, projected_light: ProjectedCells, spheres: tuple[wp.array, wp.array]
+    ) -> wp.array:
+        """Find that of a part."""
+        return self.see(call, part, projected_light).transmittance_total
+
+
+def _towards(
+    cells: list[wp.array], receivers: Receivers, directions: wp.array, projected_light: ProjectedCells
+) -> wp.array:
+    count = len(projected_light.directions)
+    if not directions.size:
+        return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
+    rows = joined([part.reshape((len(part), -1)) for part in cells])
+    transmittance = rows.reshape((len(rows), -1, count))
+    return transmittance_towards(transmittance, receivers.normals, directions, projected_light.directions)
 
 
 def _has_light(cached: CachedRows) -> bool:

@@ -183,7 +183,7 @@ class Method:
         bodies = np.arange(len(self.merged_scene.scene.bodies))
         if self.merged_scene.scene.bounces:
             return bodies
-        named = (*blocking.traced, *blocking.planes)
+        named = (*blocking.traced, *blocking.planes, *np.flatnonzero(self.merged_scene.is_glossy))
         return np.where(np.isin(bodies, named), bodies, -1) if named else None
 
     def numbering(self, blocking: Blocking, has_backs: bool) -> Numbering:
@@ -221,6 +221,18 @@ class Method:
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group."""
         raise NotImplementedError
+
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+        """Transmittance towards the samples of lobes of points, float32 of shape [batch, receiver, sample].
+
+        Args:
+            points: Receivers on bodies that shine.
+            directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
+            light: Known or free light, which says where shadows have to be sharp.
+
+        Without shadows it is 1.
+        """
+        return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
     def openness(self, points: LitPoints) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""

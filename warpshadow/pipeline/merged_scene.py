@@ -182,6 +182,11 @@ class MergedScene:
         return np.array([body.mesh.is_flat for body in self.scene.bodies])
 
     @functools.cached_property
+    def is_glossy(self) -> np.ndarray:
+        """Bodies that shine, bool of shape [body]."""
+        return np.array([body.is_glossy for body in self.scene.bodies])
+
+    @functools.cached_property
     def two_sided_faces(self) -> wp.array:
         """Faces of open bodies, int32 of shape [item]."""
         return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)

@@ -11,6 +11,7 @@ from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, 
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
+from warpshadow.stages.gloss.traced import trace_lobes
 from warpshadow.stages.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.ray_tracing import trace_shading
@@ -92,6 +93,12 @@ class Rays(Method):
         arguments = ScenePatches(self.merged_scene), self.merged_scene.scene.bounces
         rays = STILL_RAYS if self.shares_directions else RAYS
         return StaticBounces(*arguments, rays=rays, progress=self.progress)
+
+    def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
+        """Transmittance towards the samples of lobes: rays, each of its own."""
+        trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
+        words = functools.partial(receiver_words, points)
+        return Node("transmittance of lobes", _trace_lobes, trees, points.receivers_node, directions, items=words)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -190,6 +197,16 @@ class Rays(Method):
             )
             wp.copy(transfer[instance], traced)
         return [transfer]
+
+
+def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
+    points, normals, count = _without_gradient(receivers.points), receivers.normals, len(directions)
+    traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
+    for instance in range(count if points.size else 0):
+        located = min(instance, len(points) - 1)
+        arguments = points[located], normals[located], directions[instance]
+        wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
+    return traced
 
 
 def _without_gradient(points: wp.array) -> wp.array:

@@ -15,6 +15,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
+from warpshadow.scene.scene import GLOSS
 from warpshadow.stages.interpolate import interpolate
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
@@ -23,6 +24,10 @@ from warpshadow.stages.textures.seen import seen_texels
 
 Given = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
+
+
+GLOSS_DEFAULTS = {"roughness": 1.0, "metallic": 0.0, "specular": 1.0}
+"""Of bodies that do not say; their roughness does not count where they do not shine."""
 
 
 class Materials:
@@ -45,6 +50,7 @@ class Materials:
         self._take_albedo(albedo)
         self._take_textures(textures)
         self._of_scene = list(albedo.value()), list(textures.value())
+        self.gloss: dict[str, Input] = {}
 
     def _take_albedo(self, albedo: Input) -> None:
         counts = np.diff(self.merged_scene.first_vertex).tolist()
@@ -66,7 +72,10 @@ class Materials:
         bodies = merged_scene.scene.bodies
         albedo = Input("albedo", [array(np.atleast_2d(body.albedo)) for body in bodies])
         textures = Input("textures", [None if body.texture is None else array(body.texture) for body in bodies])
-        return cls(merged_scene, albedo, textures)
+        materials = cls(merged_scene, albedo, textures)
+        if merged_scene.is_glossy.any():
+            materials.gloss = {name: Input(name, _of_bodies(merged_scene, name)) for name in GLOSS}
+        return materials
 
     def is_black(self, number: int) -> bool:
         """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
@@ -123,6 +132,11 @@ class Materials:
                 "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
             )
 
+    def vertex_gloss(self, name: str) -> Node:
+        """Node of the roughness of all vertices, or of their metallic or specular, float32 of shape [batch, vertex]."""
+        counts = np.diff(self.merged_scene.first_vertex).tolist()
+        return Node("", lambda values: concatenate(values, counts), self.gloss[name])
+
     @property
     def texture_of_face(self) -> wp.array:
         """Index of each face's texture, -1 for none, int32 of shape [face]."""
@@ -144,6 +158,13 @@ class Materials:
             items=lambda: f"{sum(image.size for image in self.images):,} texels",
             idle=why_flat,
         )
+
+
+def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array]:
+    """Roughness or the like of each body, float32 of shape [1, 1] or [1, vertex]."""
+    values = (getattr(body, name) for body in merged_scene.scene.bodies)
+    rows = [GLOSS_DEFAULTS[name] if value is None else value for value in values]
+    return [wp.array(np.atleast_2d(row), dtype=wp.float32, device=merged_scene.device) for row in rows]
 
 
 class Reflection(NamedTuple):

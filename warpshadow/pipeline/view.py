@@ -180,6 +180,8 @@ class View(LitPoints):
         words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         materials = self.materials.replaced(albedo, textures)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
+        if materials.gloss:
+            return self._averaged(self._glossy(lit, light, materials, reflected.samples), is_moving=self._is_moving)
         if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
             result = (Node("reflectance", None, idle="found with the radiance"),)
             reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
@@ -189,6 +191,25 @@ class View(LitPoints):
             samples = self._radiance(lit, reflected.samples)
         averaged = self._averaged(samples, is_moving=clip.requires_grad)
         return averaged
+
+    def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
+        """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
+        from warpshadow.pipeline.gloss import GlossyPoints
+
+        points = self.cached("gloss", None, lambda: GlossyPoints(self))
+        colored, white = points.mixed(lit, light, materials)
+        parts = self._radiance(colored, reflected), self._radiance(white, self._white_reflectance)
+        return Node("radiance", _sum_moving if self._is_moving else film.sum_radiance, *parts, caches=False)
+
+    @property
+    def _is_moving(self) -> bool:
+        return self.clip_positions.requires_grad
+
+    @property
+    def _white_reflectance(self) -> wp.array:
+        """Reflectance of the samples if every surface were white, vec3 of shape [1, height, width]."""
+        width, height = self._size
+        return wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.merged_scene.device)
 
     def in_photograph(
         self,
@@ -217,7 +238,8 @@ class View(LitPoints):
         division = Node("ratio", divide, *seen, items=self._samples, caches=False)
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, caches=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
-        films = [self._averaged(self._radiance(lit, item), is_moving=is_moving) for item in (drawn, inverse)]
+        parts = self._glossy(lit, light, materials, drawn) if materials.gloss else self._radiance(lit, drawn)
+        films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(lit, inverse))]
         films.append(self._averaged(rest))
         if photograph is None:
             return Node("photograph", over_nothing, *films, caches=False)
@@ -336,6 +358,12 @@ def _moving_radiance(
     """Samples, and the colors at edges."""
     seen = receivers.fragments, receivers.faces, lit, reflected
     return moving_radiance(*seen, silhouettes, clip_positions, receivers.of_vertices)
+
+
+def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
+    """Sums of samples and of the colors at edges."""
+    samples, edge_colors = (film.sum_radiance(*pair) for pair in zip(first, second, strict=True))
+    return samples, edge_colors
 
 
 def _smooth_moving(radiance: tuple[wp.array, wp.array], silhouettes: Silhouettes, clip_positions: wp.array) -> wp.array:

@@ -85,7 +85,7 @@ _SPHERES = ".npz"
 GLOSS = ("roughness", "metallic", "specular")
 """Arguments of a body that say how it shines."""
 
-GLOSSY = ("directional", "ray-traced", AUTO)
+GLOSSY = ("directional", "none", "ray-traced", AUTO)
 """The methods that show it."""
 
 MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
@@ -246,7 +246,7 @@ class Body:
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
             shines by a GGX lobe of width α = roughness². None, the default, is a diffuse surface. Below 0.1 it is shown
-            as 0.1. Such a body has receivers at pixels; methods "directional" and "ray-traced" show it.
+            as 0.1. Such a body has receivers at pixels; all methods but "log-sh" show it.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
     """
@@ -403,6 +403,8 @@ class Body:
             check.finite(name, numbers, minimum=0.0, maximum=1.0)
             numbers.setflags(write=False)
             object.__setattr__(self, name, numbers)
+        if self.roughness is not None and self.shadow_catcher:
+            raise ValueError("roughness: got some for a shadow catcher, expected None: it shows diffuse light alone")
         if self.roughness is not None and self.receivers in ("vertex", "adaptive"):
             raise ValueError(
                 f"receivers: got {self.receivers!r} beside roughness, expected 'pixel' or 'auto', since "

@@ -72,6 +72,38 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
 
 
 @wp.kernel
+def _sum(
+    # in
+    first: wp.array2d(dtype=wp.vec4),
+    second: wp.array2d(dtype=wp.vec4),
+    # out
+    sums: wp.array2d(dtype=wp.vec4),
+):
+    """A thread owns a sample."""
+    batch, sample = wp.tid()
+    a = first[instance_in(batch, first.shape[0]), sample]
+    b = second[instance_in(batch, second.shape[0]), sample]
+    sums[batch, sample] = wp.vec4(a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3])
+
+
+def sum_radiance(first: wp.array, second: wp.array) -> wp.array:
+    """Add the radiance of two kinds of light from the same surfaces.
+
+    Args:
+        first, second: Linear RGB and coverage, vec4 of the same shape but for a batch of 1.
+
+    Returns:
+        The sum, with the coverage of the first.
+
+    Differentiable: first, second.
+    """
+    count = common_batch({"first": first, "second": second})
+    sums = wp.empty((count, first[0].size), dtype=wp.vec4, device=first.device)
+    launch(_sum, sums.shape, inputs=[rows(first), rows(second)], outputs=[sums])
+    return sums.reshape((count, *first.shape[1:]))
+
+
+@wp.kernel
 def _average(
     # in
     samples: wp.array4d(dtype=wp.vec4),

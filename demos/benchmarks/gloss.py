@@ -1,0 +1,117 @@
+"""Images of bodies that shine against Mitsuba's, by roughness, of metal and plastic.
+
+    python -m demos.benchmarks.gloss [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
+
+FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface, of which the
+difference to its own ``principled`` is printed first: a ball alone, whose light is that of its surface. Errors are of
+the whole image, and of the body that shines alone, relative L2, noise of the reference taken off.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import time
+from pathlib import Path
+
+import numpy as np
+
+import warpshadow as ws
+from demos.references import Reference, Request
+from demos.scenes import shipped_mesh
+
+ROUGHNESS = (0.2, 0.35, 0.6)
+KINDS = {"metal": {"albedo": (0.9, 0.65, 0.35), "metallic": 1.0}, "plastic": {"albedo": (0.15, 0.35, 0.6)}}
+METHODS = ("still", "kept")
+
+
+def scenes(data: Path | None, size: int, count: int) -> dict[str, ws.Scene]:
+    """Bodies on a ground, without gloss."""
+    if data is None:
+        meshes = {name: shipped_mesh(name) for name in ("bunny", "bear")}
+        lights = [ws.synthetic_sky((0.5, 0.6, 0.3), sun_radius=8, sun_strength=2)]
+    else:
+        names = ["spot.obj", "stanford-bunny.obj"]
+        meshes = {
+            "ball": ws.icosphere(1.0, 4),
+            **{Path(name).stem: ws.load_mesh(data / "meshes" / name) for name in names},
+        }
+        lights = [
+            ws.EnvironmentMap.read(data / "envmaps" / name) for name in ("apartment.exr", "city.exr", "forest.exr")
+        ]
+    result = {}
+    for number, (name, mesh) in enumerate(list(meshes.items())[:count]):
+        turn = (0, 150, 0) if name == "spot" else (0, 0, 0)
+        body = ws.Body(mesh, albedo=(0.5, 0.5, 0.5), rotation=turn, name=name).on_ground(size=2)
+        ground = ws.Body(ws.plane(8.0, 64), albedo=(0.4, 0.4, 0.4), name="ground")
+        camera = ws.Camera.framing(body, direction=(-0.4, 0.5, 1), fov_y=30, size=(size, size))
+        result[name] = ws.Scene([body, ground], lights[number % len(lights)], camera)
+    return result
+
+
+def glossy(scene: ws.Scene, roughness: float, kind: str) -> ws.Scene:
+    """The scene with its first body of a roughness and kind."""
+    body = dataclasses.replace(scene.bodies[0], roughness=roughness, **KINDS[kind])
+    return dataclasses.replace(scene, bodies=(body, *scene.bodies[1:]))
+
+
+def image(scene: ws.Scene, method: str) -> tuple[np.ndarray, float]:
+    """An image, and the CPU time that it takes when everything is compiled and cached."""
+    if method == "still":
+        ws.render(scene, progress=False)
+        start = time.process_time()
+        return ws.render(scene, progress=False), time.process_time() - start
+    result = ws.Renderer(scene, progress=False).render()
+    renderer = ws.Renderer(scene, progress=False)
+    renderer.view()
+    start = time.process_time()
+    renderer.render()
+    return result, time.process_time() - start
+
+
+def body_error(reference: Reference, shown: np.ndarray) -> float:
+    """Relative L2 error of the first body's pixels."""
+    pixels = reference.pixels(0)
+    truth = reference.mean[pixels, :3]
+    noise = np.linalg.norm(reference.images[0][pixels, :3] - reference.images[1][pixels, :3]) / 2
+    error = np.linalg.norm(shown[pixels, :3] - truth)
+    return float(np.sqrt(max(error**2 - noise**2, 0)) / np.linalg.norm(truth))
+
+
+def main() -> None:
+    """Print the tables, and write a contact sheet."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
+    parser.add_argument("--size", type=int, default=96, help="pixels")
+    parser.add_argument("--bodies", type=int, default=6, help="at most so many")
+    parser.add_argument("--bounces", type=int, default=0)
+    parser.add_argument("--samples", type=int, default=512, help="paths of a pixel of the reference")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
+    parser.add_argument("--references", type=Path, default=Path("out/references"), help="where references stay")
+    parser.add_argument("--picture", type=Path, help="contact sheet: reference, then each method")
+    arguments = parser.parse_args()
+    ws.quiet()
+    errors: dict[str, list[float]] = {method: [] for method in arguments.methods}
+    sheet = []
+    print(f"{'body':16}{'roughness':10}{'kind':9}" + "".join(f"{name:>8} body    time" for name in arguments.methods))
+    for (name, plain), roughness, kind in itertools.product(
+        scenes(arguments.data, arguments.size, arguments.bodies).items(), ROUGHNESS, KINDS
+    ):
+        scene = dataclasses.replace(glossy(plain, roughness, kind), bounces=arguments.bounces)
+        request = Request(scene, "mitsuba", arguments.bounces, arguments.samples, arguments.references)
+        reference = request.reference()
+        row, line = [reference.mean], f"{name:16}{roughness:<10}{kind:9}"
+        for method in arguments.methods:
+            shown, seconds = image(scene, method)
+            errors[method].append(reference.error(shown))
+            line += f"{reference.error(shown):8.1%}{body_error(reference, shown):6.1%}{seconds:6.2f} s"
+            row.append(shown)
+        sheet.append(np.concatenate(row, axis=0))
+        print(line + f"   noise {reference.noise():.1%}", flush=True)
+    for method, values in errors.items():
+        print(f"{method}: {np.mean(values):.1%} on average, {np.max(values):.1%} at worst")
+    if arguments.picture:
+        ws.Picture(np.concatenate(sheet, axis=1)).write(arguments.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""Gloss: the light of bodies that shine, at receivers that pixels see.
+
+Lobes are sampled at the receivers of glossy bodies; each sample looks up light without shadows in a prefiltered map,
+and its transmittance in the way of the method. Diffuse light is found as for all bodies, and mixed in at the end.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.batch import concatenate, cut
+from warpshadow.device.constants import constant
+from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, converted, map_of, receiver_words
+from warpshadow.pipeline.node import Fixed, Input, Node
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.scene.scene import GLOSS
+from warpshadow.stages.gloss.lobes import sample_lobes
+from warpshadow.stages.gloss.prefilter import look_up as look_up_light
+from warpshadow.stages.gloss.prefilter import prefilter
+from warpshadow.stages.gloss.reflection import reflect, sum_lobes
+from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.receivers import Receivers
+from warpshadow.stages.sample_receivers import Span
+
+if TYPE_CHECKING:
+    from warpshadow.pipeline.view import View
+
+_CELL_ROWS = 64
+"""Rows of the map of free light in cells: each pixel has the light of the nearest cell."""
+
+
+class GlossyPoints(LitPoints):
+    """The receivers of a view on bodies that shine.
+
+    Args:
+        view: The view.
+    """
+
+    def __init__(self, view: View):
+        glossy = view.merged_scene.is_glossy
+        self._view = view
+        receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
+        arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
+        super().__init__(*arguments, normals=view.normals, blocking=view.blocking, is_static=view.is_static)
+        self._numbers = Node("", functools.partial(_numbers, glossy), Fixed(view.receivers_node))
+
+    def mixed(self, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
+        """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
+
+        Args:
+            diffuse: Node of the view's shading.
+            light: As for :meth:`LitPoints.shading`.
+            materials: Of the bodies.
+        """
+        words = functools.partial(receiver_words, self)
+        roughness, metallic, specular = (self._values(materials, name) for name in GLOSS)
+        key = materials.gloss["roughness"]
+
+        def lobes() -> Node:
+            return Node("lobes", _sample, self.receivers_node, roughness, self._view.cameras, items=words)
+
+        sampled = self.cached("lobes", key, lobes)
+        directions, weights, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
+        source = self._light(light)
+        texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
+        radiance = Node("prefiltered light", look_up_light, texels, directions, weights, items=words)
+        through = self.method.lobe_transmittance(self, directions, source)
+        sums = Node("gloss", sum_lobes, weights, radiance, through, items=words)
+        straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
+        arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
+        mix = Node("reflection", reflect, *arguments, items=words)
+        return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)
+
+    def _values(self, materials: Materials, name: str) -> Node:
+        """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
+        return Node("", self._interpolate, self.receivers_node, materials.vertex_gloss(name))
+
+    def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
+        faces, seen = self.merged_scene.faces, receivers.seen
+        assert seen is not None
+        if not seen.face_ids.size:
+            return wp.empty((1, 0), dtype=wp.float32, device=faces.device)
+        sides = constant(np.tile(faces.numpy(), (2, 1)), wp.vec3i, faces.device)
+        rows = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
+        result = interpolate(rows, sides, values)
+        return result.reshape((len(result), -1))
+
+    def _light(self, light: Light | None) -> Input:
+        """The light as an input; the same for the same light."""
+        if light is None or light is self.method.light.value():
+            return self.method.light
+        if isinstance(light, wp.array):
+            return Input("light", light, news="light is given")
+        self._known_light = Input.renewed("light", light, getattr(self, "_known_light", None))
+        return self._known_light
+
+    def _prefiltered(self, light: Input) -> Node:
+        """Node of the texels of light, vec3 of shape [batch, texel]."""
+        device = self.merged_scene.device
+        if isinstance(light.value(), wp.array):
+            return Node("prefiltering", self._blurred, light, items=lambda: f"{self.method.basis.size} coefficients")
+        return Node("prefiltering", functools.partial(_texels, device), light)
+
+    def _blurred(self, light: wp.array) -> wp.array:
+        """Texels of free light. Differentiable: light."""
+        return converted(light, _blurred_basis(self.method.basis))
+
+
+@functools.lru_cache(maxsize=4)
+def _blurred_basis(basis: object) -> np.ndarray:
+    """The matrix from coefficients of a basis to texels, float32 of shape [texel, coefficient]."""
+    from warpshadow.maths import sh
+
+    directions = sh.equirectangular_directions(_CELL_ROWS)
+    functions = basis.functions(directions.reshape(-1, 3))  # type: ignore[attr-defined]
+    return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
+
+
+def _texels(device: wp.Device, light: KnownLight) -> wp.array:
+    return wp.array(prefilter(map_of(light))[None], dtype=wp.vec3, device=device)
+
+
+def _sample(receivers: Receivers, roughness: wp.array, cameras: wp.array) -> tuple[wp.array, wp.array, wp.array]:
+    return sample_lobes(receivers.points, receivers.normals, roughness, cameras)
+
+
+def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:
+    return [span for span in receivers.spans if span.body >= 0 and is_glossy[span.body]]
+
+
+def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
+    """Of each receiver of a view among the glossy ones, −1 for diffuse ones, int32 of shape [receiver]."""
+    first = len(receivers.on_static)
+    numbers, count = np.full(first + receivers.points.shape[1], -1, np.int32), 0
+    for span in _spans(is_glossy, receivers):
+        numbers[first + span.first : first + span.end] = count + np.arange(span.end - span.first)
+        count += span.end - span.first
+    return wp.array(numbers, dtype=wp.int32, device=receivers.points.device)
+
+
+def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
+    """The glossy ones among the receivers of a view, all of which pixels see. Differentiable: points, normals."""
+    spans, count = _spans(is_glossy, receivers), 0
+    assert receivers.vertices is not None
+    at_vertices, seen = receivers.vertices.size, receivers.seen
+    renumbered = []
+    for span in spans:
+        renumbered.append(Span(span.body, count, count + span.end - span.first))
+        count = renumbered[-1].end
+
+    def chosen(array: wp.array, first: int) -> wp.array:
+        parts = [cut(array, span.first - first, span.end - first) for span in spans]
+        if not parts:
+            return wp.empty((len(array), 0), dtype=array.dtype, device=array.device)
+        return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
+
+    if seen is None:
+        device = receivers.points.device
+        seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
+    fragments = Fragments(chosen(seen.face_ids, at_vertices), chosen(seen.barycentrics, at_vertices))
+    none = constant(np.empty(0, int), wp.int32, receivers.points.device)
+    points, normals = chosen(receivers.points, 0), chosen(receivers.normals, 0)
+    arguments = points, normals, receivers.faces, none, fragments
+    return Receivers(*arguments, spans=tuple(renumbered), vertices=none, seen=fragments)

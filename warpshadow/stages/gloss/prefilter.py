@@ -1,0 +1,180 @@
+"""Prefiltered light: a map blurred by Gaussians of rising width, and its lookup.
+
+Level 0 is the map; level k ≥ 1 has a Gaussian of σ = 2^(k−1) π / rows around each direction, and texels as wide as σ.
+Between levels log σ interpolates, between texels their positions do. Levels stand one after another, each a latitude
+by longitude grid as :class:`warpshadow.EnvironmentMap` has it. It is linear in the map.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
+from warpshadow.maths import sh
+
+ROWS = 128
+"""Most rows of level 0."""
+
+_LEAST_ROWS = 16
+_LEVELS = 7
+
+_COST = 60.0
+"""Nanoseconds that a lookup takes."""
+
+wp.set_module_options({"max_unroll": 1})
+
+
+def level_rows(rows: int) -> list[int]:
+    """Rows of each level of a map of a number of rows."""
+    return [rows] + [max(rows >> level, _LEAST_ROWS) for level in range(_LEVELS - 1)]
+
+
+def with_rows(radiance: np.ndarray, rows: int) -> np.ndarray:
+    """A map [height, width, channel] as [rows, 2 rows, channel]: means by area, or repeated pixels."""
+    height = len(radiance)
+    bounds = np.arange(rows + 1) * height / rows
+    cosines = np.cos(np.pi * np.arange(height + 1) / height)
+
+    def along(values: np.ndarray, edges: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Integrals of a piecewise constant function between edges, over the first axis."""
+        total = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values * sizes[:, None, None], axis=0)])
+        whole = np.minimum(edges.astype(int), len(values) - 1)
+        return np.diff(total[whole] + (edges - whole)[:, None, None] * (values * sizes[:, None, None])[whole], axis=0)
+
+    sizes = -np.diff(cosines)
+    ones = np.ones((height, 1, 1))
+    by_rows = along(radiance.astype(np.float64), bounds, sizes) / along(ones, bounds, sizes)
+    columns = np.arange(2 * rows + 1) * height / rows
+    turned = along(by_rows.swapaxes(0, 1), columns, np.ones(2 * height)) * (rows / height)
+    return turned.swapaxes(0, 1)
+
+
+@functools.cache
+def _blur_spectra(rows: int, sigma: float) -> np.ndarray:
+    """Of a Gaussian from row to row, over longitude: [row, row of the source, frequency]."""
+    polar = np.pi * (np.arange(rows) + 0.5) / rows
+    turns = np.pi * np.arange(2 * rows) / rows
+    solid_angles = sh.pixel_solid_angles(rows)
+    spectra = np.empty((rows, rows, rows + 1))
+    for row in range(rows):
+        cosine = np.cos(polar[row]) * np.cos(polar)[:, None] + np.outer(
+            np.sin(polar[row]) * np.sin(polar), np.cos(turns)
+        )
+        weights = np.exp((cosine - 1) / sigma**2) * solid_angles[:, None]
+        spectra[row] = np.fft.rfft(weights / weights.sum(), axis=1).real  # it is even
+    return spectra
+
+
+def prefilter(radiance: np.ndarray) -> np.ndarray:
+    """Blur a map.
+
+    Args:
+        radiance: Shape [height, 2·height, channel], of any number of channels.
+
+    Returns:
+        Texels of all levels, one level and row after another, float32 of shape [texel, channel].
+    """
+    rows = min(max(1 << (len(radiance) - 1).bit_length(), 64), ROWS)
+    levels = [with_rows(radiance, rows)]
+    for level, count in enumerate(level_rows(rows)[1:]):
+        spectrum = np.fft.rfft(with_rows(levels[0], count), axis=1)
+        blurred = np.einsum("rsf,sfc->rfc", _blur_spectra(count, 2**level * np.pi / rows), spectrum, optimize=True)
+        levels.append(np.fft.irfft(blurred, 2 * count, axis=1))
+    channels = radiance.shape[2]
+    return np.concatenate([level.reshape(-1, channels) for level in levels]).astype(np.float32)
+
+
+def rows_of(texel_count: int) -> int:
+    """Rows of level 0, by the number of all texels."""
+    return next(rows for rows in (64, ROWS) if sum(2 * count**2 for count in level_rows(rows)) == texel_count)
+
+
+@wp.func
+def _at_level(texels: wp.array(dtype=wp.vec3), first: int, rows: int, polar: float, azimuth: float):
+    """Interpolate a level at a direction; rows end at the poles, columns go around."""
+    row = wp.clamp(polar * float(rows) - 0.5, 0.0, float(rows) - 1.0)
+    column = azimuth * float(2 * rows) - 0.5
+    upper = wp.min(int(row), rows - 2)
+    left = int(wp.floor(column))
+    down = row - float(upper)
+    right = column - float(left)
+    if left < 0:
+        left += 2 * rows
+    next_column = left + 1
+    if next_column >= 2 * rows:
+        next_column = 0
+    above = first + upper * 2 * rows
+    below = above + 2 * rows
+    return (1.0 - down) * ((1.0 - right) * texels[above + left] + right * texels[above + next_column]) + down * (
+        (1.0 - right) * texels[below + left] + right * texels[below + next_column]
+    )
+
+
+@wp.func
+def _rows_at(level: int, rows: int):
+    """Rows of a level."""
+    return wp.where(level == 0, rows, wp.max(rows >> wp.max(level - 1, 0), _LEAST_ROWS))
+
+
+@wp.kernel
+def _look_up(
+    first_row: int,
+    worker: int,
+    # in
+    texels: wp.array2d(dtype=wp.vec3),
+    rows: int,
+    directions: wp.array3d(dtype=wp.vec3),
+    weights: wp.array3d(dtype=wp.vec3),
+    # out
+    light: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a receiver."""
+    batch, receiver = split_row(first_row + wp.tid(), light.shape[1])
+    lit = texels[instance_in(batch, texels.shape[0])]
+    located = instance_in(batch, directions.shape[0])
+    for i in range(light.shape[2]):
+        direction = directions[located, receiver, i]
+        polar = wp.acos(wp.clamp(direction[1], -0.999999, 0.999999)) / wp.pi
+        azimuth = wp.atan2(direction[0], -direction[2]) / (2.0 * wp.pi)
+        azimuth = azimuth - wp.floor(azimuth)
+        # half a texel of the map itself is between levels 0 and 1
+        blur = wp.max(weights[located, receiver, i][2] * float(rows) / wp.pi, 0.5)
+        height = wp.clamp(wp.log2(blur) + 1.0, 0.0, float(_LEVELS) - 1.001)
+        level = int(height)
+        finer = int(0)
+        for k in range(level):
+            finer += 2 * _rows_at(k, rows) * _rows_at(k, rows)
+        own = _rows_at(level, rows)
+        a = _at_level(lit, finer, own, polar, azimuth)
+        b = _at_level(lit, finer + 2 * own * own, _rows_at(level + 1, rows), polar, azimuth)
+        light[batch, receiver, i] = a + (height - float(level)) * (b - a)
+
+
+def look_up(texels: wp.array, directions: wp.array, weights: wp.array) -> wp.array:
+    """Look up light from the directions of lobes.
+
+    Args:
+        texels: Of :func:`prefilter`, linear RGB, vec3 of shape [batch, texel].
+        directions, weights: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample].
+
+    Returns:
+        Radiance, vec3 of shape [batch, receiver, sample].
+
+    Differentiable: texels, directions, weights.
+    """
+    check.shape("weights", weights.shape, directions.shape)
+    count = common_batch({"texels": texels, "directions": directions})
+    light = wp.empty((count, *directions.shape[1:]), dtype=wp.vec3, device=directions.device)
+    launch(
+        _look_up,
+        count * directions.shape[1],
+        inputs=[texels, rows_of(texels.shape[1]), directions, weights],
+        outputs=[light],
+        shared=[texels, directions, weights],
+        cost=_COST * directions.shape[2],
+    )
+    return light

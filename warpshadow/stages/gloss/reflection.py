@@ -1,0 +1,164 @@
+"""Reflection: the light of a lobe and diffuse light, as glTF mixes them for metals and for all else.
+
+With G = Σ w (T L + R) and G' = Σ w' (T L + R) over the samples of a lobe, T their transmittance and R the radiance of
+what blocks them, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects a A + C:
+
+    A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),
+    C = (1 − m) s (F₀ G + (1 − F₀) G') + m G'.
+
+E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is taken for all light.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
+
+STRAIGHT = 0.04
+"""F₀ of all that is not metal: an index of refraction of 1.5."""
+
+_COST = 10.0
+"""Nanoseconds that a sample takes."""
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@wp.kernel
+def _sum_lobes(
+    first_row: int,
+    worker: int,
+    # in
+    weights: wp.array3d(dtype=wp.vec3),
+    light: wp.array3d(dtype=wp.vec3),
+    transmittance: wp.array3d(dtype=wp.float32),
+    # out
+    straight: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver: G and G'."""
+    batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
+    located = instance_in(batch, weights.shape[0])
+    lit = instance_in(batch, light.shape[0])
+    through = instance_in(batch, transmittance.shape[0])
+    total = wp.vec3()
+    total_grazing = wp.vec3()
+    for i in range(weights.shape[2]):
+        weight = weights[located, receiver, i]
+        radiance = transmittance[through, receiver, i] * light[lit, receiver, i]
+        total += weight[0] * radiance
+        total_grazing += weight[1] * radiance
+    straight[batch, receiver] = total
+    grazing[batch, receiver] = total_grazing
+
+
+def sum_lobes(weights: wp.array, light: wp.array, transmittance: wp.array) -> tuple[wp.array, wp.array]:
+    """Sum the light of lobes.
+
+    Args:
+        weights: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
+        light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
+        transmittance: Float32 of shape [batch, receiver, sample].
+
+    Returns:
+        G and G', vec3 of shape [batch, receiver].
+
+    Differentiable: all.
+    """
+    count = common_batch({"weights": weights, "light": light, "transmittance": transmittance})
+    sums = [wp.empty((count, weights.shape[1]), dtype=wp.vec3, device=weights.device) for _ in range(2)]
+    launch(
+        _sum_lobes,
+        count * weights.shape[1],
+        inputs=[weights, light, transmittance],
+        outputs=sums,
+        shared=[weights, light, transmittance],
+        cost=_COST * weights.shape[2],
+    )
+    return sums[0], sums[1]
+
+
+@functools.cache
+def even_grazing() -> wp.vec3:
+    """Coefficients of e(μ) = c₀ + c₁ (1 − μ)² + c₂ (1 − μ)⁴, fitted to ∫ (1 − v·h)⁵ max(n·l, 0) dω / π."""
+    count = 64
+    z = (np.arange(count) + 0.5) / count
+    azimuth = 2 * np.pi * (np.arange(2 * count) + 0.5) / (2 * count)
+    sine = np.sqrt(1 - z**2)
+    cosines = np.linspace(0, 1, 33)
+    towards = cosines[:, None, None] * z[:, None] + np.sqrt(1 - cosines**2)[:, None, None] * np.outer(
+        sine, np.cos(azimuth)
+    )
+    values = (2 * z[:, None] * (1 - np.sqrt(np.maximum((1 + towards) / 2, 0))) ** 5).mean(axis=(1, 2))
+    powers = np.stack([np.ones_like(cosines), (1 - cosines) ** 2, (1 - cosines) ** 4], axis=1)
+    return wp.vec3(*np.linalg.lstsq(powers, values, rcond=None)[0].tolist())
+
+
+@wp.kernel
+def _reflect(
+    # in
+    numbers: wp.array(dtype=wp.int32),
+    diffuse: wp.array2d(dtype=wp.vec3),
+    straight: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
+    cosines: wp.array2d(dtype=wp.float32),
+    metallic: wp.array2d(dtype=wp.float32),
+    specular: wp.array2d(dtype=wp.float32),
+    even: wp.vec3,
+    # out
+    colored: wp.array2d(dtype=wp.vec3),
+    white: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver of any body."""
+    batch, receiver = wp.tid()
+    number = numbers[receiver]
+    light = diffuse[instance_in(batch, diffuse.shape[0]), receiver]
+    if number < 0:
+        colored[batch, receiver] = light
+        white[batch, receiver] = wp.vec3()
+    else:
+        lobe = straight[instance_in(batch, straight.shape[0]), number]
+        rest = grazing[instance_in(batch, grazing.shape[0]), number]
+        m = metallic[instance_in(batch, metallic.shape[0]), number]
+        s = specular[instance_in(batch, specular.shape[0]), number]
+        slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), number]
+        slant = slant * slant
+        reflected = STRAIGHT + (1.0 - STRAIGHT) * (even[0] + slant * (even[1] + slant * even[2]))
+        colored[batch, receiver] = (1.0 - m) * (1.0 - s * reflected) * light + m * (lobe - rest)
+        white[batch, receiver] = (1.0 - m) * s * (STRAIGHT * lobe + (1.0 - STRAIGHT) * rest) + m * rest
+
+
+def reflect(
+    numbers: wp.array,
+    diffuse: wp.array,
+    straight: wp.array,
+    grazing: wp.array,
+    cosines: wp.array,
+    metallic: wp.array,
+    specular: wp.array,
+) -> tuple[wp.array, wp.array]:
+    """Mix diffuse and glossy light.
+
+    Args:
+        numbers: Of each receiver among the glossy ones, −1 for diffuse ones, int32 of shape [receiver].
+        diffuse: E, light that receivers would reflect as white diffuse surfaces, vec3 of shape [batch, receiver].
+        straight, grazing: G and G' of the glossy ones, vec3 of shape [batch, glossy].
+        cosines: μ of them, float32 of shape [batch, glossy].
+        metallic, specular: m and s of them, float32 of shape [batch, glossy].
+
+    Returns:
+        A and C, vec3 of shape [batch, receiver]; E and 0 of diffuse ones.
+
+    Differentiable: all but numbers.
+    """
+    check.shape("numbers", numbers.shape, diffuse.shape[1:])
+    arrays = {"diffuse": diffuse, "gloss": straight, "cosines": cosines, "metallic": metallic, "specular": specular}
+    shape = common_batch(arrays), diffuse.shape[1]
+    colored, white = (wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2))
+    inputs = [numbers, diffuse, straight, grazing, cosines, metallic, specular, even_grazing()]
+    launch(_reflect, shape, inputs=inputs, outputs=[colored, white])
+    return colored, white

@@ -1,0 +1,92 @@
+"""Transmittance towards the samples of a lobe, by rays: 0 or 1, through packets of 16."""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.launch import launch
+from warpshadow.stages.gloss.lobes import SAMPLES
+from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
+
+_PACKET_COST = 2000.0
+"""Nanoseconds that a packet takes."""
+
+
+def packet_order() -> np.ndarray:
+    """Samples of a lobe by packet, [packet, 16]: those in the middle, and those around it."""
+    return np.arange(SAMPLES).reshape(-1, PACKET)
+
+
+@functools.cache
+def _make_trace() -> wp.Kernel:
+    Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
+    find_open, dot_direction, bits_above = make_find_open(), fn.dot_direction, fn.bits_above
+
+    @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+    def trace_lobes(
+        first_row: int,
+        worker: int,
+        # in
+        tree: FaceTree,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        directions: wp.array2d(dtype=wp.vec3),
+        samples: wp.array2d(dtype=wp.int32),
+        # out
+        transmittance: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a receiver."""
+        receiver = first_row + wp.tid()
+        point = points[receiver]
+        normal = normals[receiver]
+        last = int(-1)
+        for packet in range(samples.shape[0]):
+            x = Lane()
+            y = Lane()
+            z = Lane()
+            for lane in range(PACKET):
+                direction = directions[receiver, samples[packet, lane]]
+                x[lane] = direction[0]
+                y[lane] = direction[1]
+                z[lane] = direction[2]
+            toward = Vectors(x, y, z)
+            facing_rays = bits_above(dot_direction(normal, toward), 0.0)
+            is_open = int(0)
+            if facing_rays != 0:
+                result = find_open(
+                    tree.corners, tree.lowers, tree.uppers, tree.leaf_count, point, normal, toward, facing_rays, last
+                )
+                is_open = result[0]
+                last = result[1]
+            for lane in range(PACKET):
+                transmittance[receiver, samples[packet, lane]] = float((is_open >> lane) % 2)
+
+    return trace_lobes
+
+
+def trace_lobes(tree: FaceTree, points: wp.array, normals: wp.array, directions: wp.array) -> wp.array:
+    """Trace which samples of lobes meet no face.
+
+    Args:
+        tree: The faces that block light.
+        points: Receiver positions [scene units], vec3 of shape [receiver].
+        normals: Unit normals, vec3 of shape [receiver].
+        directions: Of :func:`.lobes.sample_lobes`, of an instance, vec3 of shape [receiver, sample].
+
+    Returns:
+        1 for samples that meet none, else 0, float32 of shape [receiver, sample].
+
+    Differentiable: no.
+    """
+    transmittance = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
+    launch(
+        _make_trace(),
+        len(points),
+        inputs=[tree, points, normals, directions, constant(packet_order(), wp.int32, points.device)],
+        outputs=[transmittance],
+        cost=_PACKET_COST * SAMPLES / PACKET,
+    )
+    return transmittance

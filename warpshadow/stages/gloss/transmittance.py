@@ -1,0 +1,143 @@
+"""Transmittance towards the samples of a lobe, interpolated between the cells of directions around them.
+
+    T(l) = Σ_q k_q T_q / Σ_q k_q,   k_q = max(l·ω_q − cos ρ, 0)² max(n·ω_q, 0) + ε,   ρ = 2.2 cell radii,
+
+over the cells near l. Cells below the receiver's horizon say nothing of what is above it.
+"""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
+from warpshadow.maths.directions import cell_radius
+
+REACH = 2.2
+"""Distance of a cell from which it no longer counts, in cell radii."""
+
+_ROWS = 32
+"""Rows of the table of cells near directions, and its columns: an octahedron."""
+
+_COST = 60.0
+"""Nanoseconds that a sample takes."""
+
+_NEGLIGIBLE = 1.0e-7
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@functools.lru_cache(maxsize=8)
+def _neighbors(directions: bytes) -> np.ndarray:
+    """Cells near each texel of an octahedron, the nearest first, int32 of shape [texel, cell]."""
+    from scipy.spatial import cKDTree
+
+    cells = np.frombuffer(directions).reshape(-1, 3)
+    place = (np.arange(_ROWS) + 0.5) / _ROWS * 2 - 1
+    x, z = np.meshgrid(place, place)
+    y = 1 - np.abs(x) - np.abs(z)
+    below = np.maximum(-y, 0)
+    texels = np.stack([x - np.sign(x) * below, y, z - np.sign(z) * below], axis=-1).reshape(-1, 3)
+    texels /= np.linalg.norm(texels, axis=1, keepdims=True)
+    reach = 2 * np.sin(min(REACH * cell_radius(len(cells)) + 2.2 / _ROWS, np.pi) / 2)
+    tree = cKDTree(cells)
+    most = max(len(near) for near in tree.query_ball_point(texels, reach))
+    return tree.query(texels, min(max(most, 3), len(cells)))[1].astype(np.int32)
+
+
+@wp.func
+def _texel(direction: wp.vec3):
+    """Texel of the octahedron that a direction is in."""
+    size = wp.abs(direction[0]) + wp.abs(direction[1]) + wp.abs(direction[2])
+    x = direction[0] / size
+    z = direction[2] / size
+    if direction[1] < 0.0:
+        folded = wp.sign(x) * (1.0 - wp.abs(z))
+        z = wp.sign(z) * (1.0 - wp.abs(x))
+        x = folded
+    column = wp.clamp(int((x + 1.0) * 0.5 * float(_ROWS)), 0, _ROWS - 1)
+    row = wp.clamp(int((z + 1.0) * 0.5 * float(_ROWS)), 0, _ROWS - 1)
+    return row * _ROWS + column
+
+
+@wp.kernel
+def _sum_near(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=wp.float32),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array3d(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.vec3),
+    neighbors: wp.array2d(dtype=wp.int32),
+    reach_cosine: float,
+    # out
+    sums: wp.array3d(dtype=wp.vec2),
+):
+    """A thread owns a receiver: the sums of k T and of k."""
+    batch, receiver = split_row(first_row + wp.tid(), sums.shape[1])
+    located = instance_in(batch, directions.shape[0])
+    normal = normals[instance_in(batch, normals.shape[0]), receiver]
+    row = transmittance[instance_in(batch, transmittance.shape[0])]
+    for i in range(sums.shape[2]):
+        direction = directions[located, receiver, i]
+        texel = _texel(direction)
+        total = wp.vec2()
+        for k in range(neighbors.shape[1]):
+            cell = neighbors[texel, k]
+            near = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
+            weight = near * near * wp.max(wp.dot(normal, cells[cell]), 0.0) + _NEGLIGIBLE
+            total += weight * wp.vec2(row[receiver, cell], 1.0)
+        sums[batch, receiver, i] = total
+
+
+@wp.kernel
+def _divide(
+    # in
+    sums: wp.array3d(dtype=wp.vec2),
+    # out
+    means: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a sample."""
+    batch, receiver, i = wp.tid()
+    means[batch, receiver, i] = sums[batch, receiver, i][0] / sums[batch, receiver, i][1]
+
+
+def transmittance_towards(
+    transmittance: wp.array, normals: wp.array, directions: wp.array, cells: np.ndarray
+) -> wp.array:
+    """Interpolate transmittance towards the samples of lobes.
+
+    Args:
+        transmittance: Towards cells, float32 of shape [batch, receiver, cell].
+        normals: Unit normals, vec3 of shape [batch, receiver].
+        directions: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
+        cells: Unit vectors, NumPy of shape [cell, 3].
+
+    Returns:
+        Float32 of shape [batch, receiver, sample].
+
+    Differentiable: transmittance, normals, directions.
+    """
+    check.shape("transmittance", transmittance.shape, ("batch", directions.shape[1], len(cells)))
+    arrays = {"transmittance": transmittance, "directions": directions, "normals": normals}
+    count, device = common_batch(arrays), directions.device
+    near = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
+    reach = float(np.cos(REACH * cell_radius(len(cells))))
+    sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
+    towards, neighbors = constant(cells, wp.vec3, device), constant(near, wp.int32, device)
+    launch(
+        _sum_near,
+        count * directions.shape[1],
+        inputs=[transmittance, normals, directions, towards, neighbors, reach],
+        outputs=[sums],
+        shared=[transmittance, normals, directions],
+        cost=_COST * directions.shape[2],
+    )
+    means = wp.empty(sums.shape, dtype=wp.float32, device=device)
+    launch(_divide, means.shape, inputs=[sums], outputs=[means])
+    return means
