@@ -153,14 +153,18 @@ def module_options(lanes: int) -> dict[str, Any]:
     return {"max_unroll": 1} | ({"cpu_compiler_flags": compiler_flags(lanes)} if lanes > 1 else {})
 
 
-@functools.cache
 def use_vector_registers(module_name: str, device: wp.Device) -> None:
     """Give the kernels on chunks of a Python module the flags that follow a CPU, before the first is built.
 
     Importing the module does not ask for the CPU: that starts Warp.
     """
     if device.is_cpu:
-        wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
+        _set_vector_options(module_name)
+
+
+@functools.cache
+def _set_vector_options(module_name: str) -> None:
+    wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
 
 
 def block_count(vertex_count: int, lanes: int) -> int:
