@@ -83,6 +83,7 @@ def test_receivers_between_corners_get_the_light_that_they_get_alone(device):
 
 
 def test_a_still_is_that_of_all_rays_at_all_receivers(monkeypatch):
+    monkeypatch.setattr("warpshadow.stages.shared_rays.SQUARES", 32)  # of 2 × 2 pixels
     image = ws.render(scene(64))
     monkeypatch.setattr("warpshadow.pipeline.rays.find_corners", lambda *_: None)
     assert 0 < error(image, ws.render(scene(64))) < 0.005

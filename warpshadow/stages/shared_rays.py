@@ -34,8 +34,10 @@ _PACKET_COST = 2000.0
 _PILOTS = 256
 """Receivers that stand for all, where directions are chosen."""
 
-SQUARE = 4
-"""Pixels of the side of the squares at whose corners all rays are traced."""
+SQUARES = 128
+"""Squares at whose corners all rays are traced, across the shorter side of an image, or more: their side in pixels is a
+power of two. With squares of 4 pixels at 128², thin shadows are missed: chair_wheel_fence of demos/kinds.py is 4.4% off
+a path tracer, in place of 2.5%."""
 
 TOLERANCE = 0.02
 """Part of a receiver's light that may come from rays whose visibility is interpolated."""
@@ -262,12 +264,15 @@ def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Cor
     own = triangles[face_ids]
     own = np.where((face_ids >= 0) & (own == own[..., :1]).all(axis=-1), own[..., 0], -1)
     of_pixel = own[::supersampling, ::supersampling]
+    square = 1 << max(min(of_pixel.shape) // SQUARES, 1).bit_length() - 1
+    if square == 1:
+        return result
     places = np.full((count + 1, 2), -1)
     places[own] = np.moveaxis(np.indices(own.shape), 0, -1) // supersampling
     places = places[:-1]  # the last item was for samples without a receiver
     inside = np.flatnonzero(places[:, 0] >= 0)
-    first = places[inside] // SQUARE * SQUARE
-    last = np.minimum(first + SQUARE, np.array(of_pixel.shape) - 1)
+    first = places[inside] // square * square
+    last = np.minimum(first + square, np.array(of_pixel.shape) - 1)
     rows, columns = np.stack([first, last]).transpose(2, 1, 0)  # each [receiver, 2]
     corners = of_pixel[rows[:, [0, 0, 1, 1]], columns[:, [0, 1, 0, 1]]]
     points, normals = (item.numpy()[min(instance, len(item) - 1)] for item in (receivers.points, receivers.normals))
