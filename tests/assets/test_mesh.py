@@ -10,6 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warpshadow.assets import mesh_files
 from warpshadow.assets.mesh import Mesh, MeshError
 from warpshadow.assets.mesh_files import load_mesh
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -295,6 +296,46 @@ def test_an_stl_file_that_is_cut_off_says_so(tmp_path, kind, part, messages):
     (tmp_path / "x.stl").write_bytes(content[: int(part * len(content))])
     with pytest.raises(MeshError, match=f"x.stl: faces: got none.*cut off.*({messages[kind]})"):
         load_mesh(tmp_path / "x.stl")
+
+
+@pytest.mark.parametrize("encoding", ["binary", "ascii"])
+@pytest.mark.parametrize("part", [0.1, 0.3, 0.9, 1.0])
+def test_a_ply_file_that_is_cut_off_says_so(tmp_path, encoding, part):
+    import trimesh
+
+    ball = icosphere(1.0, 2)
+    content = trimesh.Trimesh(ball.positions, ball.faces, process=False).export(file_type="ply", encoding=encoding)
+    content = content.encode() if isinstance(content, str) else content
+    length = 60 if part == 0.1 else int(part * len(content))  # within the header
+    (tmp_path / "x.ply").write_bytes(content[:length])
+    if part == 1:
+        assert load_mesh(tmp_path / "x.ply").face_count == ball.face_count
+    else:
+        with pytest.raises(
+            MeshError, match=r"x.ply: the file is cut off: (its header has no end|got \d+ (lines|bytes))"
+        ):
+            load_mesh(tmp_path / "x.ply")
+
+
+PLAIN_OBJ = "# a fan\nv 0 0 0\nv 1 0 0\nv 0 1e-1 0\n\nv -1 .5 2\nf 1 2 3\nf 1 3 4\n"
+
+
+def test_a_plain_obj_is_read_in_bulk_as_line_by_line(tmp_path, monkeypatch):
+    fast = load_mesh(write(tmp_path, "a.obj", PLAIN_OBJ))
+    monkeypatch.setattr("warpshadow.assets.mesh_files._read_plain_obj", lambda text: None)
+    slow = load_mesh(tmp_path / "a.obj")
+    np.testing.assert_array_equal(fast.positions, slow.positions)
+    np.testing.assert_array_equal(fast.faces, slow.faces)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [("f 1 2 3", "f 1 2 3 4"), ("f 1 2 3", "f 1/1 2/1 3/1"), ("f 1 2 3", "f 1 2 -2"), ("f 1 2 3", "f 1 2 3.0"),
+     ("v 1 0 0", "v 1 0"), ("v 1 0 0", "v 1 0 0 1 0 0"), ("v 1 0 0", "vt 1 0"), ("# a fan", "usemtl red")],
+)  # fmt: skip
+def test_any_other_obj_is_not_read_in_bulk(change):
+    assert mesh_files._read_plain_obj(PLAIN_OBJ) is not None
+    assert mesh_files._read_plain_obj(PLAIN_OBJ.replace(*change)) is None
 
 
 def test_uvs_of_vertices_need_no_faces_of_their_own():

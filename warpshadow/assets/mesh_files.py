@@ -265,11 +265,33 @@ def _colored(part: MeshPart, values: np.ndarray, *, linear: bool = False) -> Mes
     return part._replace(colorless=f"colors of faces dropped ({why})")
 
 
+def _read_plain_obj(text: str) -> MeshPart | None:
+    """Read an OBJ file of vertices and triangles alone, in a tenth of the time; None for any other."""
+    lines = text.splitlines()
+    vertex_lines = [line[2:] for line in lines if line.startswith("v ")]
+    face_lines = [line[2:] for line in lines if line.startswith("f ")]
+    others = sum(1 for line in lines if not line or line.startswith(("#", "vn ", "s ")))
+    triangles = " ".join(face_lines)
+    if len(vertex_lines) + len(face_lines) + others < len(lines):
+        return None
+    if not (vertex_lines and face_lines) or set(triangles) - set("0123456789 \t"):
+        return None
+    try:
+        positions = np.loadtxt(vertex_lines, ndmin=2, comments=None)
+        faces = np.loadtxt(face_lines, dtype=np.int64, ndmin=2, comments=None) - 1
+    except ValueError:  # as where lines differ in length: the other reader says which
+        return None
+    return MeshPart(positions, faces) if positions.shape[1] == faces.shape[1] == 3 else None
+
+
 def _read_obj(path: Path) -> list[MeshPart]:
     """Read v, vt and f lines: trimesh would split the vertices at uv seams and reorder them."""
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    plain = _read_plain_obj(text)
+    if plain is not None:
+        return [plain]
     positions, colors, uvs, corners, uv_corners, corner_counts = [], [], [], [], [], []
     libraries, material, materials = [], "", set()
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
         try:
             match line.partition("#")[0].split():
@@ -336,6 +358,8 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
     import trimesh
 
+    if path.suffix.lower() == ".ply" and (fault := _ply_fault(path.read_bytes())):
+        raise MeshError(f"the file is cut off: {fault}")
     tree = _gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
     parts = _trimesh_parts(loaded, of_file=True, factors=_base_color_factors(tree))
@@ -360,6 +384,36 @@ def _stl_fault(content: bytes) -> str:
     return f"; the file is cut off: got {len(content)} bytes" + (
         f", and its header says {count} triangles, which are {size}" if has_header else ", fewer than its header has"
     )
+
+
+def _ply_fault(content: bytes) -> str:
+    """What a PLY file lacks that is cut off, for messages; "" where its items may all be there."""
+    header, mark, body = content.partition(b"end_header")
+    if not mark:
+        return "its header has no end" if header.startswith(b"ply") else ""
+    count, needed, wanted = 0, 0, []
+    is_ascii = b"format ascii" in header
+    for words in map(bytes.split, header.splitlines()):
+        if words[:1] == [b"element"]:
+            count = int(words[2])
+            wanted.append(f"{count} of {words[1].decode(errors='replace')}")
+            needed += is_ascii * count
+        elif words[:1] == [b"property"] and not is_ascii:
+            has_list = words[1] == b"list"
+            least = 3 if has_list and words[-1] in (b"vertex_indices", b"vertex_index") else 0
+            sizes = [_PLY_BYTES.get(word, 0) for word in words[2:4]] if has_list else [0, 0]
+            needed += count * (sizes[0] + least * sizes[1] if has_list else _PLY_BYTES.get(words[1], 0))
+    lines = [line for line in body.splitlines() if line.strip()] if is_ascii else []
+    got, unit = (len(lines), "lines") if is_ascii else (len(body.split(b"\n", 1)[-1]), "bytes")
+    if got >= needed:
+        return ""
+    return f"got {got} {unit} after its header, which says {', '.join(wanted)}, at least {needed} {unit}"
+
+
+_PLY_BYTES = {b"char": 1, b"uchar": 1, b"short": 2, b"ushort": 2, b"int": 4, b"uint": 4, b"float": 4, b"double": 8} | {
+    f"{kind}{bits}".encode(): bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)
+}
+"""Sizes of the numbers of PLY files."""
 
 
 def _merged(part: MeshPart) -> MeshPart:
