@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.scene.scene import Body, Scene
 
-if TYPE_CHECKING:
-    from scipy.spatial import ConvexHull
-
 GUESS = "guess"  # ways to point up: the one that :func:`guess_up` finds
 
 _AXES = {"y": 1, "z": 2}
@@ -31,6 +28,7 @@ _FOOT = 0.02  # height of the part that touches the ground, as a part of the siz
 _FIRMER = 0.2  # difference of footings that decides
 _THIN = 0.3  # extent of plates and doors along their normal, as a part of the next
 _SAMPLES = 4000
+_HULL_DIRECTIONS = 64
 _SYMMETRIC, _ASYMMETRIC = 1.1, 2.0  # distances to the mirrored surface, in distances between samples
 
 
@@ -57,7 +55,10 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
         return UpGuess("y", f"as {suffix} files have it")
     rng = np.random.default_rng(0)
     samples = _samples(mesh, rng), _samples(mesh, rng)
-    mirrored = {axis: _mirror_distance(*samples, number) for axis, number in _AXES.items()}
+    usual = _mean_distance(*samples) or np.inf
+    mirrored = {
+        axis: _mean_distance(_mirrored(samples[0], number), samples[1]) / usual for axis, number in _AXES.items()
+    }
     for axis, other in (("y", "z"), ("z", "y")):
         if mirrored[other] < _SYMMETRIC and mirrored[axis] > _ASYMMETRIC:
             return UpGuess(axis, f"along {other} it is symmetric")
@@ -103,30 +104,44 @@ def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
     level = np.delete(points, axis, axis=1)
     height = points[:, axis] - points[:, axis].min()
     base, shadow = _hull(level[height < _FOOT * np.ptp(points, axis=0).max()]), _hull(level)
-    if base is None or shadow is None:
+    if _area(base) <= 1e-9 * np.ptp(points, axis=0).max() ** 2:
         return 0.0
-    is_stable = (base.equations @ [*np.delete(middle, axis), 1.0] < 0).all()
-    return base.volume / shadow.volume if is_stable else 0.0  # scipy calls the area of a polygon that
+    ends = np.roll(base, -1, axis=0)
+    is_stable = (_cross(ends - base, np.delete(middle, axis) - base) > 0).all()
+    return _area(base) / _area(shadow) if is_stable else 0.0
 
 
-def _hull(points: np.ndarray) -> ConvexHull | None:
-    """Convex hull of points in a plane; None for points on a line."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return ConvexHull(points)
-    except (QhullError, ValueError):
-        return None
+def _hull(points: np.ndarray) -> np.ndarray:
+    """Corners of about the convex hull of points in a plane, counterclockwise: the outermost in some directions."""
+    angles = 2 * np.pi * np.arange(_HULL_DIRECTIONS) / _HULL_DIRECTIONS
+    outermost = [np.argmax(points @ direction) for direction in np.stack([np.cos(angles), np.sin(angles)], axis=1)]
+    return points[[one for one, before in zip(outermost, np.roll(outermost, 1), strict=True) if one != before]]
 
 
-def _mirror_distance(one: np.ndarray, other: np.ndarray, axis: int) -> float:
-    """Mean distance from samples of a surface, upside down, to others; 1 is that of the same as they are."""
-    from scipy.spatial import KDTree
+def _area(corners: np.ndarray) -> float:
+    """Area of a polygon."""
+    return float(_cross(corners, np.roll(corners, -1, axis=0)).sum() / 2)
 
-    tree, mirrored = KDTree(one), other.copy()
-    mirrored[:, axis] = one[:, axis].min() + one[:, axis].max() - mirrored[:, axis]
-    usual = tree.query(other)[0].mean()
-    return float(tree.query(mirrored)[0].mean() / usual) if usual else 1.0
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _mirrored(points: np.ndarray, axis: int) -> np.ndarray:
+    """Points upside down."""
+    result = points.copy()
+    result[:, axis] = points[:, axis].min() + points[:, axis].max() - points[:, axis]
+    return result
+
+
+def _mean_distance(points: np.ndarray, others: np.ndarray) -> float:
+    """Mean distance of points to the nearest of others."""
+    middle = others.mean(axis=0)
+    a, b = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
+    nearest = [  # |a − b|² − |a|² in parts that fit a processor's cache
+        ((b**2).sum(axis=1) - 2 * part @ b.T).min(axis=1) for part in np.array_split(a, -(-len(a) // 32))
+    ]
+    return float(np.sqrt(np.maximum(np.concatenate(nearest) + (a**2).sum(axis=1), 0)).mean())
 
 
 def _samples(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
