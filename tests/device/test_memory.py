@@ -1,4 +1,4 @@
-"""Memory: large arrays come in huge pages, where the system has them."""
+"""Memory: new arrays are as Warp makes them, and large ones come in huge pages, where the system has them."""
 
 import mmap
 from pathlib import Path
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warpshadow.device import memory
 from warpshadow.device.memory import in_huge_pages, require_gradient
 
 SIZE = 2**24
@@ -51,3 +52,34 @@ def test_memory_that_is_asked_for_holds_what_is_written(device):
     array = in_huge_pages(wp.empty(values.shape, dtype=wp.float32, device=device))
     array.assign(values)
     np.testing.assert_array_equal(array.numpy(), values)
+
+
+@pytest.mark.parametrize("shape", [5, (3, 4), (2, 0, 3)])
+@pytest.mark.parametrize("dtype", [wp.float32, wp.vec3, wp.int32])
+def test_new_arrays_are_as_warp_makes_them(device, shape, dtype):
+    made, warps = memory.empty(shape, dtype, device), wp.empty(shape, dtype, device=device)
+    hidden = ("ptr", "ctype", "deleter", "_array_interface", "_storage_base_ptr")
+    assert vars(made).keys() == vars(warps).keys()
+    assert all(getattr(made, name) == getattr(warps, name) for name in vars(warps) if name not in hidden)
+    assert not memory.zeros(shape, dtype, device).numpy().any()
+    again = memory.empty(shape, dtype, device)
+    assert not made.size or made.ptr != again.ptr
+
+
+def test_arrays_have_a_copy_of_numpys_values(device):
+    values = np.arange(24.0).reshape(2, 4, 3)
+    array = memory.from_numpy(values, wp.vec3, device)
+    values[:] = 0
+    assert array.shape == (2, 4) and array.numpy().ravel().tolist() == [*range(24)]
+
+
+def test_views_share_values_and_gradients_and_hold_the_memory(device):
+    array = memory.from_numpy(np.arange(24.0).reshape(2, 4, 3), wp.vec3, device)
+    memory.require_gradient(array)
+    view = memory.reshaped(array, (-1,))
+    view.grad.fill_(2.0)
+    assert view.shape == (8,) and view.requires_grad and (array.grad.numpy() == 2).all()
+    del array
+    assert view.numpy().ravel().tolist() == [*range(24)]
+    with pytest.raises(RuntimeError):
+        memory.reshaped(view, (7,))

@@ -8,7 +8,8 @@ import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, reshaped
+from warpshadow.device.warp_internals import contiguous_view
 
 
 def common_batch(arrays: Mapping[str, Any]) -> int:
@@ -73,11 +74,16 @@ def concatenate(parts: Sequence[wp.array], counts: Sequence[int], *, instances: 
 
 
 def cut(array: wp.array, first: int, end: int) -> wp.array:
-    """Items of an array [batch, item] from one up to another, in memory of their own; all as they are.
+    """Items of an array [batch, item] from one up to another, contiguous: a view of a batch of 1, else a copy.
 
     Differentiable: array.
     """
-    return array if (first, end) == (0, array.shape[1]) else concatenate([array[:, first:end]], [end - first])
+    if (first, end) == (0, array.shape[1]):
+        return array
+    if len(array) == 1 and end > first:
+        view = contiguous_view(array, (1, end - first), array.dtype, first=first * array.strides[1])
+        return array[:, first:end] if view is None else view
+    return concatenate([array[:, first:end]], [end - first])
 
 
 def expand(array: wp.array, instances: int) -> wp.array:
@@ -125,4 +131,4 @@ def accumulate(values: wp.array, totals: wp.array) -> None:
 
 def rows(images: Any) -> Any:
     """View images [batch, height, width] as [batch, sample]; None stays None."""
-    return None if images is None else images.reshape((images.shape[0], -1))
+    return None if images is None else reshaped(images, (images.shape[0], -1))

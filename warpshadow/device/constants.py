@@ -39,16 +39,16 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
     def cached(*args: P.args, **kwargs: P.kwargs) -> R:
         assert not kwargs
         key = tuple(map(_key, args))
-        found = results.get(key)
-        if found is None:
+        result = results.get(key)
+        if result is None:
             with collected() as arrays:
-                found = function(*args), arrays  # type: ignore[call-arg]
+                result = function(*args), arrays  # type: ignore[call-arg]
             while len(results) >= _MOST_RESULTS:
                 results.pop(next(iter(results)), None)
-            results[key] = found
+            results[key] = result
         elif _collections:
-            use(*found[1])
-        return found[0]
+            use(*result[1])
+        return result[0]
 
     return cached
 
@@ -61,8 +61,8 @@ def _key(value: Any) -> Hashable:
 
 def use(*arrays: wp.array) -> None:
     """Note that constants are used."""
-    for each in list(_collections.values()):
-        each.extend(arrays)
+    for collection in list(_collections.values()):
+        collection.extend(arrays)
 
 
 @cached_by_values

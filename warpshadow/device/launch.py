@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warpshadow.device import warp_internals
-from warpshadow.device.memory import in_huge_pages, require_gradient
+from warpshadow.device.memory import in_huge_pages, require_gradient, reshaped
 from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint, record_kernel
 from warpshadow.device.warp_internals import is_view, scalar_type
@@ -98,7 +98,9 @@ def varies(values: Iterable[Any]) -> bool:
 
 def detached(array: wp.array) -> wp.array:
     """The same array without a gradient."""
-    same = array.reshape(array.shape)
+    if not array.requires_grad:
+        return array
+    same = reshaped(array, array.shape)
     same.requires_grad = False
     return same
 

@@ -7,12 +7,14 @@ one with gradients. Huge pages, of 2 MB, take a fourth of that. Linux gives them
 
 import ctypes
 import functools
+import math
 import mmap
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import warp as wp
 
-from warpshadow.device.warp_internals import new_array, set_gradient
+from warpshadow.device.warp_internals import contiguous_view, item_shape, new_array, scalar_type, set_gradient
 
 _HUGE = 2**21  # bytes of a huge page
 _LEAST = 2 * _HUGE  # bytes of an array that is worth asking
@@ -52,6 +54,27 @@ def zeros(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.
     return array
 
 
+def from_numpy(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array:
+    """Copy values [*shape, *shape of an item] to an array: ``wp.array``, but quicker."""
+    shape = values.shape[: values.ndim - len(item_shape(dtype))]
+    device = device if isinstance(device, wp.Device) else wp.get_device(device)
+    if not device.is_cpu or not values.size:
+        return wp.array(values, dtype=dtype, device=device)
+    values = np.ascontiguousarray(values, wp.dtype_to_numpy(scalar_type(dtype)))
+    array = empty(shape, dtype, device)
+    ctypes.memmove(array.ptr, values.__array_interface__["data"][0], values.nbytes)
+    return array
+
+
+def reshaped(array: wp.array, shape: Sequence[int]) -> wp.array:
+    """View an array in another shape: ``array.reshape``, but quicker. One length may be −1."""
+    if -1 in shape:
+        rest = -math.prod(shape)
+        shape = [array.size // rest if length == -1 else length for length in shape] if rest else shape
+    view = contiguous_view(array, shape, array.dtype) if math.prod(shape) == array.size else None
+    return array.reshape(tuple(shape)) if view is None else view
+
+
 def require_gradient(array: wp.array) -> None:
     """Let an array require a gradient, which is zero."""
     if not array.requires_grad:
@@ -64,6 +87,9 @@ def as_items(array: wp.array, dtype: type, count: int) -> wp.array:
     """View every ``count`` items of the last dimension as one of another dtype; the remainder is left out."""
     *lengths, last = array.shape
     shape, strides = (*lengths, last // count), (*array.strides[:-1], count * array.strides[-1])
+    is_whole = last % count == 0 and not array.requires_grad
+    if is_whole and (view := contiguous_view(array, shape, dtype)) is not None:
+        return view
     items = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     items.viewed = array  # the memory stays while the view does
     return items

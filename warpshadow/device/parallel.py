@@ -138,7 +138,7 @@ def launch_slices(
     device: wp.Device,
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
-    rows = thread_count() if device.is_cpu else math.prod(_shape(dim))
+    rows = 0 if not scratch else thread_count() if device.is_cpu else math.prod(_shape(dim))
     before = [*inputs, *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch), *outputs]
     summed = {place: array for place, array in enumerate(sums, 2 + len(before)) if array is not None}
     _launch_slices(kernel, dim, cost, [*before, *sums], summed, None, device)

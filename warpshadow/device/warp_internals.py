@@ -169,10 +169,10 @@ def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any]
 
 @functools.lru_cache(maxsize=4096)
 def _cpu_array(shape: Any, dtype: type) -> tuple[dict[str, Any], bytes, int]:
-    """Attributes of a new CPU array but for its memory, its descriptor, and its bytes, 0 where Warp is to make it."""
+    """Attributes of a new CPU array but for its memory, its descriptor, and its bytes."""
     array = wp.empty(shape, dtype, device="cpu")
     attributes = dict(vars(array)) | {"deleter": _free}
-    return attributes, bytes(array.__ctype__()), array.capacity if array.is_contiguous else 0
+    return attributes, bytes(array.__ctype__()), array.capacity
 
 
 def _free(pointer: int, size: int) -> None:
@@ -186,14 +186,41 @@ def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.
         return wp.empty(shape, dtype, device=device)
     attributes, descriptor, size = _cpu_array(shape if isinstance(shape, int) else tuple(shape), dtype)
     pointer = runtime.core.wp_alloc_host(size, None) if size else None
-    if not pointer:
-        return wp.empty(shape, dtype, device=device)
+    if size and not pointer:
+        raise MemoryError(f"got no memory for an array of {size:,} bytes")
     array = object.__new__(wp.array)
     own = array.__dict__
     own.update(attributes)
     own["ptr"], own["ctype"] = pointer, _types.array_t.from_buffer_copy(descriptor)
-    own["ctype"].data = pointer
+    own["ctype"].data = pointer or 0
     return array
+
+
+def array_at(pointer: int, shape: Sequence[int], dtype: type, *, owner: Any) -> wp.array:
+    """Make a contiguous CPU array of memory that belongs to another, an array or anything else that holds it."""
+    attributes, descriptor, _ = _cpu_array(tuple(shape), dtype)
+    array = object.__new__(wp.array)
+    own = array.__dict__
+    own.update(attributes)
+    own["ptr"], own["ctype"], own["deleter"] = pointer, _types.array_t.from_buffer_copy(descriptor), None
+    own["ctype"].data = pointer
+    own["_ref" if isinstance(owner, wp.array) else "owner"] = owner
+    return array
+
+
+def contiguous_view(array: wp.array, shape: Sequence[int], dtype: type, *, first: int = 0) -> wp.array | None:
+    """View contiguous memory of a CPU array, from a byte on, in another shape or dtype, and its gradient likewise.
+
+    None where Warp is to do it: of arrays on a GPU, and of such that are not contiguous or empty.
+    """
+    gradient = array.grad
+    is_whole = array.is_contiguous and array.ptr and (gradient is None or gradient.is_contiguous)
+    if not is_whole or not array.device.is_cpu or wp._src.context.runtime._apic_capture is not None:
+        return None
+    view = array_at(array.ptr + first, shape, dtype, owner=array)
+    if gradient is not None:
+        set_gradient(view, array_at(gradient.ptr + first, shape, dtype, owner=gradient))
+    return view
 
 
 def set_gradient(array: wp.array, gradient: wp.array) -> None:

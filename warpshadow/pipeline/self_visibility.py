@@ -19,6 +19,7 @@ from warpshadow import check
 from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
+from warpshadow.device.memory import from_numpy
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.merged_scene import Geometry, MergedScene
@@ -159,8 +160,8 @@ class SelfVisibility:
             def find() -> VisibilityProbes:
                 used, positions = np.unique(faces), np.zeros(mesh.positions.shape, np.float32)
                 positions[used], *_ = normalize(mesh.positions[used].astype(np.float64))
-                points = wp.array(positions[None], dtype=wp.vec3, device=device)
-                normals = vertex_normals(points, wp.array(faces, dtype=wp.vec3i, device=device)).numpy()[0]
+                points = from_numpy(positions[None], dtype=wp.vec3, device=device)
+                normals = vertex_normals(points, from_numpy(faces, dtype=wp.vec3i, device=device)).numpy()[0]
                 longest = longest_edge(positions, faces, samples_receive=bool(self._samples_receive[body]))
                 return find_probes(positions, normals, faces, longest)
 
@@ -188,7 +189,7 @@ class SelfVisibility:
 
     def places_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body, after the last of which backs are numbered, lie among its probes."""
-        return self._table(body).of_vertices(wp.array(vertices, dtype=wp.int32, device=self._merged_scene.device))
+        return self._table(body).of_vertices(from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device))
 
     def _table(self, body: int) -> ProbeTable:
         if body not in self._tables:
@@ -199,7 +200,7 @@ class SelfVisibility:
                 int(merged_scene.first_face[body]),
                 int(merged_scene.first_face[-1]),
                 len(probes.positions),
-                wp.array(probes.pieces, dtype=wp.vec4i, device=merged_scene.device),
+                from_numpy(probes.pieces, dtype=wp.vec4i, device=merged_scene.device),
             )
         return self._tables[body]
 
@@ -238,7 +239,7 @@ class SelfVisibility:
 
         def find() -> RayProbes:
             places = np.tile(positions, (len(normals) // len(positions), 1))
-            at = (wp.array(values, dtype=wp.vec3, device=self._merged_scene.device) for values in (places, normals))
+            at = (from_numpy(values, dtype=wp.vec3, device=self._merged_scene.device) for values in (places, normals))
             return RayProbes(self._tree(body), *at)
 
         return self._of_mesh(body, "ray probes", find)
@@ -334,8 +335,8 @@ class SelfVisibility:
             return VisibilityRows(*(wp.array(stored[name], device=device) for name in VisibilityRows._fields))
 
         def trace(unfinished: Unfinished) -> VisibilityRows:
-            points = wp.array(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
-            whole = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device=device))
+            points = from_numpy(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
+            whole = wp.Mesh(points, from_numpy(faces.ravel(), dtype=wp.int32, device=device))
             normals = self._normals(body)
             places = np.tile(probes.positions, (len(normals) // len(probes.normals), 1))
 

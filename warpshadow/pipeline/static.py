@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 from warpshadow.pipeline.merged_scene import Geometry, MergedScene, exchanged
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.stages.cached_cells import CachedRows
@@ -108,7 +108,7 @@ class StaticBodies:
         vertices, is_back = split_sides(vertices, len(self.has_vertex))
         outward = np.where(is_back, -1, 1).astype(np.float32)[:, None]
         return tuple(
-            wp.array(array.numpy()[:, vertices] * sign, dtype=wp.vec3, device=array.device)
+            from_numpy(array.numpy()[:, vertices] * sign, dtype=wp.vec3, device=array.device)
             for array, sign in ((self._geometry.positions, np.float32(1)), (normals, outward))
         )
 
@@ -192,7 +192,7 @@ class VertexRows:
         assert self._rows is not None
         if self._index is None or not np.array_equal(vertices, self._vertices):
             self._vertices = vertices
-            self._index = wp.array(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
+            self._index = from_numpy(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
         return CachedRows(self._rows, self._index)
 
     def _append(self, rows: wp.array) -> None:

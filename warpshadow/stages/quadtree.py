@@ -19,7 +19,7 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 
 LARGEST = 4  # pixels of the side of the largest squares
 PROBE = 2  # pixels between probes
@@ -194,8 +194,8 @@ def find_quadtree(
     inputs = [
         flat,
         keys_there,
-        wp.array(probe_keys, dtype=wp.int32, device=device),
-        wp.array(probe_shares, dtype=wp.float32, device=device),
+        from_numpy(probe_keys, dtype=wp.int32, device=device),
+        from_numpy(probe_shares, dtype=wp.float32, device=device),
     ]
     launch(
         _cut_squares,
@@ -217,7 +217,7 @@ def find_quadtree(
     corners = (view[:, None] * height + rows_) * width + columns
     is_corner = np.zeros(flat.shape, bool)
     is_corner.ravel()[corners] = True
-    return Quadtree(sizes, wp.array(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
+    return Quadtree(sizes, from_numpy(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
 
 
 def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 from warpshadow.stages.interpolate import at_point
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterize import Fragments
@@ -149,10 +149,10 @@ def number_receivers(
     of_vertices[np.concatenate([on_static, vertices])] = np.arange(len(on_static) + len(vertices))
     corners = of_vertices[faces.numpy() + shifts[:, None, None]].reshape(-1, 3)
     return Numbering(
-        wp.array(vertices, dtype=wp.int32, device=device),
+        from_numpy(vertices, dtype=wp.int32, device=device),
         on_static,
-        wp.array(corners, dtype=wp.vec3i, device=device),
-        wp.array(of_vertices, dtype=wp.int32, device=device),
+        from_numpy(corners, dtype=wp.vec3i, device=device),
+        from_numpy(of_vertices, dtype=wp.int32, device=device),
         () if bodies is None else spans_of(bodies[vertices]),
     )
 
@@ -212,7 +212,7 @@ def find_receivers(
         all_faces = empty(count + len(own.triangles), dtype=wp.vec3i, device=device)
         launch(_add_faces, count, inputs=[receiver_faces, receiver_count], outputs=[all_faces])
         if len(own.triangles):
-            wp.copy(all_faces[count:], wp.array(receiver_count + own.triangles, dtype=wp.vec3i, device=device))
+            wp.copy(all_faces[count:], from_numpy(receiver_count + own.triangles, dtype=wp.vec3i, device=device))
         receiver_faces = all_faces
     elif vertices is None:
         return Receivers(positions, normals, receiver_faces, of_vertices, receiver_fragments)

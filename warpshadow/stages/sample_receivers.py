@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.quadtree import Quadtree, sample_at
 from warpshadow.stages.rasterize import Fragments
@@ -339,7 +339,7 @@ def find_sample_receivers(
     sizes = squares = is_corner = keys = None
     if quadtree is not None:
         sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.keys
-        is_corner = wp.array(quadtree.is_corner, dtype=wp.bool, device=device)
+        is_corner = from_numpy(quadtree.is_corner, dtype=wp.bool, device=device)
     firsts, own_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = empty(sides.shape, dtype=wp.vec3, device=device)
     is_first = empty(sides.shape, dtype=wp.bool, device=device)
@@ -377,7 +377,7 @@ def find_sample_receivers(
         numbers_of_chosen, ends = _in_rooms(chosen // sample_count, room, view_count, len(names))
         numbers_of = np.empty(sides.size, np.int32)
         numbers_of[chosen] = numbers_of_chosen
-        numbers = wp.array(numbers_of.reshape(sides.shape), dtype=wp.int32, device=device)
+        numbers = from_numpy(numbers_of.reshape(sides.shape), dtype=wp.int32, device=device)
         if quadtree is not None:
             triangles = numbers_of[quadtree.triangles]
     samples = wp.full((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
@@ -444,4 +444,6 @@ def see_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:
     seen_sides = np.where(samples < 0, -1, sides.numpy()[view, samples])
     seen = rows(fragments.barycentrics).numpy()[view, samples]
     device = sides.device
-    return Fragments(wp.array(seen_sides, dtype=wp.int32, device=device), wp.array(seen, dtype=wp.vec3, device=device))
+    return Fragments(
+        from_numpy(seen_sides, dtype=wp.int32, device=device), from_numpy(seen, dtype=wp.vec3, device=device)
+    )

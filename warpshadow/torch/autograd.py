@@ -11,8 +11,10 @@ from typing import ParamSpec, TypeVar, overload
 import torch
 import warp as wp
 
+from warpshadow.device.memory import require_gradient
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.device.threads import one_call
+from warpshadow.device.warp_internals import array_at, item_shape
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -127,10 +129,19 @@ def _let_waiting_threads_sleep() -> None:
 
 def as_array(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A tensor as an array that requires no gradient, of the same memory if that is contiguous."""
-    array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+    array = _of_memory(tensor.detach().contiguous(), dtype)
     if not tensor.is_inference():  # by it a renderer on a GPU knows which arrays have not been written to
         array.origin, array.version = tensor if tensor._base is None else tensor._base, tensor._version
     return array
+
+
+def _of_memory(tensor: torch.Tensor, dtype: type) -> wp.array:
+    """A contiguous tensor as an array of the same memory, as ``wp.from_torch`` makes one."""
+    shape, item = tuple(tensor.shape), item_shape(dtype)
+    leading = shape[: len(shape) - len(item)]
+    if tensor.device.type != "cpu" or not tensor.numel() or shape[len(leading) :] != item or not leading:
+        return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+    return array_at(tensor.data_ptr(), leading, dtype, owner=tensor)
 
 
 @dataclass(frozen=True)
@@ -185,7 +196,7 @@ class _Playback:
             # copies, since memory shared with torch is reused behind the tape's back
             for result, adjoint in zip(self._results, adjoints, strict=True):
                 if result.requires_grad:
-                    wp.copy(result.grad, wp.from_torch(adjoint.detach().contiguous(), dtype=result.dtype))
+                    wp.copy(result.grad, _of_memory(adjoint.detach().contiguous(), result.dtype))
             self._tape.backward()
             return tuple(
                 wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
@@ -202,7 +213,8 @@ class _WarpFunction(torch.autograd.Function):
         # streams are the device's, as Warp has it, not a thread's
         with one_call, _current_stream(call.device), recorded() if any(wants) else unrecorded() as tape:
             for argument, is_wanted in zip(arguments, wants, strict=True):
-                argument.requires_grad = is_wanted  # here, so that a graph that is captured zeroes the gradient
+                if is_wanted:
+                    require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
             results = call.function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
         outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)

@@ -37,7 +37,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
-from warpshadow.maths.directions import BUNDLE, cell_radius, falloff_width
+from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.directional import PAIR_COST, SOFTNESS
@@ -441,7 +441,7 @@ def sphere_light(
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, unblocked. (The derivative in T is
     that at a fixed blend of spheres.) Not: directions, softness, merging, skip, clusters.
     """
-    width = falloff_width(softness, len(directions))
+    cells = make_cells(directions, softness, points.device)
     check_spheres(points, normals, centers, radii)
     common_batch({"points": points, "proxy_radiance": proxy_radiance, "unblocked": unblocked})
     batch_count, vertex_count = points.shape
@@ -464,7 +464,7 @@ def sphere_light(
     sums = (own_count * _SUMS,), lane_type(lanes)
     cached = [empty((row_count * spans, *sums[0]), dtype=sums[1], device=device)] if stores_sums else []
     inputs = LightInputs()
-    inputs.traversed, inputs.cells = traversed, make_cells(directions, width, device)
+    inputs.traversed, inputs.cells = traversed, cells
     inputs.proxy_radiance, inputs.transmittance, inputs.unblocked = proxy_radiance, transmittance, unblocked
     inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
     cost = PAIR_COST * lanes * radii.shape[1] * own_count

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty, from_numpy, zeros
 from warpshadow.device.parallel import run_length, strip_count
 from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.screen import (
@@ -479,7 +479,7 @@ def find_silhouettes(
         counts = crossings.counts.numpy()
         maximum, entry_count = int(counts.max()), 2 * int(counts.sum())
         ends = np.cumsum(crossings.room - counts)
-        gaps = wp.array(np.concatenate([[0], ends[:-1]]), dtype=wp.int32, device=device)
+        gaps = from_numpy(np.concatenate([[0], ends[:-1]]), dtype=wp.int32, device=device)
     samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
     entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)

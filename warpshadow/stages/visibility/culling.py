@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
-from warpshadow.maths.directions import bundle_cones, check_directions
+from warpshadow.maths.directions import bundle_cones, check_directions, falloff_width
 from warpshadow.stages.visibility.cones import BLEND
 from warpshadow.stages.visibility.traversal import ALL, receiver_lanes_type
 
@@ -33,13 +33,14 @@ class DirectionCells:
 
 
 @cached_by_values
-def make_cells(directions: np.ndarray, width: float, device: wp.Device) -> DirectionCells:
-    """Put cells together with the cones around their bundles.
+def make_cells(directions: np.ndarray, softness: float, device: wp.Device) -> DirectionCells:
+    """Put cells together with the cones around their bundles, and the width of a falloff of some softness.
 
     Raises:
-        ValueError: for directions for which there are no cells.
+        ValueError: for directions for which there are no cells, and for too soft a falloff.
     """
     check_directions(directions)
+    width = falloff_width(softness, len(directions))
     axes, cosine, sine = bundle_cones(directions, width)
     cells = DirectionCells()
     cells.directions = constant(directions, wp.vec3, device)

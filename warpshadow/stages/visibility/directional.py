@@ -28,7 +28,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_place
-from warpshadow.maths.directions import BUNDLE, cell_radius, falloff_width
+from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.cones import check_spheres
 from warpshadow.stages.visibility.culling import DirectionCells, cap_type, make_cap_functions, make_cells, make_cull
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
@@ -300,12 +300,11 @@ def transmittance(
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
     clusters.
     """
-    width = falloff_width(softness, len(directions))
+    cells = make_cells(directions, softness, points.device)
     check_spheres(points, normals, centers, radii)
     device = points.device
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
-    cells = make_cells(directions, width, device)
     spans = span_count(device, len(directions))
     bundle_count = len(directions) // (BUNDLE * spans)
     nodes, inputs = make_inputs(points, normals, centers, radii, merging, cell_radius(len(directions)), skip, clusters)
