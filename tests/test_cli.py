@@ -439,6 +439,17 @@ def test_tune_prints_what_it_tried_and_lines_that_the_scene_file_takes(scene, tm
     assert ws.load_scene(scene).visibility.method == method
 
 
+def test_tune_takes_a_mesh(tmp_path, quick_tuning):
+    import trimesh
+
+    ball = ws.icosphere(1.0, 1)
+    trimesh.Trimesh(ball.positions, ball.faces).export(tmp_path / "ball.ply")
+    result = run("tune", tmp_path / "ball.ply", "--error", "0.9", "--up", "y", "--size", "16", "12")
+    assert result.exit_code == 0, result.output
+    assert "image: time of a warm one of 16 × 12" in result.stdout
+    assert "[visibility]" in result.stdout
+
+
 def test_tune_chooses_by_time_as_well(scene, quick_tuning):
     result = run("tune", scene, "--ms", "1e6")
     assert result.exit_code == 0, result.output
@@ -555,6 +566,8 @@ def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_fil
     assert result.exit_code == 0, result.output
     assert re.search(r"^(finished|converged) after \d+ iterations, [\d.]+ ms each$", result.stdout, re.M)
     assert re.search(r"^loss \d\S* before, \d\S* after$", result.stdout, re.M)
+    (color,) = re.findall(r": albedo \((.*), (.*), (.*)\)$", result.stdout, re.M)
+    np.testing.assert_allclose([float(value) for value in color], COLOR, atol=RECOVERED)
     assert not result.stderr  # which is no terminal, so no bars
     (files,) = re.findall(rf"^{folder}: (.*)$", result.stdout, re.M)
     written = {path.name for path in folder.iterdir()}

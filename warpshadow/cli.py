@@ -390,7 +390,7 @@ def view(
 
 @app.command()
 def tune(
-    scene: Annotated[Path, typer.Argument(help="Scene file, TOML; warpshadow/scene/README.md lists its keys.")],
+    scene: SceneOrMesh,
     error: Annotated[Optional[float], typer.Option(help="Largest relative error of shading, such as 0.03.")] = None,
     ms: Annotated[
         Optional[float], typer.Option(help="In place of --error: longest time of an image, in milliseconds.")
@@ -407,6 +407,9 @@ def tune(
     fit: Annotated[
         bool, typer.Option(help="Also fit 16 to 512 spheres a body, some 20 s in all; they are kept for later.")
     ] = False,
+    up: Up = None,
+    size: Size = None,
+    light: Light = None,
     device: Device = "cpu",
     is_quiet: Quiet = False,
 ) -> None:
@@ -415,14 +418,13 @@ def tune(
     Errors are printed before times are measured. Exit status 1: no setting reaches the error; the message names the
     nearest one, and what to try next.
     """
-    from warpshadow.scene.files import load_scene
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene
 
     with _clear_errors():
         if (error is None) == (ms is None):
             raise ValueError(f"--error, --ms: got {'neither' if error is None else 'both'}, expected one of them")
-        loaded = load_scene(scene)
+        loaded = _load(scene, up, size, light, is_quiet)
         where = _device(device)
         tuning = tune_scene(
             loaded, error=error, milliseconds=ms, bounces=bounces, fits=fit, device=where, progress=True
@@ -498,7 +500,7 @@ def fit(
     from warpshadow.inverse.fit_file import load_fit
     from warpshadow.inverse.folder import CHECKPOINT, PREVIEW, check_folder
     from warpshadow.inverse.many import is_of_many
-    from warpshadow.inverse.report import SUMMARY, Report
+    from warpshadow.inverse.report import SUMMARY, Report, found_values
 
     where = file[0] if len(file) == 1 else file
     if isinstance(where, list) or is_of_many(where):
@@ -544,6 +546,8 @@ def fit(
             frame_rate = f", {1e3 * result.seconds:.3g} ms each" if math.isfinite(result.seconds) else ""
             _note(f"{ending}{frame_rate}", is_quiet)
             _note(f"loss {report.loss_before:.4g} before, {report.loss_after:.4g} after", is_quiet)
+            for line in found_values(result):
+                _note(line, is_quiet)
             if result.light is not None:
                 _note(f"{result.light}", is_quiet)
             _note(f"{output}: {', '.join(path.name for path in report.write(output))}", is_quiet)

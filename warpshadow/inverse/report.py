@@ -121,6 +121,24 @@ class Report:
         return written
 
 
+def found_values(result: Result) -> list[str]:
+    """Describe in a line each what a fit changed: poses, colors, exposures, and where light is strongest."""
+    lines, start, scene = [], result.problem.scene, result.scene
+    for before, after in zip(start.bodies, scene.bodies, strict=True):
+        for name, unit in (("translation", ""), ("rotation", "°"), ("scale", ""), ("albedo", "")):
+            values = np.asarray(getattr(after, name))
+            if not np.array_equal(values, getattr(before, name)) and values.size <= 3:
+                shown = ", ".join(f"{value:.4g}" for value in values.ravel())
+                lines.append(f"{after.called}: {name} ({shown}){unit}")
+    if scene.light is not start.light:
+        radiance = map_of(scene.light)
+        x, y, z = EnvironmentMap(np.maximum(radiance, 0)).directions().reshape(-1, 3)[radiance.sum(axis=2).argmax()]
+        lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
+    if any(factor != 1 for factor in result.found.exposures):
+        lines.append(f"exposure: {', '.join(f'{factor:.4g}' for factor in result.found.exposures)}")
+    return lines
+
+
 def _evaluated(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarray]:
     with torch.no_grad():
         loss, images = model.loss(values)
