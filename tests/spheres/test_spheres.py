@@ -204,7 +204,7 @@ def test_refinement_gradient_agrees_with_differences_in_float64(refinement):
 
     def loss(balls):
         error = twin_transmittance(points, directions, balls, width) - seen.visibility[chosen]
-        return (seen.weights[chosen] * (error @ seen.lights.astype(np.float64)) ** 2).sum() / len(chosen)
+        return (seen.weights[chosen] * (error @ seen.metric.astype(np.float64)) * error).sum() / len(chosen)
 
     got_loss, got = fit.gradient(spheres, chosen, width)
     assert got_loss == pytest.approx(loss(spheres), rel=1e-4)

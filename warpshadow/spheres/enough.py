@@ -51,7 +51,7 @@ def enough_spheres(
         known: Errors of the first short fits, where an interrupted call found them.
         keep: Gets the known fits, after each short fit.
     """
-    judges = FitReceivers(mesh, _JUDGES, np.random.default_rng(seed + 1))
+    judges = FitReceivers(mesh, _JUDGES, np.random.default_rng(seed + 1), sharpness=0.0)
     before = np.inf, np.inf
     errors = list(known)
     for number, count in enumerate(TRIED):
@@ -78,7 +78,7 @@ def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:
     visibility = judges.visibility[chosen]
     wrong = judge.transmittance(spheres, chosen, judge.WIDTHS[1]) - visibility
     parts = [
-        np.sum(judges.weights[chosen] * (part @ judges.lights) ** 2) for part in (wrong, visibility, 1 - visibility)
+        np.sum(judges.weights[chosen] * (part @ judges.metric) * part) for part in (wrong, visibility, 1 - visibility)
     ]
     wrong, seen, missing = np.sqrt(parts)
     return float(wrong / max(seen, 1e-9)), float(wrong / max(missing, 1e-9))

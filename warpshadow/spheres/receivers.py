@@ -15,8 +15,11 @@ from warpshadow.spheres.normalized_mesh import NormalizedMesh
 FIT_BUNDLE = 16
 """Directions of a receiver's hemisphere that are near each other, which a sphere reaches or misses together."""
 
-LEAST_LIGHT = 0.01
-"""Lights of the metric that count less than this, next to the strongest, are left out: 28 of 128 are in."""
+SHARPNESS = 3.0
+"""Weight of errors under a sun, next to 1 for each wider light, which do not see gaps between spheres.
+
+The shadow that 512 spheres of a tent cast on a ground under a sun of 1.5° is off by 35% with 0, 28% with 1 and 26% with
+3; of a cage by 31, 27 and 26%. Under a wide light it is better, too: the tent's off by 8.0, 5.5 and 5.0%."""
 
 _RAY_COST = 500.0  # nanoseconds that a ray takes
 
@@ -57,6 +60,7 @@ class FitReceivers:
         mesh: The body.
         count: How many.
         rng: Draws them.
+        sharpness: Weight of errors under a sun next to those under each wider light.
 
     A receiver sees 128 directions of a hemisphere. Receivers on a mesh look along its normals, to both sides of an open
     one. Of the receivers in the space around a body and within its bounds, half look toward the nearest surface, and
@@ -72,7 +76,7 @@ class FitReceivers:
     cast is off by 40%, the light around it by 40 and on it by 26%; with this one by 8, 29 and 40%. What a body blocks
     of its own light is traced."""
 
-    def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator):
+    def __init__(self, mesh: NormalizedMesh, count: int, rng: np.random.Generator, *, sharpness: float = SHARPNESS):
         ground, surface = int(self.GROUND * count), int(self.SURFACE * count)
         parts = [_on_surface(mesh, surface, rng), _on_grounds(mesh, ground, rng)]
         parts.append(_around(mesh, count - ground - surface, rng))
@@ -80,8 +84,10 @@ class FitReceivers:
         frames = _frames(normals, rng)
         self.places = np.column_stack([points, frames.reshape(-1, 9)]).T.astype(np.float32)
         """Where they are: points, and the rows of frames, [12, receiver]."""
-        self.directions = hemisphere(self.DIRECTIONS)  # directions in the frame of each receiver [direction, 3]
-        self.lights = _light_metric(self.directions)
+        self.directions = hemisphere(self.DIRECTIONS)
+        """Directions in the frame of each receiver [direction, 3]."""
+        self.metric = _light_metric(self.directions, sharpness)
+        """Matrix M [direction, direction] of the loss e·M e of errors e of visibility."""
         array = partial(wp.array, device=mesh.device)
         visibility = empty((count, self.DIRECTIONS), dtype=wp.uint8, device=mesh.device)
         rays = array(self.directions.astype(np.float32), dtype=wp.vec3)
@@ -150,19 +156,17 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack(rows, axis=1).astype(np.float32)
 
 
-def _light_metric(directions: np.ndarray) -> np.ndarray:
-    """Matrix F [direction, light] of the loss |e F|² of errors e of visibility, under light of several sharpnesses.
+def _light_metric(directions: np.ndarray, sharpness: float) -> np.ndarray:
+    """Matrix M [direction, direction] of the loss e·M e of errors e of visibility, under light of several sharpnesses.
 
     The error is smoothed with lobes of 0.6 and 0.25 radians and with the whole hemisphere: the irradiance
-    error under lights of that width from anywhere.
+    error under lights of that width from anywhere. Under a sun single directions count, with weight ``sharpness``.
     """
     count = len(directions)
     angles = np.arccos(np.clip(directions @ directions.T, -1, 1))
-    metric = np.full((count, count), 1 / count)
+    metric = np.full((count, count), 1 / count) + sharpness * np.eye(count)
     for lobe in (0.6, 0.25):
         smooth = np.exp(-0.5 * (angles / lobe) ** 2)
         smooth /= smooth.sum(axis=1, keepdims=True)
         metric += smooth.T @ smooth
-    strengths, lights = np.linalg.eigh(metric / count)
-    matters = strengths > LEAST_LIGHT * strengths.max()
-    return (lights[:, matters] * np.sqrt(strengths[matters])).astype(np.float32)
+    return (metric / count).astype(np.float32)

@@ -378,9 +378,9 @@ class Refinement:
         return self._see_through(self._project(spheres, chosen, width))[: len(chosen)]
 
     def _loss(self, transmittance: np.ndarray, chosen: np.ndarray) -> tuple[float, np.ndarray]:
-        """Loss of a batch, and its gradient by the errors under the lights, [receiver, light]."""
-        errors = (transmittance - self.receivers.visibility[chosen]) @ self.receivers.lights
-        weighted = errors * (self.receivers.weights[chosen] / len(chosen))
+        """Loss of a batch, and its gradient by the transmittance."""
+        errors = transmittance - self.receivers.visibility[chosen]
+        weighted = (errors @ self.receivers.metric) * (self.receivers.weights[chosen] / len(chosen))
         return float(np.vdot(weighted, errors)), 2 * weighted
 
     def gradient(self, spheres: np.ndarray, chosen: np.ndarray, width: float) -> tuple[float, np.ndarray]:
@@ -389,8 +389,8 @@ class Refinement:
         transmittance = self._see_through(view)
         upstream = np.zeros_like(transmittance)
         passing = transmittance[: len(chosen)]
-        loss, by_errors = self._loss(passing, chosen)
-        upstream[: len(chosen)] = (by_errors @ self.receivers.lights.T) * passing
+        loss, by_transmittance = self._loss(passing, chosen)
+        upstream[: len(chosen)] = by_transmittance * passing
         by_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
         sums = empty(view.axes.shape, dtype=_Sums, device=self.device)
         inputs = [view.axes, view.edges, view.reached, self.directions, by_logs]
