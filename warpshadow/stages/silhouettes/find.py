@@ -43,6 +43,9 @@ wp.set_module_options({"max_unroll": 1})  # it compiles in 2.2 s instead of 3.1 
 MOST_STEPS = 32
 """Faces that are walked over between the centers of two samples before the search for an edge is given up."""
 
+MOST_SAMPLES = 2**31 - 1
+"""Samples of all images of a batch, which are numbered in int32."""
+
 LEAST_OPENING = 1e-4
 """Relative change of two surfaces' distance over a sample, below which rounding hides where they intersect."""
 
@@ -50,6 +53,9 @@ LEAST_OPENING = 1e-4
 _SNAP = 1.0 / 2048.0
 
 _FACE_COST = 40.0  # nanoseconds that a face takes, if it is small
+
+_MOST_CROSSINGS = 1 << 30
+"""Of an image: a claim is twice the number of one, in int32. No image has a line beside each of so many samples."""
 
 # In place of the silhouette between two samples, which may be none (−1).
 _UNKNOWN = -2
@@ -92,9 +98,10 @@ class _Crossings:
     """Crossings between neighboring samples, a list for each image, in no order: threads share images, not lists."""
 
     counts: wp.array(dtype=wp.int32)  # of each image
-    room: int  # for each image
-    items: wp.array(dtype=_Crossing)  # sample, way to its neighbor, and vertices of the edge as each of them has it
-    claims: wp.array(dtype=wp.int32)  # one item that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
+    # of each image: sample, way to its neighbor, and vertices of the edge as each of them has it
+    items: wp.array2d(dtype=_Crossing)
+    # one item of its image that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
+    claims: wp.array(dtype=wp.int32)
 
 
 # ---------------------------------------------------------------------------------------------------- edges
@@ -247,8 +254,8 @@ def _add_crossing(
     Of the crossings beside a sample one claims it, any.
     """
     image = image_of(seen, sample)
-    crossing = image * crossings.room + wp.atomic_add(crossings.counts, image, 1)
-    crossings.items[crossing] = _Crossing(sample, way, edge[0], edge[1], its_edge[0], its_edge[1])
+    crossing = wp.atomic_add(crossings.counts, image, 1)
+    crossings.items[image, crossing] = _Crossing(sample, way, edge[0], edge[1], its_edge[0], its_edge[1])
     crossings.claims[sample] = 2 * crossing
     crossings.claims[neighbor(sample, way, seen.width)] = 2 * crossing + 1
 
@@ -398,7 +405,7 @@ def _find_intersections(
 def _make_entries(
     # in
     crossings: _Crossings,
-    gaps: wp.array(dtype=wp.int32),
+    first_entries: wp.array(dtype=wp.int32),
     width: int,
     has_all: bool,
     # out
@@ -408,17 +415,16 @@ def _make_entries(
 ):
     """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
 
-    Gaps are room that the lists of the images before an image have left. If there is an entry for all samples, it is
-    the sample's own.
+    An image's entries begin at its first one. If there is an entry for all samples, it is the sample's own.
     """
     image, number = wp.tid()
     if number < crossings.counts[image]:
-        crossing = crossings.items[image * crossings.room + number]
+        crossing = crossings.items[image, number]
         for end in range(2):
             sample = crossing[0]
             if end == 1:
                 sample = neighbor(sample, crossing[1], width)
-            entry = wp.where(has_all, sample, crossings.claims[sample] - 2 * gaps[image])
+            entry = wp.where(has_all, sample, first_entries[image] + crossings.claims[sample])
             samples[entry] = sample
             entries[sample] = entry
             edges[entry, crossing[1] + end] = wp.vec2i(crossing[2 + 2 * end], crossing[3 + 2 * end])
@@ -451,11 +457,13 @@ def find_silhouettes(
     check.shape("neighbors", neighbors.shape, faces.shape)
     check.shape("clip_positions", clip_positions.shape, (fragments.face_ids.shape[0], "vertex"))
     device, sample_count = faces.device, fragments.face_ids.size
+    if sample_count > MOST_SAMPLES:
+        raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MOST_SAMPLES}")
     seen, crossings, strips = make_fragment_arrays(fragments, faces, clip_positions), _Crossings(), strip_count(device)
     image_count = len(clip_positions)
     crossings.counts = zeros(image_count, dtype=wp.int32, device=device)
-    crossings.room = 2 * sample_count // image_count
-    crossings.items = empty(2 * sample_count, dtype=_Crossing, device=device)
+    room = min(2 * sample_count // image_count, _MOST_CROSSINGS)
+    crossings.items = empty((image_count, room), dtype=_Crossing, device=device)
     crossings.claims = empty(sample_count, dtype=wp.int32, device=device)
     between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
     if creases is not None:
@@ -474,15 +482,14 @@ def find_silhouettes(
         launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, creases, run], outputs=[crossings])
     has_all = bool(device.is_capturing)
     if has_all:
-        maximum, entry_count, gaps = crossings.room, sample_count, crossings.counts  # gaps do not matter
+        maximum, entry_count, first_entries = room, sample_count, crossings.counts  # the last do not matter
     else:
         counts = crossings.counts.numpy()
         maximum, entry_count = int(counts.max()), 2 * int(counts.sum())
-        ends = np.cumsum(crossings.room - counts)
-        gaps = from_numpy(np.concatenate([[0], ends[:-1]]), dtype=wp.int32, device=device)
+        first_entries = from_numpy(2 * (np.cumsum(counts) - counts), dtype=wp.int32, device=device)
     samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
     edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
     entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
-    inputs = [crossings, gaps, seen.width, has_all]
+    inputs = [crossings, first_entries, seen.width, has_all]
     launch(_make_entries, (image_count, maximum), inputs=inputs, outputs=[samples, edges, entries])
     return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)
