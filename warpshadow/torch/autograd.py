@@ -217,7 +217,7 @@ class _WarpFunction(torch.autograd.Function):
                     require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
             results = call.function(*arguments)
         results = results if isinstance(results, tuple) else (results,)
-        outputs = tuple(wp.to_torch(result, requires_grad=False) for result in results)
+        outputs = tuple(_as_tensor(result, call.device) for result in results)
         if any(wants):
             ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
             ctx.call, ctx.playback = call, _Playback(tape, arguments, results)
@@ -263,10 +263,25 @@ class _WarpAdjoint(torch.autograd.Function):
 
 
 def _current_stream(device: torch.device) -> wp.ScopedStream:
-    """Launch on torch's current stream, which while it is captured must not wait for streams that are not."""
+    """Launch on torch's current stream, which while it is captured must not wait for streams that are not.
+
+    Else Warp's stream waits for it at the end: there Warp frees what has been used, once nobody holds it.
+    """
     is_cuda = device.type == "cuda"
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None
-    return wp.ScopedStream(stream, sync_enter=not is_capturing(device))
+    waits = not is_capturing(device)
+    return wp.ScopedStream(stream, sync_enter=waits, sync_exit=waits)
+
+
+def _is_on_side_stream(device: torch.device) -> bool:
+    """Whether torch's current stream is one that the device's default stream does not wait for."""
+    return device.type == "cuda" and torch.cuda.current_stream(device) != torch.cuda.default_stream(device)
+
+
+def _as_tensor(result: wp.array, device: torch.device) -> torch.Tensor:
+    """A result as a tensor: of Warp's memory, or on a side stream of torch's, whose later work Warp cannot await."""
+    tensor = wp.to_torch(result, requires_grad=False)
+    return tensor.clone() if _is_on_side_stream(device) else tensor
 
 
 def is_capturing(device: torch.device) -> bool:
