@@ -28,6 +28,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import as_items, empty, zeros
 from warpshadow.device.parallel import Scratch, scratch_place
+from warpshadow.device.warp_sums import sum_over_warp
 from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
@@ -243,13 +244,19 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                 of_rays = inputs.looks_at_rays[q]
                 if wp.static(lanes == 1) or of_rays == 1:
                     for k in range(inputs.counts[turn, q]):
+                        adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
                                 pull = wp.cw_mul(adj, look(probes.rows[corner], of_rays, indices[k], inputs))
                                 adj_place[corner] += weights[k] * pull
-                                if adj_all_weights:
-                                    adj_weight = total(wp.cw_mul(probes.weights[corner], pull))
-                                    wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
+                                adj_weight += total(wp.cw_mul(probes.weights[corner], pull))
+                        if adj_all_weights:
+                            if wp.static(lanes == 1):
+                                adj_weight = sum_over_warp(
+                                    adj_weight, (turn * inputs.directions.shape[0] + q) * adj_all_weights.shape[2] + k
+                                )
+                            if adj_weight != 0.0:
+                                wp.atomic_add(adj_all_weights, turn, q, k, adj_weight)
                 else:
                     for k in range(inputs.counts[turn, q]):
                         adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj

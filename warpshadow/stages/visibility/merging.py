@@ -26,6 +26,7 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.device.warp_sums import sum_over_warp, sums_over_warp
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 
 QUAD = 4  # spheres that merge, in the order in which they are given: best near each other
@@ -193,11 +194,15 @@ def make_add_to_node(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def add_to_node(adj_offset: Vectors, adj_radius: Lane, batch: int, node: int, gradients: Gradients):
-        if gradients.centers:
-            adj_center = wp.vec3(total(adj_offset.x), total(adj_offset.y), total(adj_offset.z))
-            wp.atomic_add(gradients.centers, batch, node, adj_center)
-        if gradients.radii:
-            wp.atomic_add(gradients.radii, batch, node, total(adj_radius))
+        adj = wp.vec4(total(adj_offset.x), total(adj_offset.y), total(adj_offset.z), total(adj_radius))
+        if wp.static(lanes == 1):
+            node_count = wp.max(gradients.centers.shape[1], gradients.radii.shape[1])
+            adj = sums_over_warp(adj, batch * node_count + node)
+        if not adj == wp.vec4():  # noqa: SIM201 (vectors have no !=)
+            if gradients.centers:
+                wp.atomic_add(gradients.centers, batch, node, wp.vec3(adj[0], adj[1], adj[2]))
+            if gradients.radii:
+                wp.atomic_add(gradients.radii, batch, node, adj[3])
 
     return add_to_node
 
@@ -282,7 +287,11 @@ def make_merged_adjoint(lanes: int) -> wp.Function:
                 adj_offset = scale((2.0 * inverse) * wp.cw_mul(adj_merged, slope), offset)
                 add_to_node(adj_offset, Lane(0.0), batch, spheres.count + quad, gradients)
                 if gradients.extents:
-                    wp.atomic_add(gradients.extents, batch, quad, -total(dot(adj_offset, offset)))
+                    adj_extent = -total(dot(adj_offset, offset))
+                    if wp.static(lanes == 1):
+                        adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + quad)
+                    if adj_extent != 0.0:
+                        wp.atomic_add(gradients.extents, batch, quad, adj_extent)
         return adj_offset
 
     return adjoint
