@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from warpshadow.inverse import QuasiNewton
+from warpshadow.inverse import QuasiNewton, quasi_newton
 
 CURVATURE = torch.tensor([[1.0, 0.3, 0.0], [0.3, 30.0, -0.5], [0.0, -0.5, 300.0]])
 LOWEST = torch.tensor([0.7, -0.4, 0.2])
@@ -153,3 +154,31 @@ def test_values_that_are_clamped_end_at_the_least_within_their_bounds():
             if optimizer.has_converged(1e-6):
                 break
         assert found < 1.001 * least
+
+
+def test_a_step_waits_for_the_device_three_times_however_long_its_memory_is(monkeypatch):
+    """A wait is a read of numbers: of torch's own, as by float(), or several at once."""
+    read, waits = quasi_newton._read, []
+    monkeypatch.setattr(quasi_newton, "_read", lambda *values: waits.append("several") or read(*values))
+
+    class Reads(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), options=None):
+            if function is torch.ops.aten._local_scalar_dense.default:
+                waits.append("one")
+            return function(*arguments, **(options or {}))
+
+    x = torch.tensor([-1.0, 1.2, 0.4, 1.3], requires_grad=True)
+    optimizer = QuasiNewton([x], 0.1)
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = valley(x)
+        value.backward()
+        return value.detach()
+
+    for _ in range(20):
+        waits.clear()
+        with Reads():
+            optimizer.step(closure)
+    assert len(optimizer.curvature[0]) > 8
+    assert sorted(waits) == ["one", "several", "several", "several"]  # one of the loss

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+
+T = TypeVar("T")
 
 Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
 """Steps, and how the gradient changed over them, [value] each."""
@@ -72,11 +74,12 @@ class QuasiNewton(torch.optim.Optimizer):
             self._keep(loss, place, gradient, torch.zeros_like(place))
         else:
             self._judge(loss, place, gradient)
-        direction = self._direction()
-        longest, bound = float(direction.abs().max()), memory["bound"]
+        direction, bound = self._direction(), memory["bound"]
+        longest, slope = _read(direction.abs().max(), _dot(memory["gradient"], direction))
         if longest > bound or not self.curvature[0]:  # a gradient alone does not tell how far
-            direction *= bound / longest if longest > 0 else 0.0
-        memory["hoped"] = -_dot(memory["gradient"], direction)
+            factor = bound / longest if longest > 0 else 0.0
+            direction, slope = factor * direction, factor * slope
+        memory["hoped"] = -slope
         memory["aim"] = memory["place"] + direction
         self._move_to(memory["aim"])
         return loss
@@ -109,10 +112,12 @@ class QuasiNewton(torch.optim.Optimizer):
     def _judge(self, loss: float, place: torch.Tensor, gradient: torch.Tensor) -> None:
         """Keep the last step or take it back, and bound the next."""
         memory = self._memory
-        step = place - memory["place"]  # maybe clamped
-        slope = _dot(memory["gradient"], step)
-        self._remember(step, gradient - memory["gradient"])
-        length, rise = float(step.abs().max()), loss - memory["loss"]
+        step, change = place - memory["place"], gradient - memory["gradient"]  # maybe clamped
+        numbers = _dot(memory["gradient"], step), step.abs().max(), *(_dot(*pair) for pair in _products(step, change))
+        slope, length, *products = _read(*numbers)
+        if _curves(*products):
+            self._remember(step, change)
+        rise = loss - memory["loss"]
         if rise >= 0 and length > 0:
             lowest = -slope / (2 * (rise - slope)) if rise > slope else _LONGEST  # of the parabola through both
             memory["bound"] = length * min(max(lowest, _SHORTEST), _LONGEST)
@@ -123,34 +128,54 @@ class QuasiNewton(torch.optim.Optimizer):
         self._keep(loss, place, gradient, self._sides(place))
 
     def _remember(self, step: torch.Tensor, change: torch.Tensor) -> None:
-        """Add a step and how the gradient changed over it, if the loss curves upwards there."""
+        """Add a step and how the gradient changed over it."""
         memory = self._memory
         steps, changes = self.curvature
-        if _curves(step, change):
-            memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
+        memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
 
     def _direction(self) -> torch.Tensor:
-        """Minus the gradient times the inverse of the curvature, as the steps tell it."""
-        memory = self._memory
+        """Minus the gradient times the inverse of the curvature, as the steps tell it.
+
+        All vectors of the recursion are sums of steps, changes and the gradient. So it works on the factors of these
+        [Chen et al. 2014, Large-scale L-BFGS using MapReduce], whose dot products are read all at once.
+        """
+        memory, (steps, changes) = self._memory, self.curvature
         moves = (memory["sides"] * memory["gradient"] >= 0).to(memory["gradient"])
-        direction = -memory["gradient"] * moves
-        moved = [(step * moves, change * moves) for step, change in zip(*self.curvature, strict=True)]
-        pairs = [pair for pair in moved if _curves(*pair)]
-        parts = []
+        downhill = -memory["gradient"] * moves
+        if not steps:
+            return downhill
+        vectors = torch.stack([*steps, *changes, downhill]).double() * moves
+        products = torch.tensor(_read(*(vectors @ vectors.T)), dtype=torch.float64)
+        count = len(steps)
+        pairs = [(k, count + k) for k in range(count)]
+        pairs = [(k, j) for k, j in pairs if _curves(*(float(products[pair]) for pair in _products(k, j)))]
+        factors, parts = torch.zeros(2 * count + 1, dtype=torch.float64), []
+        factors[-1] = 1.0
         for step, change in reversed(pairs):
-            parts.append(_dot(step, direction) / _dot(step, change))
-            direction = direction - parts[-1] * change
+            parts.append(products[step] @ factors / products[step, change])
+            factors[change] -= parts[-1]
         if pairs:
-            direction = direction * (_dot(*pairs[-1]) / _dot(pairs[-1][1], pairs[-1][1]))
+            step, change = pairs[-1]
+            factors *= products[step, change] / products[change, change]
         for (step, change), part in zip(pairs, reversed(parts), strict=True):
-            direction = direction + (part - _dot(change, direction) / _dot(step, change)) * step
-        return direction
+            factors[step] += part - products[change] @ factors / products[step, change]
+        return (factors.to(vectors) @ vectors).to(downhill)
 
 
-def _curves(step: torch.Tensor, change: torch.Tensor) -> bool:
-    """Whether the loss curves upwards over a step, by how its gradient changed."""
-    return _dot(step, change) > _CURVED * math.sqrt(_dot(step, step) * _dot(change, change))
+def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
+    """Which dot products tell whether the loss curves upwards over a step."""
+    return (step, change), (step, step), (change, change)
 
 
-def _dot(first: torch.Tensor, second: torch.Tensor) -> float:
-    return float(first.double() @ second.double())
+def _curves(across: float, step: float, change: float) -> bool:
+    """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
+    return across > _CURVED * math.sqrt(step * change)
+
+
+def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    return first.double() @ second.double()
+
+
+def _read(*values: torch.Tensor) -> list[Any]:
+    """Numbers of a device, for which the host waits once."""
+    return torch.stack([value.double() for value in values]).cpu().numpy().tolist()
