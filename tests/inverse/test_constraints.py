@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import warpshadow as ws
 from warpshadow.inverse import Pose, Problem, Stage, Target, fit, load_fit
 from warpshadow.inverse.constraints import hull_points, plane_below, stable_rotation
-from warpshadow.inverse.free.pose import PRIOR
+from warpshadow.inverse.free.base import PRIOR
 
 # Float32 of positions of a few units.
 FLOAT32 = 2e-6
@@ -114,7 +114,7 @@ def test_the_height_has_the_derivative_of_the_lowest_vertex():
     weights = torch.tensor([0.3, -1.0, 0.7])
 
     def read(place: dict) -> torch.Tensor:
-        return weights @ free._moved(place, setting)[1]
+        return weights @ free.moved(place, setting)[1]
 
     read(values).backward()
     for key, tensor in values.items():

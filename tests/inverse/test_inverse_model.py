@@ -8,8 +8,9 @@ import torch
 
 import warpshadow as ws
 from warpshadow.inverse import Albedo, Light, Loss, Pose, Problem, Target, fit
-from warpshadow.inverse.model import LightModel, Model, make_model
+from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.schedule import Stage
+from warpshadow.inverse.variable_projection import make_model
 
 CPU = torch.device("cpu")
 

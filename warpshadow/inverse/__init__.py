@@ -6,6 +6,7 @@ be rendered, relit and written. Needs torch.
 
 from warpshadow.inverse.checkpoint import CheckpointError
 from warpshadow.inverse.descent import FitWarning, Result, default_optimizer, fit, short_adam
+from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
@@ -13,14 +14,15 @@ from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
-from warpshadow.inverse.free.views import CameraPose, Exposure
+from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.many import Ending, find_fits, fit_many
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.report import write_result
-from warpshadow.inverse.schedule import Stage, deformation_stages, pose_stages
+from warpshadow.inverse.schedule import Stage, deformation_stages, photograph_stages, pose_stages
 from warpshadow.inverse.target import Target
+from warpshadow.inverse.uncertainty import PoseUncertainty, Uncertainty
 from warpshadow.viewer import FitViewer
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "CameraPose",
     "CheckpointError",
     "Deformation",
+    "DiagnosticWarning",
     "Ending",
     "Exposure",
     "Fit",
@@ -38,7 +41,9 @@ __all__ = [
     "Free",
     "Light",
     "Loss",
+    "OutlineOffset",
     "Pose",
+    "PoseUncertainty",
     "Problem",
     "QuasiNewton",
     "Radii",
@@ -46,12 +51,14 @@ __all__ = [
     "Stage",
     "Target",
     "Texture",
+    "Uncertainty",
     "default_optimizer",
     "deformation_stages",
     "find_fits",
     "fit",
     "fit_many",
     "load_fit",
+    "photograph_stages",
     "pose_stages",
     "short_adam",
     "write_result",

@@ -23,13 +23,17 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_of
 from warpshadow.inverse.found_light import FoundLight, found_light
-from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.model import Model, make_model
+from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.views import OutlineOffset
+from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
+from warpshadow.inverse.uncertainty import Uncertainty, along_flat, uncertainty
+from warpshadow.inverse.variable_projection import make_model
 from warpshadow.inverse.watch import Watch, watching
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.scene import Scene
@@ -96,6 +100,11 @@ class Result:
         if self.problem.basis is None:
             return None
         return found_light(self.scene.light, self.problem, self.setting, self.values)
+
+    @functools.cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How well it knows its few numbers, such as poses and exposures; None where it has none."""
+        return uncertainty(self)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -180,6 +189,8 @@ class _Descent:
         return [*best[:count], *(_Candidate(values, None) for values in scattered)]
 
     def _scattered(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
+        if count > 0 and self.stages[self.stage].scatter == "flat":
+            return along_flat(self.problem, self.setting, values, count)
         generator = torch.Generator().manual_seed(self.seed)
         return [
             {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
@@ -198,7 +209,8 @@ class _Descent:
         """Set up the optimizer for a candidate."""
         self.values, self.best = _copied(candidate.values), _copied(candidate.values)
         self.failure: str | None = None
-        self.tensors = {f"{name}.{key}": t for name, own in self.values.items() for key, t in own.items()}
+        names = [free.name for free in self.problem.free if _descends(free, self.stages[self.stage])]
+        self.tensors = {f"{name}.{key}": t for name in names for key, t in self.values[name].items()}
         for tensor in self.tensors.values():
             tensor.requires_grad_()
         self.optimizer = self.make_optimizer(list(self.tensors.values()), lr=self.stages[self.stage].learning_rate)
@@ -282,6 +294,9 @@ class _Descent:
         if self.reason is not None:
             self.best = ranked[0].values
             return False
+        stages = self.stages[self.stage : self.stage + 2]
+        if len({tuple(free.name for free in self.problem.free if _descends(free, item)) for item in stages}) > 1:
+            ranked = [candidate._replace(curvature=None) for candidate in ranked]  # of other parameters
         self.stage += 1
         self.candidates, self.ended = self._widened(ranked), []
         self.begin_stage()
@@ -340,6 +355,7 @@ class _Descent:
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(len(self.losses[-1]))
         evaluated: list[float] = []
+        before: dict[str, Values] = {}
 
         def closure() -> float:
             self.optimizer.zero_grad()
@@ -349,6 +365,8 @@ class _Descent:
                 if not self.losses[0] and not evaluated:
                     raise  # values that were bad from the beginning
                 raise _Diverged(str(error)) from error
+            if not evaluated:  # with the light that was solved for there
+                before.update(_copied(self.values))
             self.images = None if images is None else images.detach()
             _check_finite({"the images": images, "the loss": loss})
             loss.backward()
@@ -356,7 +374,6 @@ class _Descent:
             evaluated.append(float(loss.detach()))
             return evaluated[-1]
 
-        before = _copied(self.values)
         self.optimizer.step(closure)
         with torch.no_grad():
             for free in self.problem.free:
@@ -366,6 +383,13 @@ class _Descent:
         if losses[-1] == min(losses):
             self.best = before
         _check_finite(self.tensors)
+
+
+def _descends(free: Free, stage: Stage) -> bool:
+    """Whether a stage has a gradient for a parameter."""
+    if stage.compares == "outlines":
+        return free.moves or isinstance(free, OutlineOffset)
+    return not (stage.solves_light and isinstance(free, Light))
 
 
 def _copied(values: Mapping[str, Values], device: torch.device | None = None) -> dict[str, Values]:

@@ -19,7 +19,7 @@ from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
-from warpshadow.inverse.free.views import CameraPose, Exposure
+from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
@@ -27,13 +27,13 @@ from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
 from warpshadow.inverse.target import Target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
-from warpshadow.scene.scene import Scene, Visibility
+from warpshadow.scene.scene import BodyLike, Scene, Visibility
 from warpshadow.scene.toml_tables import Table
 
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "distortion")
-_TARGET_KEYS = ("image", "mask", "camera", *_PHOTOGRAPH_KEYS)
-_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose)}
+_TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
+_FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose, OutlineOffset)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
 
 
@@ -132,11 +132,21 @@ def _target(table: Table, folder: Path) -> Target:
     options: Table = {key: table[key] for key in _PHOTOGRAPH_KEYS if key in table}
     if "mask" in table:
         options["mask"] = toml_tables.file(table, "mask", folder)
+    if "outlines" in table:
+        with check.located("outlines"):
+            toml_tables.check_table(table["outlines"])
+            files = table["outlines"]
+            options["outlines"] = {_body(name): toml_tables.file(files, name, folder) for name in files}
     if "camera" in table:
         with check.located("camera"):
             toml_tables.check_table(table["camera"])
             options["camera"] = parse_camera({"size": image_size(path)} | table["camera"])
     return Target(path, **options)
+
+
+def _body(key: str) -> BodyLike:
+    """A body's number, where a key is one; or its name."""
+    return int(key) if key.isdecimal() else key
 
 
 # ---------------------------------------------------------------------------------------------- free parameters

@@ -9,6 +9,8 @@ import torch
 
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.loss import bounded
+from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.target import stacked
@@ -34,6 +36,8 @@ class Model:
         self.cameras = tuple(camera.resized(stage.scale) for camera in setting.cameras)
         self.renderer = self._make_renderer(stage)
         self.targets, self.weights, self.saturated = stacked(problem.targets, stage.scale, setting.device)
+        self.outlines = outlines_of(problem.targets, setting.scene, stage.scale, setting.device)
+        self.compares_images = stage.compares == "all"
 
     def _make_renderer(self, stage: Stage) -> TorchRenderer:
         scene = self.setting.scene
@@ -50,12 +54,16 @@ class Model:
             scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
         return TorchRenderer(scene, device=self.setting.device, basis=self.problem.basis, cameras=self.cameras)
 
-    def images(self, values: Mapping[str, Values]) -> torch.Tensor:
-        """Images of the views, [view, height, width, 4]. Differentiable: values."""
+    def world(self, values: Mapping[str, Values]) -> World:
+        """The world with values in it."""
         world = World(self.renderer, self.cameras)
         for free in self.problem.free:
             free.apply(values[free.name], self.setting, world)
-        return world.images()
+        return world
+
+    def images(self, values: Mapping[str, Values]) -> torch.Tensor:
+        """Images of the views, [view, height, width, 4]. Differentiable: values."""
+        return self.world(values).images()
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
@@ -66,9 +74,17 @@ class Model:
         return total, images
 
     def _unlikeness(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return (image loss, images)."""
-        images = self.images(values)
-        return self.problem.loss(images, self.targets, self.weights, self.setting.unit, self.saturated), images
+        """Return (loss of images and outlines, images)."""
+        world = self.world(values)
+        total, images = torch.zeros((), device=self.setting.device), None
+        if self.compares_images:
+            images = world.images()
+            compared = bounded(images, self.targets, self.saturated)
+            total = self.problem.loss(compared, self.targets, self.weights, self.setting.unit)
+        if self.outlines is not None:
+            masks, weight = world.masks(), self.problem.loss.coverage
+            total = total + weight * self.outlines.loss(masks, world.outline_offsets)
+        return total, images
 
 
 class LightModel(Model):
@@ -101,7 +117,8 @@ class LightModel(Model):
     def applies(problem: Problem) -> bool:
         """Whether a problem is one of light alone, and of squares."""
         is_light = len(problem.free) == 1 and isinstance(problem.free[0], Light)
-        return is_light and problem.loss.kind == "l2" and all(target.saturated is None for target in problem.targets)
+        is_plain = all(target.saturated is None and not target.outlines for target in problem.targets)
+        return is_light and is_plain and problem.loss.kind == "l2"
 
     def _images_of_units(self) -> list[torch.Tensor]:
         """Images in light of which one coefficient is 1, [view, height, width, 4] each."""
@@ -120,8 +137,3 @@ def _product(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
     """A product of matrices in float64, some pixels at a time, so that no copy of all is made."""
     parts = zip(rows.split(_PIXELS_AT_ONCE, dim=1), columns.split(_PIXELS_AT_ONCE), strict=True)
     return torch.stack([row.double() @ column.double() for row, column in parts]).sum(dim=0)
-
-
-def make_model(problem: Problem, setting: Setting, stage: Stage) -> Model:
-    """The cheapest model that the problem allows."""
-    return (LightModel if LightModel.applies(problem) else Model)(problem, setting, stage)

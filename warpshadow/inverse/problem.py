@@ -92,6 +92,9 @@ class Problem:
         for number, item in enumerate(self.free):
             with check.located(f"free[{number}]"):
                 item.check_scene(self.scene)
+        for number, target in enumerate(self.targets):
+            for body in target.outlines:
+                self.scene.body_number(body, f"targets[{number}].outlines")
         self.cameras()  # raises for an image of other proportions
 
     def __repr__(self) -> str:
@@ -188,6 +191,8 @@ def _digest(value: object, digest: hashlib._Hash) -> None:
             _digest(getattr(value, entry.name), digest)
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, dict):
+        _digest(list(value.items()), digest)
     elif isinstance(value, (tuple, list)):
         digest.update(f"{len(value)} items".encode())
         for item in value:

@@ -17,10 +17,12 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result
+from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.schedule import Stage
+from warpshadow.inverse.uncertainty import FLAT
 from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
@@ -104,7 +106,28 @@ class Report:
             image["white_balance"] = list(gains)
         light = self.result.light
         known = {} if light is None else {"light": {"undetermined": round(light.undetermined_share, 4)}}
-        return {"fit": fit, **known, "view": views, "image": images}
+        unsure = self._uncertain()
+        return {"fit": fit, **known, **unsure, "view": views, "image": images}
+
+    def _uncertain(self) -> toml_tables.Table:
+        """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
+        known = self.result.uncertainty
+        if known is None:
+            return {}
+        table: toml_tables.Table = {}
+        for name, pose in known.poses.items():
+            table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
+            if pose.is_flat:
+                check.warn(
+                    f"{name} is uncertain by more than {FLAT:.0%} of its size; {pose}. A plane that it stands on "
+                    "(stands_on), a prior or another view would tell more",
+                    DiagnosticWarning,
+                )
+        if known.light is not None:
+            table["light"] = known.light
+        if known.stops:
+            table["stops"] = known.stops
+        return {"uncertainty": table} if table else {}
 
     def _write_pictures(self, folder: Path) -> list[Path]:
         """Targets, and images before and after, the views side by side, at one exposure."""

@@ -33,6 +33,10 @@ class Stage:
         standout: A candidate has found it, and no others are tried from then on, if its loss is below this part of
             that of each of six values scattered around it. 0: all are tried.
         tolerance: In place of the fit's.
+        compares: "all", or "outlines" alone, for which nothing is shaded.
+        solves_light: Solve for the light at each geometry in place of descending to it; see
+            :mod:`~warpshadow.inverse.variable_projection`.
+        scatter: How candidates differ: "turned", or "flat", moved along the direction that the images tell least of.
         regularization: Factor of all regularizers: coarse stages want more of them.
     """
 
@@ -46,10 +50,16 @@ class Stage:
     regularization: float = 1.0
     standout: float = 0.0
     tolerance: float | None = None
+    compares: str = "all"
+    solves_light: bool = False
+    scatter: str = "turned"
 
     def __post_init__(self) -> None:
         check.whole("iterations", self.iterations)
         check.whole("candidates", self.candidates)
+        check.choice("compares", self.compares, ("all", "outlines"))
+        check.choice("scatter", self.scatter, ("turned", "flat"))
+        check.flag("solves_light", self.solves_light)
         if not (check.is_number(self.learning_rate) and self.learning_rate > 0):
             raise ValueError(f"learning_rate: got {self.learning_rate!r}, expected a positive number")
         check.nonnegative("regularization", self.regularization)
@@ -99,6 +109,10 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
     visibility = problem.visibility
     for number, stage in enumerate(stages):
         check.instance(f"stages[{number}]", stage, Stage, "a Stage, such as Stage(iterations=200)")
+        if stage.solves_light and problem.basis is None:
+            raise ValueError(f"stages[{number}]: got solves_light where light is not free, expected Light among free")
+        if stage.compares == "outlines" and not all(target.outlines for target in problem.targets):
+            raise ValueError(f'stages[{number}]: got compares = "outlines" for a target without, expected outlines')
         try:
             stage.visibility(visibility)
         except ValueError as error:
@@ -141,9 +155,34 @@ def deformation_stages(problem: Problem) -> tuple[Stage, ...]:
     )
 
 
+def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
+    """Find poses and light in a photograph: outlines first, and then poses along the direction that they do not tell.
+
+    A light that is fitted at a wrong pose confirms it. So the light is solved for at each pose, and of five poses along
+    the flat direction that with the least loss goes on.
+    """
+    side = {size: _scale(problem, size) for size in (32, 64, 96, 160)}
+    stages: list[Stage] = []
+    if all(target.outlines for target in problem.targets):
+        first: dict[str, Any] = {"compares": "outlines", "tolerance": 0.01}
+        stages += [
+            Stage(30, 0.1, side[32], candidates=7, standout=0.08, **first),
+            Stage(20, 0.03, side[64], candidates=2, **first),
+            Stage(20, 0.01, side[160], **first),
+        ]
+    solved: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
+    scatter = "flat" if stages else "turned"
+    return (
+        *stages,
+        Stage(12, 0.03, side[96], candidates=5, scatter=scatter, tolerance=0.01, **solved),
+        Stage(20, 0.01, side[160], tolerance=1e-3, **solved),
+    )
+
+
 READY_STAGES: dict[str, Callable[[Problem], tuple[Stage, ...]]] = {
     "pose": pose_stages,
     "deformation": deformation_stages,
+    "photograph": photograph_stages,
 }
 """Ready-made stages, by name."""
 

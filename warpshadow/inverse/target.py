@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.check import AnyPath
 from warpshadow.inverse.encoding import checked_encoding, decoded, guess_encoding, read_linear, read_mask
+from warpshadow.scene.scene import BodyLike
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -35,6 +36,8 @@ class Target:
         white_balance: Gains of red, green and blue with which it was developed: its values are divided by them.
         saturation: Value of the file, 0 to 1 as it is stored, from which a color is saturated: an image may be brighter
             there. None: none is.
+        outlines: Where bodies are seen, by their numbers or names: masks as above, which the bodies' own are to cover.
+            They tell a pose even where light and reflectance are unknown.
         distortion: OpenCV's coefficients k1, k2, p1, p2[, k3] of the camera's lens: the image is made that of a
             pinhole, and pixels that the lens did not see do not count.
     """
@@ -44,6 +47,7 @@ class Target:
     camera: Camera | None
     encoding: str | float
     saturated: np.ndarray | None = field(repr=False)
+    outlines: dict[BodyLike, np.ndarray] = field(repr=False)
 
     def __init__(
         self,
@@ -55,6 +59,7 @@ class Target:
         exposure: float = 0.0,
         white_balance: npt.ArrayLike | None = None,
         saturation: float | None = None,
+        outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
         distortion: npt.ArrayLike | None = None,
     ):
         if encoding is not None:
@@ -92,6 +97,7 @@ class Target:
                 )
             object.__setattr__(self, "mask", mask)
             image[mask == 0] = 0  # whatever the value
+        object.__setattr__(self, "outlines", _outlines(outlines or {}, image.shape[:2]))
         size = image.shape[1], image.shape[0]
         check.instance("camera", self.camera, (Camera, type(None)), "a Camera, or None for the scene's")
         if self.camera is not None and (self.camera.width, self.camera.height) != size:
@@ -118,6 +124,8 @@ class Target:
         if self.saturated is not None:
             spread = undistorted(self.saturated.astype(np.float32), self.camera, coefficients)
             object.__setattr__(self, "saturated", spread > 0)
+        for body, outline in self.outlines.items():
+            self.outlines[body] = np.nan_to_num(undistorted(outline[..., None], self.camera, coefficients)[..., 0])
         both[~is_seen] = 0
         object.__setattr__(self, "mask", np.clip(both[..., -1], 0, 1))
         return np.ascontiguousarray(both[..., :-1])
@@ -125,6 +133,20 @@ class Target:
     def weights(self) -> np.ndarray:
         """How much each pixel counts, float32 of shape [height, width]."""
         return np.ones(self.image.shape[:2], np.float32) if self.mask is None else self.mask
+
+
+def _outlines(
+    outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath], shape: tuple[int, ...]
+) -> dict[BodyLike, np.ndarray]:
+    check.instance("outlines", outlines, Mapping, "masks by bodies, such as {'bottle': 'bottle.png'}")
+    masks = {}
+    for body, outline in outlines.items():
+        with check.located(f"outlines[{body!r}]"):
+            mask = read_mask(check.file("mask", outline)) if check.is_path(outline) else np.asarray(outline, np.float32)
+            check.shape("mask", mask.shape, shape)
+            check.finite("mask", mask, minimum=0, maximum=1)
+        masks[body] = mask
+    return masks
 
 
 def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:
@@ -159,7 +181,7 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> St
     """Targets at the size of a camera resized."""
     images = np.stack([target.image for target in targets])
     weights = np.stack([target.weights() for target in targets])[..., None]
-    down, width_means = (_area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
+    down, width_means = (area_means(count, max(1, round(count * scale))).to(device) for count in images.shape[1:3])
 
     def resized(pixels: np.ndarray) -> torch.Tensor:
         return torch.einsum("ih,vhwc,jw->vijc", down, torch.from_numpy(pixels).to(device), width_means)
@@ -174,7 +196,7 @@ def stacked(targets: Sequence[Target], scale: float, device: torch.device) -> St
     return Stacked(image.contiguous(), weight[..., 0].contiguous(), saturated)
 
 
-def _area_means(count: int, fewer: int) -> torch.Tensor:
+def area_means(count: int, fewer: int) -> torch.Tensor:
     """Averages of a row of pixels by area, [fewer, count]; ``fewer`` need not be a part of ``count``."""
     edges, coarse_edges = np.arange(count + 1), np.arange(fewer + 1) * (count / fewer)
     ends = np.minimum(edges[1:], coarse_edges[1:, None])

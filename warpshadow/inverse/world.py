@@ -112,6 +112,7 @@ class World:
         moving: Bodies that do not stand where the scene has them.
         clip_matrices: Of the views, [view, 4, 4], None for the scene's.
         exposures: Factors of the views' colors, [view, 1] or [view, 3], None for 1.
+        outline_offsets: By how much painted outlines lie inside the true ones [pixels of targets], [view], None for 0.
     """
 
     def __init__(self, renderer: TorchRenderer, cameras: Sequence[Camera]):
@@ -126,24 +127,37 @@ class World:
         self.moving: set[int] = set()
         self.clip_matrices: torch.Tensor | None = None
         self.exposures: torch.Tensor | None = None
+        self.outline_offsets: torch.Tensor | None = None
+
+    @functools.cached_property
+    def geometry(self) -> Geometry | None:
+        """The bodies where they were moved; None where none was."""
+        if not self.moving:
+            return None
+        poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
+        return self.renderer.placed(*poses, rest=self.rest, moving=self.moving)
 
     def images(self) -> torch.Tensor:
-        """Render the views: premultiplied linear RGB and coverage, [view, height, width, 4]."""
-        geometry = None
-        if self.moving:
-            poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
-            geometry = self.renderer.placed(*poses, rest=self.rest, moving=self.moving)
+        """Render the views: premultiplied linear RGB and coverage, [view, height, width, 4]; of lights in their place.
+
+        Lights of one view may be a batch, [light, coefficient, 3].
+        """
         images = self.renderer(
             self.light,
             albedo=self.albedo,
             textures=self.textures,
-            geometry=geometry,
+            geometry=self.geometry,
             clip_matrices=self.clip_matrices,
         )
         if self.exposures is not None:
             color = images[..., :3] * self.exposures[:, None, None]
             images = torch.cat([color, images[..., 3:]], dim=-1)
         return images
+
+    def masks(self) -> torch.Tensor:
+        """Part of each pixel that each body covers, [view, body, height, width]."""
+        masks = self.renderer.layers(geometry=self.geometry, clip_matrices=self.clip_matrices).masks
+        return masks.reshape(len(self.cameras), -1, *masks.shape[-2:])
 
 
 @dataclass
@@ -155,12 +169,14 @@ class FittedScene:
         cameras: Of the views.
         exposures: Factors of the views' colors.
         white_balances: Gains of red, green and blue in each view, beside its exposure; green has 1.
+        outline_offsets: Of the views' painted outlines [pixels].
     """
 
     scene: Scene
     cameras: list[Camera]
     exposures: list[float]
     white_balances: list[tuple[float, float, float]] = field(default_factory=list)
+    outline_offsets: list[float] = field(default_factory=list)
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""

@@ -77,7 +77,7 @@ class Light(Free):
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Penalize negative radiance, and differences between neighboring cells."""
         if isinstance(self.basis, CellBasis):
-            first, second = _neighbors(self.basis.size)
+            first, second = neighboring_cells(self.basis.size)
             radiance = values["log_radiance"].exp()
             return self.smoothness * (radiance[first] - radiance[second]).square().mean() if self.smoothness else None
         if not self.nonnegativity:
@@ -94,7 +94,7 @@ class Light(Free):
 
 
 @functools.cache
-def _neighbors(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+def neighboring_cells(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Pairs of cells that lie side by side: each and the six nearest to it."""
     from scipy.spatial import cKDTree
 

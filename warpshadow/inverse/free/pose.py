@@ -14,13 +14,10 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.inverse import constraints
 from warpshadow.inverse.constraints import PoseConstraint
-from warpshadow.inverse.free.base import FreeOfBody, Values
+from warpshadow.inverse.free.base import PRIOR, FreeOfBody, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
-
-PRIOR = 1e-3
-"""Loss of a prior that is missed by one standard deviation: about 3% of the targets' root mean square in each pixel."""
 
 _NO_TURN = {
     "axis-angle": (0.0, 0.0, 0.0),
@@ -171,11 +168,11 @@ class Pose(FreeOfBody):
 
     def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
-        rotation, middle, scale = self._moved(values, setting)
+        rotation, middle, scale = self.moved(values, setting)
         return rotation, middle - scale * rotation @ setting.tensor(setting.middle(self.number)), scale
 
-    def _moved(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Rotation, middle in the world, and scale of the body."""
+    def moved(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rotation, middle in the world, and scale of the body. Differentiable: values."""
         body, possible = setting.scene.bodies[self.number], self.constraint(setting)
         turn = possible.turn(values["turn"]) if self.rotation == "axis-angle" else values["turn"]
         rotation = rotation_matrices(turn) @ setting.tensor(possible.rotation)
@@ -192,7 +189,7 @@ class Pose(FreeOfBody):
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
         """Squared distances from the priors, in standard deviations."""
         body = setting.scene.bodies[self.number]
-        rotation, middle, scale = self._moved(values, setting)
+        rotation, middle, scale = self.moved(values, setting)
         squares = []
         if self.distance is not None:
             mean, deviation = self.distance

@@ -1,4 +1,4 @@
-"""Free parameters of each view: its exposure and its camera."""
+"""Free parameters of each view: its exposure, the offset of its outlines, and its camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.assets.camera import Camera
-from warpshadow.inverse.free.base import Free, Values
+from warpshadow.inverse.free.base import PRIOR, Free, Values
 from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.torch import rotation_matrices
 
@@ -59,6 +59,42 @@ class Exposure(Free):
         """A factor of each view, and its gains."""
         figures: dict[str, ArrayLike] = {"exposure": fitted.exposures}
         return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
+
+
+@dataclass(frozen=True)
+class OutlineOffset(Free):
+    """By how much the painted outlines of each view lie inside the true ones, since no mask is right to the pixel.
+
+    Args:
+        deviation: Standard deviation of its prior [pixels].
+    """
+
+    key: ClassVar[str] = "outline_offset"
+
+    deviation: float = 1.0
+
+    def __post_init__(self) -> None:
+        check.positive("deviation", self.deviation)
+
+    def start(self, setting: Setting) -> Values:
+        """None."""
+        return {"offset": setting.tensor(np.zeros(len(setting.cameras)))}
+
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
+        """Move the outlines; values are in standard deviations."""
+        world.outline_offsets = values["offset"] * self.deviation
+
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor:
+        """Squared offsets in standard deviations."""
+        return PRIOR * values["offset"].square().sum()
+
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Offsets of the views."""
+        fitted.outline_offsets = (values["offset"] * self.deviation).tolist()
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """An offset of each view."""
+        return {"outline_offset": fitted.outline_offsets}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,114 @@
+"""Uncertainty: standard deviations that repeated measurements have, and the direction that images do not tell."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import warpshadow as ws
+from warpshadow.inverse import (
+    DiagnosticWarning,
+    Exposure,
+    Light,
+    OutlineOffset,
+    Pose,
+    Problem,
+    Result,
+    Target,
+    write_result,
+)
+from warpshadow.inverse.uncertainty import SPREAD, along_flat
+
+NOISE = 0.05
+KNOWN_TURN = Pose("egg", covariance=[0.02] * 3 + [10.0] * 3)  # the outline of an egg hardly tells it
+
+
+def scene(blockers: int = 0) -> ws.Scene:
+    mesh = ws.icosphere(1.0, 3)
+    mesh = dataclasses.replace(mesh, positions=mesh.positions * (0.5, 0.8, 0.6))
+    body = ws.Body(mesh, albedo=(0.7, 0.5, 0.3), blockers=blockers, translation=(0, 0.8, 0), name="egg")
+    ground = ws.Body(ws.plane(6.0, 8), blockers=0, albedo=(0.6,) * 3, name="table")
+    light = np.zeros((4, 3))
+    light[0], light[1], light[2] = 3.0, 0.8, 0.5
+    camera = ws.Camera.look_at((0, 3, 5), (0, 0.6, 0), size=(64, 48))
+    return ws.Scene((body, ground), light, camera, ws.Visibility("none"), supersampling=1)
+
+
+def result_of(free, **target) -> Result:
+    """A fit that has ended at the truth, of an image with noise."""
+    where = scene()
+    image = ws.render(where)[..., :3]
+    image = image + NOISE * np.random.default_rng(0).standard_normal(image.shape)
+    problem = Problem(where, Target(image.astype(np.float32), **target), free, still=None)
+    setting = problem.setting(torch.device("cpu"))
+    return Result(problem, setting, problem.start(setting), [[]], "converged", math.nan)
+
+
+@pytest.fixture(scope="module")
+def outline() -> np.ndarray:
+    alone = dataclasses.replace(scene(), bodies=scene().bodies[:1], supersampling=8)
+    return ws.render(alone)[..., 3]
+
+
+def test_the_exposure_is_as_uncertain_as_repetitions_say():
+    known = result_of([Exposure()]).uncertainty
+    clean = ws.render(scene())[..., :3].astype(np.float64)
+    rng = np.random.default_rng(1)
+    factors = [
+        (clean * (clean + NOISE * rng.standard_normal(clean.shape))).sum() / (clean**2).sum() for _ in range(300)
+    ]
+    (stops,) = known.stops
+    assert stops == pytest.approx(np.log2(factors).std(), rel=0.3)  # a sum over tiles is known to a tenth or two
+    assert known.names == ["exposure.log[0]"] and known.light is None and not known.poses
+
+
+def test_an_outline_does_not_tell_depth_and_a_plane_does(outline):
+    free = result_of([KNOWN_TURN, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
+    standing = result_of(
+        [Pose("egg", stands_on="table", resting="given"), OutlineOffset()],
+        outlines={"egg": outline},
+        mask=np.eye(48, 64),
+    )
+    lengths = []
+    for result in (free, standing):
+        (pose,) = result.uncertainty.poses.values()
+        lengths.append(np.linalg.norm(pose.least))
+        assert np.linalg.norm(pose.shift) >= 0.99 * lengths[-1]
+        if result is free:
+            assert pose.along_view > 0.9 and "along the view" in str(pose) and pose.is_flat
+    assert lengths[1] < 0.5 * lengths[0]
+    assert standing.uncertainty.deviations["outline_offset.offset[0]"] < 1  # less than the prior's
+
+
+def test_a_free_light_makes_a_pose_less_certain():
+    known = result_of([Pose(0)]).uncertainty
+    beside = result_of([Pose(0), Light(2)]).uncertainty
+    assert beside.light > 0
+    sizes = [np.trace(item.covariance) for item in (known, beside)]
+    assert sizes[1] > sizes[0]
+
+
+def test_starts_lie_along_the_direction_that_is_known_least(outline):
+    result = result_of([KNOWN_TURN, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
+    starts = along_flat(result.problem, result.setting, result.values, 4)
+    shifts = [np.concatenate([s["pose[0]"]["turn"].numpy(), s["pose[0]"]["shift"].numpy()]) for s in starts]
+    np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-5)
+    np.testing.assert_allclose(shifts[0], -shifts[1], atol=1e-7)
+
+
+def test_the_summary_has_it_and_a_flat_direction_is_warned_of(tmp_path, outline):
+    result = result_of([KNOWN_TURN, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
+    with pytest.warns(DiagnosticWarning, match="egg is uncertain by more than 2% of its size; known least: ±"):
+        write_result(result, tmp_path)
+    text = (tmp_path / "summary.toml").read_text()
+    assert "[uncertainty]" in text and "along the view" in text
+    from warpshadow.scene import toml_tables
+
+    table = toml_tables.read(tmp_path / "summary.toml", "summary")["uncertainty"]
+    np.testing.assert_allclose(table["egg"]["shift"], result.uncertainty.poses["egg"].shift)
+
+
+def test_textures_alone_have_none():
+    assert result_of([Light(2)]).uncertainty is None

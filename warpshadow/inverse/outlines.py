@@ -1,0 +1,78 @@
+"""Outlines: where bodies are seen in a target, painted by hand or by a segmentation, and not right to the pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpshadow.inverse.target import Target, area_means
+from warpshadow.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """The outlines of all targets at the size of a stage.
+
+    Args:
+        views, bodies: Of each outline, [outline].
+        distances: Signed distance from the outline [pixels of the targets], positive inside, [outline, height, width].
+        scale: Pixels of the stage in one of the targets.
+    """
+
+    views: tuple[int, ...]
+    bodies: tuple[int, ...]
+    distances: torch.Tensor
+    scale: float
+
+    def differences(self, masks: torch.Tensor, offsets: torch.Tensor | None) -> torch.Tensor:
+        """Masks of bodies minus their outlines, [outline, height, width].
+
+        Args:
+            masks: Part of each pixel that each body covers, [view, body, height, width].
+            offsets: By how much outlines are moved outwards [pixels of the targets], [view]; None for 0.
+
+        Differentiable: masks, offsets.
+        """
+        distances = self.distances
+        if offsets is not None:
+            distances = distances + offsets[list(self.views)][:, None, None]
+        return masks[list(self.views), list(self.bodies)] - (0.5 + self.scale * distances).clamp(0, 1)
+
+    def loss(self, masks: torch.Tensor, offsets: torch.Tensor | None) -> torch.Tensor:
+        """Mean square of the differences, summed over outlines. Differentiable: masks, offsets."""
+        return self.differences(masks, offsets).square().mean(dim=(1, 2)).sum()
+
+
+def outlines_of(targets: Sequence[Target], scene: Scene, scale: float, device: torch.device) -> Outlines | None:
+    """The outlines of targets; None where they have none."""
+    painted = [
+        (view, scene.body_number(body, "outlines"), mask)
+        for view, target in enumerate(targets)
+        for body, mask in target.outlines.items()
+    ]
+    if not painted:
+        return None
+    views, bodies, masks = zip(*painted, strict=True)
+    distances = np.stack([signed_distances(mask) for mask in masks])
+    down, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
+    small = torch.einsum("ih,ohw,jw->oij", down, torch.from_numpy(distances), width_means)
+    return Outlines(views, bodies, small.contiguous().to(device), scale)
+
+
+def signed_distances(mask: np.ndarray) -> np.ndarray:
+    """Distance of pixel centers from the edge of a mask [pixels], positive inside, float32 of shape [height, width].
+
+    Where the edge crosses a pixel, the part that is covered tells its distance.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    is_inside = mask >= 0.5
+    if is_inside.all() or not is_inside.any():
+        return np.full(mask.shape, np.hypot(*mask.shape) * (1 if is_inside.all() else -1), np.float32)
+    far = distance_transform_edt(is_inside) - distance_transform_edt(~is_inside)
+    far -= 0.5 * np.sign(far)
+    crosses = np.abs(far) <= 0.5
+    return np.where(crosses, mask - 0.5, far).astype(np.float32)

@@ -1,0 +1,293 @@
+"""Uncertainty of a fit: Gauss–Newton's normal matrix at its end, and the direction that the images tell least of.
+
+With residuals r and their Jacobian J by the few parameters θ, such as poses and exposures, the loss curves as H = JᵀJ,
+and errors of the images move θ by H⁻¹ Jᵀ r. Neighboring residuals have common causes (a shadow that is too soft, a
+highlight), so their products are summed over tiles of pixels [Liang and Zeger 1986, the sandwich estimator]:
+
+    cov θ = H⁻¹ (Σ_tile g gᵀ) H⁻¹,  g = Σ_{p in tile} J_p r_p.
+
+A free light is linear, so it is projected out: from each column of J the best change of the light is subtracted. Priors
+count as measurements with their own standard deviations. J is of central differences of small images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.free.base import PRIOR, Values
+from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.loss import bounded
+from warpshadow.inverse.model import Model
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.variable_projection import ProjectedModel
+from warpshadow.inverse.world import Setting
+
+if TYPE_CHECKING:
+    from warpshadow.inverse.descent import Result
+
+FEW = 32
+"""Numbers that a parameter has at most to be among the uncertain ones; textures are taken as they are."""
+
+FLAT = 0.02
+"""Part of its diagonal by which a body may be uncertain without a warning."""
+
+SPREAD = 0.06
+"""Distance between candidates along a flat direction [half diagonals of the body]."""
+
+_STEP = 0.01  # of differences: half a pixel or less of the small images
+_TILE = 8  # pixels across of the small images
+_RIDGE = 1e-9  # of normal matrices, as a share of their largest entry
+
+
+@dataclass(frozen=True, eq=False)
+class PoseUncertainty:
+    """How well a pose is known, as standard deviations.
+
+    Args:
+        shift: Of the body's middle along x, y and z [scene units], shape [3].
+        turn: Root mean square over all axes together [degrees].
+        least: Shift of the middle by one deviation along the direction that is known least [scene units], [3].
+        least_turn: Turn beside it [degrees].
+        along_view: Part of the shift that is along the view, 0 to 1.
+        diagonal: Of the body's bounding box [scene units].
+    """
+
+    shift: np.ndarray
+    turn: float
+    least: np.ndarray
+    least_turn: float
+    along_view: float
+    diagonal: float
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the body is uncertain by more than 2% of its diagonal."""
+        turned = np.radians(self.least_turn) * self.diagonal / 2
+        return float(np.hypot(np.linalg.norm(self.least), turned)) > FLAT * self.diagonal
+
+    def __str__(self) -> str:
+        length = np.linalg.norm(self.least)
+        where = "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
+        return f"known least: ±{length:.2g} {where}, turned by ±{self.least_turn:.2g}°"
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How well a fit knows its few parameters.
+
+    Args:
+        names: Of the numbers, as "pose[0].shift[1]".
+        covariance: Of them in the units of the fit's values, [number, number].
+        poses: By bodies' names.
+        light: Standard deviation of the total radiance of a free light, as a part of it; None where it is not free.
+    """
+
+    names: list[str]
+    covariance: np.ndarray = field(repr=False)
+    poses: dict[str, PoseUncertainty]
+    light: float | None
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations of the numbers, in the units of the fit's values."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def stops(self) -> list[float]:
+        """Of the exposures of the views."""
+        return [sd / np.log(2.0) for name, sd in self.deviations.items() if name.startswith("exposure.log[")]
+
+
+class _Normal:
+    """The normal matrix at some values, and the sum over tiles."""
+
+    def __init__(self, problem: Problem, setting: Setting, values: Mapping[str, Values]):
+        self.problem, self.setting = problem, setting
+        self.values = {name: {key: t.detach().clone() for key, t in own.items()} for name, own in values.items()}
+        stage = small_stage(problem)
+        has_light = any(isinstance(free, Light) for free in problem.free)
+        self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
+        self.places = _places(self.values)
+        with torch.no_grad():
+            if isinstance(self.model, ProjectedModel):
+                self.model.solve(self.values)
+            self.residuals = self._residuals()
+            self.columns = np.stack([self._difference(*place) for place in self.places], axis=-1)
+            self.light = self._project_light() if isinstance(self.model, ProjectedModel) else None
+        curvature = self._prior()
+        flat = self.columns.reshape(-1, len(self.places))
+        self.form = flat.T @ flat + PRIOR * curvature
+        self.form += _RIDGE * np.abs(self.form).max() * np.eye(len(self.form))
+        scores = _by_tiles(self.columns * self.residuals[..., None])
+        self.middle = scores.T @ scores + PRIOR**2 * curvature
+
+    def _residuals(self) -> np.ndarray:
+        """Weighted differences whose squares sum to the loss, float64 [view, height, width, channel]."""
+        model, loss = self.model, self.problem.loss
+        world = model.world(self.values)
+        compared = bounded(world.images(), model.targets, model.saturated)
+        x = (compared[..., :3] - model.targets[..., :3]) / self.setting.unit
+        if not hasattr(self, "roots"):  # weights of the reweighted squares stay
+            self.roots = (model.weights[..., None] / model.weights.sum() * loss.pixel_weights(x)).sqrt()
+        parts = [self.roots * x]
+        if model.targets.shape[-1] == 4:
+            share = (loss.coverage * model.weights / model.weights.sum()).sqrt()[..., None]
+            parts.append(share * (compared[..., 3:] - model.targets[..., 3:]))
+        if model.outlines is not None:
+            gaps = model.outlines.differences(world.masks(), world.outline_offsets)
+            pixels = gaps.new_zeros(len(model.cameras), *gaps.shape[1:], len(gaps))
+            for number, view in enumerate(model.outlines.views):
+                pixels[view, ..., number] = gaps[number]
+            parts.append(pixels * float(np.sqrt(loss.coverage / gaps[0].numel())))
+        return torch.cat(parts, dim=-1).double().cpu().numpy()
+
+    def _difference(self, name: str, key: str, number: int) -> np.ndarray:
+        """Derivative of the residuals by a number."""
+        tensor = self.values[name][key].view(-1)
+        both = []
+        for step in (_STEP, -_STEP):
+            tensor[number] += step
+            both.append(self._residuals())
+            tensor[number] -= step
+        return (both[0] - both[1]) / (2 * _STEP)
+
+    def _project_light(self) -> float:
+        """Take the best change of the light out of the columns; the relative deviation of its total."""
+        assert isinstance(self.model, ProjectedModel)
+        design = (self.model.design(self.values) * self.roots).double().cpu().numpy()
+        design = np.tensordot(self.model.atoms, design, axes=1)  # [atom, view, height, width, 3]
+        radiance = self.model.solution
+        prior, total, variance = self.model.prior(), 0.0, 0.0
+        for color in range(3):
+            active = radiance[:, color] > 1e-3 * radiance[:, color].max()
+            basis = design[active][..., color].reshape(int(active.sum()), -1).T  # [pixel, atom]
+            form = basis.T @ basis + prior[np.ix_(active, active)]
+            form += 1e-6 * np.trace(form) / max(len(form), 1) * np.eye(len(form))
+            columns = self.columns[..., color, :]
+            flat = columns.reshape(-1, columns.shape[-1])
+            flat -= basis @ np.linalg.solve(form, basis.T @ flat)
+            self.columns[..., color, :] = flat.reshape(columns.shape)
+            errors = self.residuals[..., color]
+            shape = (*errors.shape, 1, basis.shape[1])
+            scores = _by_tiles((basis * errors.reshape(-1, 1)).reshape(shape))
+            ones = np.linalg.solve(form, np.ones(len(form)))
+            total += radiance[active, color].sum()
+            variance += float(((scores @ ones) ** 2).sum())
+        return float(np.sqrt(variance) / total) if total > 0 else 0.0
+
+    def _prior(self) -> np.ndarray:
+        """Precision that priors have, [number, number]: the curvature of the regularizers of poses and offsets."""
+        sizes = [self.values[name][key].view(-1)[number] for name, key, number in self.places]
+        start = torch.stack(sizes) if sizes else torch.zeros(0)
+
+        def regularizer(flat: torch.Tensor) -> torch.Tensor:
+            parts: dict[str, dict[str, list[torch.Tensor]]] = {}
+            for (name, key, _), value in zip(self.places, flat, strict=True):
+                parts.setdefault(name, {}).setdefault(key, []).append(value)
+            total = flat.sum() * 0
+            for free in self.problem.free:
+                if free.name in parts and (isinstance(free, Pose) or free.key == "outline_offset"):
+                    own = self.values[free.name]
+                    values = {key: torch.stack(part).view_as(own[key]) for key, part in parts[free.name].items()}
+                    term = free.regularizer(values, self.setting)
+                    total = total if term is None else total + term
+            return total
+
+        hessian = torch.autograd.functional.hessian(regularizer, start)
+        return hessian.double().cpu().numpy() / (2 * PRIOR)
+
+
+def _by_tiles(pixels: np.ndarray) -> np.ndarray:
+    """Sums over tiles and channels, [view, height, width, channel, number] to [tile, number]."""
+    sums = pixels.sum(axis=-2)
+    rows = np.add.reduceat(sums, np.arange(0, sums.shape[1], _TILE), axis=1)
+    return np.add.reduceat(rows, np.arange(0, sums.shape[2], _TILE), axis=2).reshape(-1, sums.shape[-1])
+
+
+def uncertainty(result: Result) -> Uncertainty | None:
+    """How well a fit knows its few parameters; None where it has none."""
+    if not _places(result.values):
+        return None
+    normal = _Normal(result.problem, result.setting, result.values)
+    inverse = np.linalg.inv(normal.form)
+    covariance = inverse @ normal.middle @ inverse
+    poses = {
+        free.called(result.found): _pose_uncertainty(free, normal, covariance)
+        for free in result.problem.free
+        if isinstance(free, Pose)
+    }
+    names = [f"{name}.{key}[{number}]" for name, key, number in normal.places]
+    return Uncertainty(names, covariance, poses, normal.light)
+
+
+def _pose_uncertainty(free: Pose, normal: _Normal, covariance: np.ndarray) -> PoseUncertainty:
+    """The uncertainty of a pose in scene units and degrees."""
+    setting, own = normal.setting, normal.values[free.name]
+    rows = [index for index, (name, _, _) in enumerate(normal.places) if name == free.name]
+    slopes = []
+    for index in rows:
+        _, key, number = normal.places[index]
+        ends = []
+        for step in (_STEP, -_STEP):
+            own[key].view(-1)[number] += step
+            rotation, middle, _ = free.moved(own, setting)
+            ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
+            own[key].view(-1)[number] -= step
+        turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
+        slopes.append(np.array([*(ends[0][1] - ends[1][1]), turn[2, 1], turn[0, 2], turn[1, 0]]) / (2 * _STEP))
+    _, middle, scale = free.moved(own, setting)
+    half = setting.extent(free.number) * float(scale)
+    both = np.stack(slopes, axis=1)
+    cov = both @ covariance[np.ix_(rows, rows)] @ both.T
+    units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
+    sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
+    least = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
+    view = middle.double().numpy(force=True) - setting.cameras[0].eye
+    length = float(np.linalg.norm(least[:3]))
+    along = abs(float(least[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
+    return PoseUncertainty(
+        np.sqrt(np.diag(cov)[:3]),
+        float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))),
+        least[:3],
+        float(np.degrees(np.linalg.norm(least[3:]) / half)),
+        along,
+        2 * half,
+    )
+
+
+def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
+    """Values beside some, along the direction of the poses that the images tell least of, either way, farther and
+    farther; the light is solved for anew.
+    """
+    normal = _Normal(problem, setting, values)
+    poses = [index for index, (name, _, _) in enumerate(normal.places) if name.startswith(f"{Pose.key}[")]
+    beside: list[dict[str, Values]] = []
+    if poses:
+        spread = np.linalg.inv(normal.form)[np.ix_(poses, poses)]
+        direction = np.linalg.eigh(spread)[1][:, -1]
+    for number in range(count):
+        moved = {name: {key: t.detach().clone() for key, t in own.items()} for name, own in values.items()}
+        step = SPREAD * (number // 2 + 1) * (-1) ** number
+        for index, part in zip(poses, direction if poses else (), strict=True):
+            name, key, place = normal.places[index]
+            moved[name][key].view(-1)[place] += step * float(part)
+        beside.append(moved)
+    return beside
+
+
+def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
+    """Name, key and index of the numbers of parameters that have few."""
+    return [
+        (name, key, number)
+        for name, own in values.items()
+        for key, tensor in own.items()
+        if name != Light.key and tensor.numel() <= FEW
+        for number in range(tensor.numel())
+    ]

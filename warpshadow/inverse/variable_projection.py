@@ -1,0 +1,141 @@
+"""Variable projection: a light that is solved for at each geometry, not descended to [Golub and Pereyra 1973].
+
+For known geometry and reflectance images are linear in the light, I = A L. The loss at the best light,
+
+    f(θ) = min_{L ≥ 0} loss(A(θ) L, I),
+
+has the gradient of the loss at that light held fixed, since the loss does not change with it there. So a pose descends
+through lights that explain as much as they can, and a light found at a wrong pose cannot confirm it.
+
+The light is a sum of cells that are never negative: those of a map, or of spherical harmonics the projections of cells.
+Least squares with that bound are solved by their normal equations; other losses by reweighting them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from warpshadow.assets.basis import CellBasis
+from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.light import Light, neighboring_cells
+from warpshadow.inverse.model import LightModel, Model
+from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.schedule import Stage
+from warpshadow.inverse.world import Setting
+from warpshadow.maths.directions import fibonacci
+
+_REWEIGHTINGS = 6  # of losses that are not squares
+_RIDGE = 1e-6  # least eigenvalue of a form, as a share of the mean of its diagonal
+_DARKEST = 1e-6  # radiance of a cell whose logarithm is stored, where the solution is 0 [radiance of the targets]
+_LIGHTS_AT_ONCE = 32
+_ATOMS = 192  # cells of which light in spherical harmonics is made
+
+
+class ProjectedModel(Model):
+    """A model whose light is solved for before each loss, in place, so that no optimizer holds it."""
+
+    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
+        super().__init__(problem, setting, stage)
+        self.light = next(free for free in problem.free if isinstance(free, Light))
+        self.atoms = atoms(self.light)
+        self.solution = np.zeros((len(self.atoms), 3))  # radiance of the atoms that was found last
+
+    def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The loss at the best light, and the images. Differentiable: values, but for the light's, which it sets."""
+        with torch.no_grad():
+            self.solve(values)
+        return super().loss(values)
+
+    def design(self, values: Mapping[str, Values]) -> torch.Tensor:
+        """Images in light of which one coefficient is 1, [coefficient, view, height, width, 3]."""
+        world = self.world(values)
+        units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
+        images = []
+        for part in units if len(self.cameras) > 1 else units.split(_LIGHTS_AT_ONCE):
+            world.light = part
+            images.append(world.images().reshape(-1, len(self.cameras), *self.targets.shape[1:3], 4)[..., :3])
+        return torch.cat(images)
+
+    def solve(self, values: Mapping[str, Values]) -> None:
+        """Set the light to that of the least loss, for the other values."""
+        design = self.design(values).permute(4, 0, 1, 2, 3).flatten(2)  # [color, coefficient, pixel]
+        design = torch.einsum("ak,ckp->cap", torch.from_numpy(self.atoms).to(design), design)
+        target = (self.targets[..., :3] / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
+        share = self.weights.flatten() / (self.weights.sum() if self.problem.loss.reduction == "mean" else 1.0)
+        prior = self.prior()
+        weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))
+        for _ in range(1 if self.problem.loss.kind == "l2" and self.saturated is None else _REWEIGHTINGS):
+            for color in range(3):
+                weighted = design[color] * weights[color]
+                form = (weighted @ design[color].T).double().cpu().numpy() + prior
+                slope = (weighted @ target[color]).double().cpu().numpy()
+                radiance[color] = nonnegative_least_squares(form, slope)
+            images = torch.einsum("cap,ca->cp", design, torch.from_numpy(radiance).to(design))
+            weights = share * self._reweighted(images, target)
+        self.solution = radiance.T
+        self._store(self.solution, values[self.light.name])
+
+    def _reweighted(self, images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Weights of squares that stand for the loss at images, [color, pixel]; 0 where saturation allows them."""
+        weights = self.problem.loss.pixel_weights((images - target).T).T
+        if self.saturated is None:
+            return weights
+        saturated = self.saturated.permute(3, 0, 1, 2).flatten(1)
+        return torch.where(saturated & (images > target), 0.0, weights)
+
+    def prior(self) -> np.ndarray:
+        """Quadratic form of the smoothness of cells, as :meth:`Light.regularizer` has it, [atom, atom]."""
+        count = len(self.atoms)
+        form = np.zeros((count, count))
+        if isinstance(self.light.basis, CellBasis) and self.light.smoothness:
+            first, second = (part.numpy() for part in neighboring_cells(count))
+            weight = self.regularization * self.light.smoothness / (3 * len(first))
+            np.add.at(form, (first, first), weight)
+            np.add.at(form, (second, second), weight)
+            np.add.at(form, (first, second), -weight)
+            np.add.at(form, (second, first), -weight)
+        return form
+
+    def _store(self, radiance: np.ndarray, values: Values) -> None:
+        """Write radiance of atoms, [atom, 3], into the light's values."""
+        if isinstance(self.light.basis, CellBasis):
+            stored = {"log_radiance": np.log(np.maximum(radiance, _DARKEST))}
+        else:
+            stored = {"coefficients": self.atoms.T @ radiance / np.sqrt(4 * np.pi)}
+        for key, numbers in stored.items():
+            values[key].copy_(self.setting.tensor(numbers))
+
+
+def atoms(light: Light) -> np.ndarray:
+    """Lights of which sums with no negative parts are searched, in coefficients, float64 [atom, coefficient]."""
+    if isinstance(light.basis, CellBasis):
+        return np.eye(light.basis.size)
+    return light.basis.functions(fibonacci(_ATOMS)).astype(np.float64) * (4 * np.pi / _ATOMS)
+
+
+def nonnegative_least_squares(form: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """The x ≥ 0 of the least xᵀ F x − 2 sᵀ x [Lawson and Hanson 1974, on a square root of F].
+
+    Args:
+        form: F, symmetric and positive semidefinite, [n, n]; directions in which it is about 0 get a ridge.
+        slope: s, [n].
+    """
+    from scipy.optimize import nnls
+
+    scale = np.trace(form) / len(form)
+    if scale <= 0:
+        return np.zeros(len(form))
+    values, vectors = np.linalg.eigh(form / scale)
+    roots = np.sqrt(np.maximum(values, _RIDGE))
+    solution, _ = nnls(roots[:, None] * vectors.T, vectors.T @ slope / (scale * roots))
+    return solution
+
+
+def make_model(problem: Problem, setting: Setting, stage: Stage) -> Model:
+    """The cheapest model that a problem and a stage allow."""
+    if stage.solves_light:
+        return ProjectedModel(problem, setting, stage)
+    return (LightModel if LightModel.applies(problem) else Model)(problem, setting, stage)
