@@ -544,3 +544,51 @@ def test_a_ground_in_moving_shadows(method, receivers, double, make_renderer, mo
     tensors = variables(renderer, turns, PLACES, SCALES, camera_turn, LIGHT, color)
     assert (draw(*tensors)[..., 3] == 1).all()
     assert torch.autograd.gradcheck(draw, tensors, nondet_tol=CUDA_SUMS, **EXACT)
+
+
+# ---------------------------------------------------------------------------------------------- gloss
+
+EYE = np.array([[1.2, 0.1, 0.2, 0.3], [0, 1.4, 0.1, -0.2], [0.1, 0.2, 1.0, 0.5], [0.1, -0.2, 0.9, 3.0]])
+
+
+@pytest.fixture
+def glossy():
+    """Points, normals that see the camera, and roughness, as arguments."""
+    points = random(0, 1, 2, 3)
+    normals = unit(unit(twins.eye_of(EYE) - points) + 0.5 * np.tanh(random(1, 1, 2, 3)))
+    return (wp.vec3d, points), (wp.vec3d, normals), (wp.float64, 0.5 + 0.2 * np.tanh(random(2, 1, 2)))
+
+
+@pytest.mark.parametrize("quantity", [0, 1, 2])
+def test_samples_of_lobes(quantity, double, device, check, glossy):
+    sample = double("stages.gloss.lobes").sample_lobes
+    check(lambda *arguments: sample(*arguments, 4)[quantity], *glossy, (wp.mat44d, EYE[None]))
+
+
+def test_prefiltered_light(double, device, check):
+    module = double("stages.gloss.prefilter")
+    texels = put(module.prefilter(random(0, 8, 16, 3) ** 2)[None], wp.vec3d, device)
+    towards, weights = unit(random(1, 1, 2, 3, 3)), np.abs(random(2, 1, 2, 3, 3)) + 0.1
+    check(lambda d, w: module.look_up(texels, d, w), (wp.vec3d, towards), (wp.vec3d, weights))
+
+
+def test_transmittance_of_lobes(double, device, check, glossy):
+    module, cells = double("stages.gloss.transmittance"), double("maths.directions").fibonacci(16)
+    towards = unit(glossy[1][1][:, :, None] + 0.3 * random(4, 1, 2, 2, 3))
+    arguments = (wp.float64, random(3, 1, 2, 16)), glossy[1], (wp.vec3d, towards)
+    check(lambda *arguments: module.transmittance_towards(*arguments, cells), *arguments)
+
+
+@pytest.mark.parametrize("quantity", [0, 1])
+def test_sums_of_lobes(quantity, double, device, check):
+    sums = double("stages.gloss.reflection").sum_lobes
+    weights, light = (wp.vec3d, random(0, 1, 2, 3, 3)), (wp.vec3d, random(1, 2, 2, 3, 3))
+    check(lambda *arguments: sums(*arguments)[quantity], weights, light, (wp.float64, random(2, 1, 2, 3)))
+
+
+@pytest.mark.parametrize("quantity", [0, 1])
+def test_reflection(quantity, double, device, check):
+    reflect, numbers = double("stages.gloss.reflection").reflect, put(np.int32([-1, 1, 0]), wp.int32, device)
+    lights = [(wp.vec3d, random(0, 2, 3, 3)), *((wp.vec3d, random(seed, 2, 2, 3)) for seed in (1, 2))]
+    scalars = [(wp.float64, np.abs(np.tanh(random(seed, 1, 2)))) for seed in (3, 4, 5)]
+    check(lambda *arguments: reflect(numbers, *arguments)[quantity], *lights, *scalars)

@@ -437,3 +437,92 @@ def central_differences(function, values, step=1e-6):
         behind[index] -= step
         gradient[index] = (function(ahead) - function(behind)) / (2 * step)
     return gradient
+
+
+# ------------------------------------------------------------------------------------------ gloss
+
+
+def unit(vectors):
+    """Vectors of length 1."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def eye_of(clip_matrix):
+    """The point at which x, y and w of clip space are 0."""
+    rows = clip_matrix[[0, 1, 3]]
+    return -np.linalg.solve(rows[:, :3], rows[:, 3])
+
+
+def lobe_samples(points, normals, roughness, clip_matrix, count):
+    """Directions, (w, w', σ) and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023)."""
+    view = unit(eye_of(clip_matrix) - points)
+    mu = (view * normals).sum(axis=-1)
+    tangent = unit(view - mu[..., None] * normals)
+    frame = np.stack([tangent, np.cross(normals, tangent), normals], axis=-1)
+    alpha = (roughness**2)[..., None]
+    local = np.stack([np.sqrt(1 - mu**2), 0 * mu, mu], axis=-1)
+    slant = np.sqrt(mu**2 * (1 - alpha[..., 0] ** 2) + alpha[..., 0] ** 2)
+    stretched = unit(np.concatenate([alpha * local[..., :2], local[..., 2:]], axis=-1))
+    directions, weights = [], []
+    for i in range(count):
+        share, turn = (i + 0.5) / count, np.pi * (1 + np.sqrt(5)) * i
+        z = (1 - share) * (1 + stretched[..., 2]) - stretched[..., 2]
+        ring = np.sqrt(1 - z**2)
+        mirror = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1) + stretched
+        mirror = unit(np.concatenate([alpha * mirror[..., :2], mirror[..., 2:]], axis=-1))
+        facing = (mirror * local).sum(axis=-1)
+        to = 2 * facing[..., None] * mirror - local
+        up, a = to[..., 2], alpha[..., 0]
+        other = np.sqrt(up**2 * (1 - a**2) + a**2)
+        w = np.where(up > 0, up * (mu + slant) / (up * slant + mu * other), 0) / count
+        density = a**2 / (np.pi * (mirror[..., 2] ** 2 * (a**2 - 1) + 1) ** 2) / (2 * (mu + slant))
+        directions.append((frame @ to[..., None])[..., 0])
+        weights.append(np.stack([w, w * (1 - facing) ** 5, 1 / np.sqrt(2 * np.pi * count * density)], axis=-1))
+    return np.stack(directions, axis=-2), np.stack(weights, axis=-2), mu
+
+
+def lobe_energy(cosine, roughness):
+    """∫ f c dω of GGX and Smith, and with (1 − v·h)⁵, over a hemisphere cut finely around the mirrored direction."""
+    alpha, view = roughness**2, np.array([-np.sqrt(1 - cosine**2), 0, cosine])
+    u = (np.arange(2000) + 0.5) / 2000
+    polar = np.arctan(alpha * np.sqrt(u / (1 - u)))  # mirrors, drawn from D max(n·h, 0)
+    azimuth = 2 * np.pi * (np.arange(400) + 0.5) / 400
+    mirror = np.stack(
+        np.broadcast_arrays(
+            np.sin(polar)[:, None] * np.cos(azimuth), np.sin(polar)[:, None] * np.sin(azimuth), np.cos(polar)[:, None]
+        ),
+        axis=-1,
+    )
+    facing = mirror @ view
+    up = 2 * facing * mirror[..., 2] - cosine
+    slants = [np.sqrt(x**2 * (1 - alpha**2) + alpha**2) for x in (cosine, up)]
+    shown = 0.5 / np.where(up > 0, up * slants[0] + cosine * slants[1], 1)
+    values = np.where((up > 0) & (facing > 0), 4 * shown * up * facing / mirror[..., 2], 0)
+    return values.mean(), (values * (1 - np.clip(facing, 0, 1)) ** 5).mean()
+
+
+def even_grazing(cosine):
+    """∫ (1 − v·h)⁵ max(n·l, 0) dω / π."""
+    directions, weights = sphere_quadrature(64)
+    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    facing = np.sqrt(np.maximum(1 + directions @ view, 0) / 2)
+    return weights @ ((1 - facing) ** 5 * np.maximum(directions[:, 2], 0)) / np.pi
+
+
+def blurred(radiance, directions, sigma):
+    """A map under exp((cos − 1) / σ²) around directions, [direction, channel]."""
+    height, width, _ = radiance.shape
+    theta = np.pi * (np.arange(height)[:, None] + 0.5) / height
+    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
+    towards = np.stack(
+        np.broadcast_arrays(np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)), axis=-1
+    )
+    weights = np.exp((towards @ directions.T - 1) / sigma**2) * np.sin(theta)[..., None]
+    return np.einsum("ijd,ijc->dc", weights, radiance) / weights.sum(axis=(0, 1))[:, None]
+
+
+def transmittance_near(transmittance, normals, directions, cells, reach):
+    """Mean over cells, weighted by max(l·ω − cos ρ, 0)² max(n·ω, 0)."""
+    near = np.maximum(directions @ cells.T - np.cos(reach * 2 / np.sqrt(len(cells))), 0) ** 2
+    weights = near * np.maximum(normals @ cells.T, 0)[:, :, None]
+    return (weights * transmittance[:, :, None]).sum(axis=-1) / weights.sum(axis=-1)

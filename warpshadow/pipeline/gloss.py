@@ -63,7 +63,8 @@ class GlossyPoints(LitPoints):
         key = materials.gloss["roughness"]
 
         def lobes() -> Node:
-            return Node("lobes", _sample, self.receivers_node, roughness, self._view.cameras, items=words)
+            inputs = self.receivers_node, roughness, self._view.cameras, self.method.lobe_samples
+            return Node("lobes", _sample, *inputs, items=words)
 
         sampled = self.cached("lobes", key, lobes)
         directions, weights, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
@@ -126,8 +127,10 @@ def _texels(device: wp.Device, light: KnownLight) -> wp.array:
     return wp.array(prefilter(map_of(light))[None], dtype=wp.vec3, device=device)
 
 
-def _sample(receivers: Receivers, roughness: wp.array, cameras: wp.array) -> tuple[wp.array, wp.array, wp.array]:
-    return sample_lobes(receivers.points, receivers.normals, roughness, cameras)
+def _sample(
+    receivers: Receivers, roughness: wp.array, cameras: wp.array, sample_count: int
+) -> tuple[wp.array, wp.array, wp.array]:
+    return sample_lobes(receivers.points, receivers.normals, roughness, cameras, sample_count)
 
 
 def _spans(is_glossy: np.ndarray, receivers: Receivers) -> list[Span]:

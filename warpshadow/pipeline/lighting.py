@@ -18,6 +18,7 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import BY_SPHERES, Blocking, SelfVisibility
 from warpshadow.pipeline.static import StaticBodies
+from warpshadow.stages.gloss.lobes import SAMPLES
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.receivers import Numbering, Receivers, number_receivers
 from warpshadow.stages.shading import shade
@@ -137,6 +138,9 @@ class Method:
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
+
+    lobe_samples = SAMPLES
+    """Samples of a lobe of a body that shines."""
 
     traces_self_visibility = False
     """Whether bodies' shadows on themselves may come from rays, where the others' come from spheres."""

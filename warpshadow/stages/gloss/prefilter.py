@@ -12,6 +12,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.maths import sh
@@ -82,15 +83,19 @@ def prefilter(radiance: np.ndarray) -> np.ndarray:
     levels = [with_rows(radiance, rows)]
     for level, count in enumerate(level_rows(rows)[1:]):
         spectrum = np.fft.rfft(with_rows(levels[0], count), axis=1)
-        blurred = np.einsum("rsf,sfc->rfc", _blur_spectra(count, 2**level * np.pi / rows), spectrum, optimize=True)
+        # texels are means, and interpolated: that blurs by a twelfth and a sixth of their square
+        sigma = float(np.sqrt((2**level / rows) ** 2 - 0.25 / count**2) * np.pi)
+        blurred = np.einsum("rsf,sfc->rfc", _blur_spectra(count, sigma), spectrum, optimize=True)
         levels.append(np.fft.irfft(blurred, 2 * count, axis=1))
     channels = radiance.shape[2]
     return np.concatenate([level.reshape(-1, channels) for level in levels]).astype(np.float32)
 
 
-def rows_of(texel_count: int) -> int:
-    """Rows of level 0, by the number of all texels."""
-    return next(rows for rows in (64, ROWS) if sum(2 * count**2 for count in level_rows(rows)) == texel_count)
+def _levels_of(texel_count: int) -> np.ndarray:
+    """First texel and rows of each level, [level, 2], by the number of all texels."""
+    choices = (np.array(level_rows(rows)) for rows in (64, ROWS))
+    rows = next(counts for counts in choices if (2 * counts**2).sum() == texel_count)
+    return np.stack([np.cumsum(2 * rows**2) - 2 * rows**2, rows], axis=1)
 
 
 @wp.func
@@ -102,22 +107,13 @@ def _at_level(texels: wp.array(dtype=wp.vec3), first: int, rows: int, polar: flo
     left = int(wp.floor(column))
     down = row - float(upper)
     right = column - float(left)
-    if left < 0:
-        left += 2 * rows
-    next_column = left + 1
-    if next_column >= 2 * rows:
-        next_column = 0
+    next_column = wp.where(left + 1 >= 2 * rows, 0, left + 1)
+    left = wp.where(left < 0, left + 2 * rows, left)
     above = first + upper * 2 * rows
     below = above + 2 * rows
     return (1.0 - down) * ((1.0 - right) * texels[above + left] + right * texels[above + next_column]) + down * (
         (1.0 - right) * texels[below + left] + right * texels[below + next_column]
     )
-
-
-@wp.func
-def _rows_at(level: int, rows: int):
-    """Rows of a level."""
-    return wp.where(level == 0, rows, wp.max(rows >> wp.max(level - 1, 0), _LEAST_ROWS))
 
 
 @wp.kernel
@@ -126,7 +122,7 @@ def _look_up(
     worker: int,
     # in
     texels: wp.array2d(dtype=wp.vec3),
-    rows: int,
+    levels: wp.array(dtype=wp.vec2i),
     directions: wp.array3d(dtype=wp.vec3),
     weights: wp.array3d(dtype=wp.vec3),
     # out
@@ -142,15 +138,11 @@ def _look_up(
         azimuth = wp.atan2(direction[0], -direction[2]) / (2.0 * wp.pi)
         azimuth = azimuth - wp.floor(azimuth)
         # half a texel of the map itself is between levels 0 and 1
-        blur = wp.max(weights[located, receiver, i][2] * float(rows) / wp.pi, 0.5)
+        blur = wp.max(weights[located, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
         height = wp.clamp(wp.log2(blur) + 1.0, 0.0, float(_LEVELS) - 1.001)
         level = int(height)
-        finer = int(0)
-        for k in range(level):
-            finer += 2 * _rows_at(k, rows) * _rows_at(k, rows)
-        own = _rows_at(level, rows)
-        a = _at_level(lit, finer, own, polar, azimuth)
-        b = _at_level(lit, finer + 2 * own * own, _rows_at(level + 1, rows), polar, azimuth)
+        a = _at_level(lit, levels[level][0], levels[level][1], polar, azimuth)
+        b = _at_level(lit, levels[level + 1][0], levels[level + 1][1], polar, azimuth)
         light[batch, receiver, i] = a + (height - float(level)) * (b - a)
 
 
@@ -169,10 +161,11 @@ def look_up(texels: wp.array, directions: wp.array, weights: wp.array) -> wp.arr
     check.shape("weights", weights.shape, directions.shape)
     count = common_batch({"texels": texels, "directions": directions})
     light = wp.empty((count, *directions.shape[1:]), dtype=wp.vec3, device=directions.device)
+    levels = constant(_levels_of(texels.shape[1]), wp.vec2i, directions.device)
     launch(
         _look_up,
         count * directions.shape[1],
-        inputs=[texels, rows_of(texels.shape[1]), directions, weights],
+        inputs=[texels, levels, directions, weights],
         outputs=[light],
         shared=[texels, directions, weights],
         cost=_COST * directions.shape[2],

@@ -2,22 +2,14 @@
 
 import functools
 
-import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
-from warpshadow.stages.gloss.lobes import SAMPLES
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open
 
 _PACKET_COST = 2000.0
 """Nanoseconds that a packet takes."""
-
-
-def packet_order() -> np.ndarray:
-    """Samples of a lobe by packet, [packet, 16]: those in the middle, and those around it."""
-    return np.arange(SAMPLES).reshape(-1, PACKET)
 
 
 @functools.cache
@@ -34,7 +26,6 @@ def _make_trace() -> wp.Kernel:
         points: wp.array(dtype=wp.vec3),
         normals: wp.array(dtype=wp.vec3),
         directions: wp.array2d(dtype=wp.vec3),
-        samples: wp.array2d(dtype=wp.int32),
         # out
         transmittance: wp.array2d(dtype=wp.float32),
     ):
@@ -43,12 +34,12 @@ def _make_trace() -> wp.Kernel:
         point = points[receiver]
         normal = normals[receiver]
         last = int(-1)
-        for packet in range(samples.shape[0]):
+        for packet in range(directions.shape[1] / PACKET):
             x = Lane()
             y = Lane()
             z = Lane()
             for lane in range(PACKET):
-                direction = directions[receiver, samples[packet, lane]]
+                direction = directions[receiver, packet * PACKET + lane]
                 x[lane] = direction[0]
                 y[lane] = direction[1]
                 z[lane] = direction[2]
@@ -62,7 +53,7 @@ def _make_trace() -> wp.Kernel:
                 is_open = result[0]
                 last = result[1]
             for lane in range(PACKET):
-                transmittance[receiver, samples[packet, lane]] = float((is_open >> lane) % 2)
+                transmittance[receiver, packet * PACKET + lane] = float((is_open >> lane) % 2)
 
     return trace_lobes
 
@@ -74,7 +65,7 @@ def trace_lobes(tree: FaceTree, points: wp.array, normals: wp.array, directions:
         tree: The faces that block light.
         points: Receiver positions [scene units], vec3 of shape [receiver].
         normals: Unit normals, vec3 of shape [receiver].
-        directions: Of :func:`.lobes.sample_lobes`, of an instance, vec3 of shape [receiver, sample].
+        directions: Of :func:`.lobes.sample_lobes`, of an instance, vec3 of shape [receiver, sample], a multiple of 16.
 
     Returns:
         1 for samples that meet none, else 0, float32 of shape [receiver, sample].
@@ -85,8 +76,8 @@ def trace_lobes(tree: FaceTree, points: wp.array, normals: wp.array, directions:
     launch(
         _make_trace(),
         len(points),
-        inputs=[tree, points, normals, directions, constant(packet_order(), wp.int32, points.device)],
+        inputs=[tree, points, normals, directions],
         outputs=[transmittance],
-        cost=_PACKET_COST * SAMPLES / PACKET,
+        cost=_PACKET_COST * directions.shape[1] / PACKET,
     )
     return transmittance
