@@ -522,7 +522,9 @@ def blurred(radiance, directions, sigma):
 
 
 def transmittance_near(transmittance, normals, directions, cells, reach):
-    """Mean over cells, weighted by max(l·ω − cos ρ, 0)² max(n·ω, 0)."""
-    near = np.maximum(directions @ cells.T - np.cos(reach * 2 / np.sqrt(len(cells))), 0) ** 2
-    weights = near * np.maximum(normals @ cells.T, 0)[:, :, None]
-    return (weights * transmittance[:, :, None]).sum(axis=-1) / weights.sum(axis=-1)
+    """Mean over cells, weighted by max(l·ω − cos ρ, 0)², of the light above the horizon."""
+    radius = 2 / np.sqrt(len(cells))
+    near = np.maximum(directions @ cells.T - np.cos(reach * radius), 0) ** 2
+    rise = np.clip(0.5 + 0.5 / radius * normals @ cells.T, 0, 1)
+    above = (rise**2 * (3 - 2 * rise))[:, :, None]
+    return (near * np.minimum(transmittance[:, :, None], above)).sum(axis=-1) / (near * above).sum(axis=-1)

@@ -3,7 +3,7 @@
 import copy
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -86,11 +86,39 @@ class Materials:
         body = self.merged_scene.scene.bodies[number]
         return not arguments and not np.any(body.albedo if body.texture is None else body.texture)
 
-    def replaced(self, albedo: Given, textures: Given) -> "Materials":
+    def replaced(self, albedo: Given, textures: Given, gloss: Mapping[str, Given] | None = None) -> "Materials":
         """A copy with some materials replaced, checked; nodes of the others are shared.
 
         Itself where nothing is given.
         """
+        shiny = self._shiny(gloss or {})
+        return self._colored(albedo, textures) if shiny is self else shiny._colored(albedo, textures)
+
+    def _shiny(self, gloss: Mapping[str, Given]) -> "Materials":
+        """A copy with other roughness and the like; itself where nothing is given."""
+        bodies, changed = self.merged_scene.scene.bodies, {}
+        for name, arrays in gloss.items():
+            values = list(self.gloss[name].value()) if self.gloss else []
+            for number, array in enumerate(arrays or ()):
+                if array is None:
+                    continue
+                if not bodies[number].is_glossy:
+                    expected = "one for bodies that have roughness in the scene"
+                    raise ValueError(f"{name}[{number}]: got some for {bodies[number].called!r}, expected {expected}")
+                count = 1 if array.shape[1:] == (1,) else bodies[number].mesh.vertex_count
+                check.shape(f"{name}[{number}]", array.shape, ("batch", count))
+                check.finite_arrays({f"{name}[{number}]": array})
+                values[number] = array
+                changed[name] = values
+        if not changed:
+            return self
+        materials = copy.copy(self)
+        inputs = {name: Input(name, values, news=f"{name} is given") for name, values in changed.items()}
+        materials.gloss = self.gloss | inputs
+        return materials
+
+    def _colored(self, albedo: Given, textures: Given) -> "Materials":
+        """A copy with other albedo and textures; itself where nothing is given."""
         bodies = self.merged_scene.scene.bodies
         colors, images = list(self.albedo.value()), list(self.textures.value())
         for number, color in enumerate(albedo or ()):

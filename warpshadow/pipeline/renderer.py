@@ -4,7 +4,7 @@
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -44,7 +44,7 @@ from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
-from warpshadow.scene.scene import SCENE, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import GLOSS, SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
@@ -578,6 +578,7 @@ class SceneRenderer:
         *,
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
+        gloss: Mapping[str, PerBody[wp.array]] | None = None,
         view: View | None = None,
     ) -> wp.array:
         """Draw images.
@@ -586,16 +587,20 @@ class SceneRenderer:
             light: As for :meth:`shade`.
             albedo: As for :meth:`reflect`.
             textures: As for :meth:`reflect`.
+            gloss: "roughness", "metallic" and "specular" of bodies that have roughness in the scene, each float32 of
+                shape [batch, 1] or [batch, vertex] for bodies, as albedo is given.
             view: From :meth:`view`, by default the scene's own.
                 Batches of 1 serve every instance of the others.
 
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
 
-        Differentiable: light, albedo, textures, view.
+        Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._own(view)
-        return view.image(light, *self._per_body(albedo, textures)).value(self._call(view))
+        check.known_keys("gloss", gloss or {}, GLOSS)
+        shiny = {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
+        return view.image(light, *self._per_body(albedo, textures), shiny).value(self._call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.

@@ -3,6 +3,7 @@
 import copy
 import functools
 import operator
+from collections.abc import Mapping
 
 import numpy as np
 import warp as wp
@@ -175,10 +176,16 @@ class View(LitPoints):
             result[[body for body in static.bodies if set(casting) - {body}]] = True
         return result
 
-    def image(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
+    def image(
+        self,
+        light: Light | None = None,
+        albedo: Given = None,
+        textures: Given = None,
+        gloss: Mapping[str, Given] | None = None,
+    ) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
-        materials = self.materials.replaced(albedo, textures)
+        materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
         if materials.gloss:
             return self._averaged(self._glossy(lit, light, materials, reflected.samples), is_moving=self._is_moving)

@@ -97,6 +97,8 @@ def sum_radiance(first: wp.array, second: wp.array) -> wp.array:
 
     Differentiable: first, second.
     """
+    if not first.size:
+        return first
     count = common_batch({"first": first, "second": second})
     sums = wp.empty((count, first[0].size), dtype=wp.vec4, device=first.device)
     launch(_sum, sums.shape, inputs=[rows(first), rows(second)], outputs=[sums])

@@ -142,6 +142,9 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
+        roughness: PerBody[torch.Tensor] | None = None,
+        metallic: PerBody[torch.Tensor] | None = None,
+        specular: PerBody[torch.Tensor] | None = None,
     ) -> torch.Tensor:
         """Render images.
 
@@ -159,21 +162,28 @@ class TorchRenderer(torch.nn.Module):
                 still.
             clip_matrices: Cameras, [4, 4] or [batch, 4, 4], from :meth:`clip_matrices` or
                 :func:`~warpshadow.torch.clip_matrices_from_opengl`; by default the renderer's own.
+            roughness, metallic, specular: Of bodies that have roughness in the scene, in [0, 1], one number, [] or [1],
+                or one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; a list or a mapping, as
+                albedo.
 
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
 
-        Differentiable: light, albedo, textures, geometry, clip_matrices; stages/README.md says how exactly. Gradients
-            to light, and where no light bounces to albedo and textures, may be differentiated again, in all of these;
+        Differentiable: all; stages/README.md says how exactly. Gradients to light,
+            and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
         stored = self._given(light, albedo, textures, geometry, clip_matrices)
+        gloss = {"roughness": roughness, "metallic": metallic, "specular": specular}
+        self._add_gloss(stored, gloss)
+        bodies = range(len(self.scene.bodies))
 
         def draw(arrays: Mapping[str, wp.array]) -> wp.array:
             inputs = self._inputs(stored, arrays, light)
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
-            return self.warp.draw(**inputs, view=self.warp.view(*seen))
+            shiny = {name: [arrays.get(f"{name}[{body}]") for body in bodies] for name in gloss}
+            return self.warp.draw(**inputs, gloss=shiny, view=self.warp.view(*seen))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
         return stored.apply(draw, affine=[name for name in stored.names if is_affine.get(name.partition("[")[0])])
@@ -283,6 +293,16 @@ class TorchRenderer(torch.nn.Module):
                 messages = self._said("textures", textures, number)
                 stored.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, messages=messages)
         return stored
+
+    def _add_gloss(self, stored: Arguments, gloss: Mapping[str, PerBody[torch.Tensor] | None]) -> None:
+        """Add roughness and the like, checked."""
+        for name, values in gloss.items():
+            for number, tensor in enumerate(self.scene.per_body(values, name)):
+                if tensor is not None:
+                    row = tensor.reshape(1) if isinstance(tensor, torch.Tensor) and tensor.ndim == 0 else tensor
+                    count = self.scene.bodies[number].mesh.vertex_count
+                    shape = (1 if np.shape(row)[-1:] == (1,) else count,)
+                    stored.add(f"{name}[{number}]", row, wp.float32, shape, messages=self._said(name, values, number))
 
     def _said(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
         """Name of an item for a body in messages: by the name of the body where that was given."""

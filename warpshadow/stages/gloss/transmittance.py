@@ -1,8 +1,9 @@
 """Transmittance towards the samples of a lobe, interpolated between the cells of directions around them.
 
-    T(l) = Σ_q k_q T_q / Σ_q k_q,   k_q = max(l·ω_q − cos ρ, 0)² max(n·ω_q, 0) + ε,   ρ = 2.2 cell radii,
+    T(l) = Σ_q k_q min(T_q, H_q) / Σ_q k_q H_q,   k_q = max(l·ω_q − cos 2.2ρ, 0)² + ε,   H_q = s(n·ω_q / ρ),
 
-over the cells near l. Cells below the receiver's horizon say nothing of what is above it.
+over the cells near l, ρ their radius and s the smoothstep from 0 at −1 to 1 at 1: the part of a cell that is above the
+receiver's horizon. Of a ball, T_q is H_q: it blocks nothing of what is above.
 """
 
 import functools
@@ -75,10 +76,11 @@ def _sum_near(
     cells: wp.array(dtype=wp.vec3),
     neighbors: wp.array2d(dtype=wp.int32),
     reach_cosine: float,
+    per_radius: float,
     # out
     sums: wp.array3d(dtype=wp.vec2),
 ):
-    """A thread owns a receiver: the sums of k T and of k."""
+    """A thread owns a receiver: the sums of k min(T, H) and of k H."""
     batch, receiver = split_row(first_row + wp.tid(), sums.shape[1])
     located = instance_in(batch, directions.shape[0])
     normal = normals[instance_in(batch, normals.shape[0]), receiver]
@@ -90,8 +92,10 @@ def _sum_near(
         for k in range(neighbors.shape[1]):
             cell = neighbors[texel, k]
             near = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
-            weight = near * near * wp.max(wp.dot(normal, cells[cell]), 0.0) + _NEGLIGIBLE
-            total += weight * wp.vec2(row[receiver, cell], 1.0)
+            weight = near * near + _NEGLIGIBLE
+            rise = wp.clamp(0.5 + 0.5 * per_radius * wp.dot(normal, cells[cell]), 0.0, 1.0)
+            above = rise * rise * (3.0 - 2.0 * rise) + _NEGLIGIBLE
+            total += weight * wp.vec2(wp.min(row[receiver, cell], above), above)
         sums[batch, receiver, i] = total
 
 
@@ -127,13 +131,14 @@ def transmittance_towards(
     arrays = {"transmittance": transmittance, "directions": directions, "normals": normals}
     count, device = common_batch(arrays), directions.device
     near = _neighbors(np.ascontiguousarray(cells, np.float64).tobytes())
-    reach = float(np.cos(REACH * cell_radius(len(cells))))
+    radius = float(cell_radius(len(cells)))
+    reach = float(np.cos(REACH * radius))
     sums = wp.empty((count, *directions.shape[1:]), dtype=wp.vec2, device=device)
     towards, neighbors = constant(cells, wp.vec3, device), constant(near, wp.int32, device)
     launch(
         _sum_near,
         count * directions.shape[1],
-        inputs=[transmittance, normals, directions, towards, neighbors, reach],
+        inputs=[transmittance, normals, directions, towards, neighbors, reach, 1 / radius],
         outputs=[sums],
         shared=[transmittance, normals, directions],
         cost=_COST * directions.shape[2],

@@ -1,0 +1,152 @@
+"""Bodies that shine, as a whole: images, and gradients of images against central differences of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import twins
+
+import warpshadow as ws
+from warpshadow.torch import TorchRenderer, rotation_matrices
+
+# Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
+SMOOTH = 2e-2
+
+SKY = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
+BALL = ws.Body(
+    ws.icosphere(1.0, 3),
+    albedo=(0.8, 0.5, 0.3),
+    blockers=ws.Spheres([(0, 0, 0)], [0.97]),
+    translation=(0, 1.0, 0),
+    roughness=0.4,
+    metallic=0.6,
+    name="ball",
+)
+GROUND = ws.Body(ws.plane(6.0, 8), albedo=(0.3, 0.5, 0.6), name="ground", receivers="pixel")
+POST = ws.Body(
+    ws.icosphere(0.4, 2), blockers=ws.Spheres([(0, 0, 0)], [0.39]), translation=(-1.3, 0.9, 0.9), name="post"
+)
+
+
+def scene_of(*bodies, **options):
+    camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.9, 0), size=(32, 32))
+    return ws.Scene(bodies or (BALL, GROUND, POST), SKY, camera, supersampling=1, **options)
+
+
+NEAR = ws.Camera.look_at((0.3, 1.6, 2.6), (0, 1.0, 0), fov_y=20, size=(32, 32))
+"""Sees no silhouette: those of diffuse bodies have the same gradient."""
+
+
+def weights():
+    row, column = np.mgrid[0:1:32j, 0:1:32j]
+    return torch.tensor(np.stack([np.sin(3 * row + 2 * column), np.cos(2 * row), 1 + column, 0 * row], -1)).float()
+
+
+def slopes(loss, value, step):
+    """The gradient of a loss by the tape, and central differences of it, along each of some directions."""
+    value = value.clone().requires_grad_()
+    loss(value).backward()
+    differences = []
+    with torch.no_grad():
+        for place in np.ndindex(*value.shape):
+            shift = torch.zeros_like(value)
+            shift[place] = step
+            differences.append(float(loss(value + shift) - loss(value - shift)) / (2 * step))
+    return value.grad.numpy().ravel(), np.array(differences)
+
+
+def test_a_diffuse_scene_makes_the_same_launches_and_bits_beside_no_gloss():
+    plain = dataclasses.replace(BALL, roughness=None, metallic=None)
+    renderer = ws.Renderer(scene_of(plain, GROUND))
+    renderer.render()
+    assert "gloss" not in str(renderer.explain()) and "lobes" not in str(renderer.explain())
+
+
+def test_a_rough_dielectric_without_specular_is_diffuse():
+    """All that differs is that its receivers are pixels."""
+    plain = dataclasses.replace(BALL, roughness=None, metallic=None, receivers="pixel")
+    dull = dataclasses.replace(BALL, specular=0.0, metallic=0.0)
+    images = [ws.Renderer(scene_of(body, GROUND, POST)).render() for body in (plain, dull)]
+    np.testing.assert_allclose(*images, atol=1e-6)
+
+
+@pytest.mark.parametrize(("roughness", "loss"), [(0.2, 0.001), (0.6, 0.202), (1.0, 0.618)])
+def test_a_white_metal_in_a_white_furnace_loses_what_single_scattering_loses(roughness, loss):
+    metal = dataclasses.replace(BALL, albedo=(1, 1, 1), roughness=roughness, metallic=1.0, blockers=0)
+    image = ws.Renderer(dataclasses.replace(scene_of(metal), light=ws.EnvironmentMap.constant(1.0))).render()
+    cosines = np.sqrt((np.arange(16) + 0.5) / 16)  # of a ball far away, each as often
+    expected = 1 - np.mean([twins.lobe_energy(cosine, roughness)[0] for cosine in cosines])
+    got = 1 - image[image[..., 3] == 1, :3].mean()
+    assert expected == pytest.approx(loss, abs=0.01) and got == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_stills_and_kept_renderers_show_the_same_gloss(metallic):
+    body = dataclasses.replace(BALL, metallic=metallic)
+    kept, still = ws.Renderer(scene_of(body, GROUND, POST)).render(), ws.render(scene_of(body, GROUND, POST))
+    assert np.linalg.norm(kept - still) < 0.06 * np.linalg.norm(still)
+
+
+@pytest.mark.parametrize("name", ["roughness", "metallic", "specular"])
+def test_gradients_to_gloss(name):
+    renderer, image = TorchRenderer(scene_of(), progress=False), weights()
+
+    def loss(value):
+        return (renderer(**{name: {"ball": value}}) * image).sum()
+
+    gradient, difference = slopes(loss, torch.tensor([0.45]), 3e-3)
+    assert gradient == pytest.approx(difference, rel=SMOOTH)
+
+
+def test_gradients_to_light():
+    basis = ws.CellBasis(ws.fibonacci(32))
+    scene = scene_of(visibility=ws.Visibility(directions=32))
+    renderer, image = TorchRenderer(scene, basis=basis, progress=False), weights()
+    light = torch.tensor(basis.coefficients(SKY))
+    chosen = torch.randn(light.shape, generator=torch.Generator().manual_seed(0))
+
+    def loss(value):
+        return (renderer(light + value * chosen) * image).sum()
+
+    gradient, difference = slopes(loss, torch.tensor([0.0]), 0.1)
+    assert gradient == pytest.approx(difference, rel=1e-3)
+
+
+def test_gradients_to_colors():
+    renderer, image = TorchRenderer(scene_of(), progress=False), weights()
+    gradient, difference = slopes(
+        lambda value: (renderer(albedo={"ball": value}) * image).sum(), torch.tensor([0.8, 0.5, 0.3]), 0.05
+    )
+    np.testing.assert_allclose(gradient, difference, rtol=1e-3)
+
+
+def test_gradients_to_a_pose_of_what_blocks_and_what_shines():
+    renderer, image = TorchRenderer(dataclasses.replace(scene_of(), camera=NEAR), progress=False), weights()
+    rotations, translations, scales = renderer.scene_poses()
+
+    def loss(value):
+        shifts = torch.zeros_like(translations)
+        shifts = torch.cat([value[:1], shifts[1:2], value[1:]])
+        return (renderer(geometry=renderer.placed(rotations, translations + shifts, scales)) * image).sum()
+
+    gradient, difference = slopes(loss, torch.zeros(2, 3), 3e-3)
+    assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
+
+
+def test_gradients_to_the_camera():
+    renderer, image = TorchRenderer(dataclasses.replace(scene_of(), camera=NEAR), progress=False), weights()
+    R, t, K = renderer.scene_cameras()
+
+    def loss(value):
+        turned = rotation_matrices(value[0]) @ R
+        return (renderer(clip_matrices=renderer.clip_matrices(turned, t + value[1], K)) * image).sum()
+
+    gradient, difference = slopes(loss, torch.zeros(2, 3), 1e-3)
+    assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
+
+
+def test_gloss_of_a_diffuse_body_is_refused():
+    renderer = TorchRenderer(scene_of(), progress=False)
+    with pytest.raises(ValueError, match=r"roughness\[1\]: got some for 'ground', expected one for bodies that have"):
+        renderer(roughness={"ground": torch.tensor(0.5)})
