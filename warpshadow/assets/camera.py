@@ -61,7 +61,8 @@ class Camera:
     center of the top left pixel is at (0.5, 0.5), and (0, 0) is its corner. Intrinsics of OpenCV, ROS and RealSense,
     in which pixel centers are at whole numbers, differ from these by half a pixel: :meth:`from_opencv` adds it. There
     are :meth:`from_opengl`, :meth:`from_pytorch3d` and :meth:`from_colmap`, too, and :func:`warpshadow.load_cameras`
-    reads the cameras of NeRF's ``transforms.json`` and of COLMAP. (Clip space: see the module.)
+    reads the cameras of NeRF's ``transforms.json`` and of COLMAP. All take a ``size``, width and height [pixels], and
+    ``near``. (Clip space: see the module.)
 
     Args:
         intrinsics: K [pixels], shape [3, 3], last row (0, 0, 1).
@@ -130,8 +131,6 @@ class Camera:
             target: Point looked at [scene units], shape [3].
             up: Direction that points up in the image, shape [3], any length.
             fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
-            size: Width and height [pixels].
-            near: Distance of the near plane [scene units].
         Raises:
             ValueError: when eye and target coincide or up is parallel to the view.
         """
@@ -165,7 +164,6 @@ class Camera:
                 front.
             up: Direction that points up in the image, shape [3], any length.
             fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
-            size: Width and height [pixels].
             margin: Fraction of the image that stays free around the framed bodies, 0 or more and below 1; leave some
                 for shadows.
             near: Distance of the near plane [scene units]; by default 1% of the distance to the framed bodies.
@@ -219,9 +217,7 @@ class Camera:
             K: OpenCV's camera matrix [pixels], [3, 3], with pixel centers at whole numbers; or a ROS ``CameraInfo`` or
                 RealSense ``intrinsics``, which have the size and the distortion, too. (Of ROS's rectified images the
                 camera matrix is ``np.reshape(info.p, (3, 4))[:, :3]``.)
-            size: Width and height [pixels].
             distortion: Coefficients of the lens; None or zeros, since ``cv2.undistort`` makes images without.
-            near: Distance of the near plane [scene units].
         """
         result, (width, height) = camera_conventions.from_opencv(rvec, tvec, K, size, distortion)
         return cls(*result, width, height, near)
@@ -250,7 +246,6 @@ class Camera:
             size: Width and height [pixels] (PyTorch3D's ``image_size`` is height and width).
             in_ndc: Whether focal length and principal point are in NDC, ±1 at the ends of the shorter side, +x left and
                 +y up; else in pixels, +x right and +y down.
-            near: Distance of the near plane [scene units].
         """
         width, height = check.image_size(size)
         check.flag("in_ndc", in_ndc)
@@ -275,8 +270,6 @@ class Camera:
             tvec: World to camera [scene units], TX, TY, TZ.
             model: "SIMPLE_PINHOLE" or "PINHOLE"; ``colmap image_undistorter`` makes such of others.
             params: f, cx, cy, or fx, fy, cx, cy [pixels]; pixel centers are at +0.5, as here.
-            size: Width and height [pixels].
-            near: Distance of the near plane [scene units].
         """
         width, height = check.image_size(size)
         return cls(*camera_conventions.from_colmap(qvec, tvec, model, params), width, height, near)
@@ -298,7 +291,6 @@ class Camera:
             projection: Perspective projection to OpenGL's clip space, shape [4, 4]; off-center ones are
                 welcome. Either order of the two will do: only one of them can be a projection.
             fov_y: In place of ``projection``: vertical field of view [degrees].
-            size: Width and height [pixels].
             near: Distance of the near plane [scene units]; by default the projection's, or 0.01 with ``fov_y``.
         Raises:
             ValueError: when the view is not rigid or the projection not a perspective.

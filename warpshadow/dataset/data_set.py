@@ -143,7 +143,7 @@ def _split_of(recipe: Recipe, content: str) -> str:
 
 
 class _ReadWhenAsked(Sequence[Item], Generic[Item]):
-    """Hash the files of a folder."""
+    """Files of a folder, each read when it is asked for."""
 
     def __init__(self, folder: Path, names: Sequence[str], read: Callable[[Path], Item]):
         self._folder, self._names, self._read = folder, names, read

@@ -24,7 +24,7 @@ from warpshadow.maths import sh
 from warpshadow.scene.scene import Body, Bounces, Scene, Visibility
 from warpshadow.spheres import Spheres
 
-GROUND_SIZE = 10.0  # scene units; a body is about one
+GROUND_SIZE = 10.0  # scene units, or wider where bodies need it; a body is about one
 SKY_HEIGHT = 64  # rows
 
 Range = tuple[float, float]  # lower and upper bound of an even distribution; equal for a constant
@@ -109,7 +109,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "elevation": (1.0, 89.0),
     "distance": (0.5, 100.0),
 }
-"""Range of the diameter over all draws; the ground is ``GROUND_SIZE`` wide, or wider where bodies need it."""
+"""Least and largest bound of each range."""
 
 
 def _checked_range(name: str, value: object) -> tuple[float, float]:
