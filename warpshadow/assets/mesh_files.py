@@ -32,11 +32,8 @@ class OfTrimesh(Protocol):
 Factors = Mapping[tuple[int, ...], tuple[float, ...]]
 """Linear factors of materials, by the codes that trimesh rounds them to."""
 
-NO_FACTORS: Factors = {}
-"""Of meshes whose file is not known."""
-
-MeshSource = AnyPath | OfTrimesh
-"""Accepted sources of a mesh."""
+NO_FACTORS: Factors = {}  # of meshes whose file is not known
+MeshSource = AnyPath | OfTrimesh  # accepted sources of a mesh
 
 
 def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
@@ -74,15 +71,12 @@ def load_mesh(path: MeshSource) -> Mesh:
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the meshes
             of a ``trimesh.Scene``, which are treated like files.
-
     Returns:
         The mesh, named after the file.
-
     Raises:
         MeshError: for a file of another format, or without usable triangles.
         FileNotFoundError: when the file does not exist.
         ImportError: for USD without the package usd-core.
-
     Warns: Once, with the counts of degenerate faces, duplicate faces and unreferenced vertices, and the attributes that
     were dropped: uvs that some faces lack, textures, and colors that vertices cannot have.
     """
@@ -101,10 +95,8 @@ def load_textured_mesh(path: MeshSource, *, reads_texture: bool = True) -> tuple
     Args:
         path: As there.
         reads_texture: Whether to read the texture, and to warn of dropped textures and colors.
-
     Returns:
         The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
-
     Warns:
         As there; and of a texture that cannot be read, or that counts in place of colors.
     """
@@ -624,5 +616,4 @@ _READERS: dict[str, Callable[[Path], list[MeshPart]]] = {
     **dict.fromkeys([".usd", ".usda", ".usdc", ".usdz"], _read_usd),
 }
 
-MESH_SUFFIXES = tuple(_READERS)
-"""Suffixes of mesh files."""
+MESH_SUFFIXES = tuple(_READERS)  # suffixes of mesh files

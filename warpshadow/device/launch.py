@@ -80,7 +80,6 @@ def differentiable(
         result: Memory for the result: ``wp.empty`` if it is large, since memory that was written to stays in small
             pages. It requires a gradient if a variable does.
         variables: Arrays that the result depends on differentiably; None is skipped.
-
     Returns:
         The result.
     """

@@ -73,11 +73,9 @@ def load(path: AnyPath) -> dict[str, Any] | None:
 
     Args:
         path: The file that :func:`save` was given.
-
     Returns:
         The state, its tensors on the CPU; that of FILE.previous, with a warning, where the file is damaged, and without
         one where it is missing because a process ended between two renames; None where there is neither.
-
     Raises:
         CheckpointError: where files are there but none is whole; and for a whole one that holds more than data, of
             which nothing is executed.

@@ -39,11 +39,8 @@ from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.scene import Scene
 from warpshadow.viewer import FitViewer
 
-FEW = 100
-"""Up to how many values are found by quasi-Newton steps unless an optimizer is named."""
-
-WINDOW = 25
-"""Iterations over which a loss must fall for its stage to go on."""
+FEW = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
+WINDOW = 25  # iterations over which a loss must fall for its stage to go on
 
 AROUND = 6
 """To how many scattered values a result is compared that may stand out: a pose turned about each axis, either way."""
@@ -53,8 +50,7 @@ class FitWarning(UserWarning):
     """A fit that ended before its time."""
 
 
-GOOD_ENDINGS = ("converged", "finished")
-"""Why a fit ends whose values can be used as they are."""
+GOOD_ENDINGS = ("converged", "finished")  # why a fit ends whose values can be used as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +441,6 @@ def fit(
         seed: Of candidates that are drawn at random.
         tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
             loss falls by less than this part.
-        device: Where to compute.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
             off, with the result that it would have had (on a CPU, to the bit).
         checkpoint_seconds: Time between checkpoints [s].
@@ -455,11 +450,9 @@ def fit(
             fit can be paused and stopped; it is closed when the fit ends. Or a :class:`FitViewer`, which stays open. A
             fit that was stopped goes on from its checkpoint.
         progress: Show progress, that of sphere fits included.
-
     Returns:
         The result. If a value becomes NaN or Inf, the result has the best values before that, and a :class:`FitWarning`
         names the quantity.
-
     Raises:
         ValueError: for a problem that cannot be rendered.
         CheckpointError: for a checkpoint of another problem.

@@ -89,7 +89,6 @@ def load_fit(path: AnyPath) -> Fit:
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
-
     Raises:
         FitFileError: for a mistake in the file: it names the table, the key, the value it got and the accepted values.
         FileNotFoundError: for a file that is not there.

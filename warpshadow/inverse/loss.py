@@ -50,7 +50,6 @@ class Loss:
             targets: [view, height, width, 3 or 4].
             weights: Of the pixels, [view, height, width].
             unit: Radiance that counts as 1.
-
         Differentiable: images.
         """
         costs = self._costs((images[..., :3] - targets[..., :3]) / unit)

@@ -20,7 +20,6 @@ def side_by_side(targets: torch.Tensor, images: torch.Tensor) -> np.ndarray:
 
     Args:
         targets, images: Linear RGB, [view, height, width, 3 or more].
-
     Returns:
         Shape [view · height, 3 · width, 3].
     """

@@ -14,7 +14,7 @@ Curvature = tuple[list[torch.Tensor], list[torch.Tensor]]
 """Steps, and how the gradient changed over them, [value] each."""
 
 HISTORY = 12
-"""How many steps are load_or_compute: of six values, their curvature wholly."""
+"""How many steps are kept: of six values, their curvature wholly."""
 
 _GROWTH = 2.0  # of the bound, where a step that reached it was kept
 _SHORTEST, _LONGEST = 0.1, 0.5  # factors of the bound after a rejected step, relative to the step

@@ -27,8 +27,7 @@ from warpshadow.pipeline.lighting import map_of
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import camera_table, write_scene
 
-SUMMARY = "summary.toml"
-"""The file of a folder of results that is written last: where it is, the others are."""
+SUMMARY = "summary.toml"  # the file of a folder of results that is written last: where it is, the others are
 
 
 def write_result(result: Result, folder: AnyPath) -> list[Path]:
@@ -41,7 +40,6 @@ class Report:
 
     Args:
         result: The result.
-
     Attributes:
         before, after: Images of the views, [view, height, width, 4].
         loss_before, loss_after: With regularizers.
@@ -58,13 +56,11 @@ class Report:
         """Write it.
 
         Args:
-            folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it,
-                to be rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended,
-                and of each view the camera and the exposure, which a scene does not have); light.png of free light,
-                striped where the images did not determine it; parameters.npz (all values, as the fit holds them);
-                before.png and after.png beside target.png; and loss.png where matplotlib is
-                installed.
-
+            folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
+                rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended, and of
+                each view the camera and the exposure, which a scene does not have); light.png of free light, striped
+                where the images did not determine it; parameters.npz (all values, as the fit holds them); before.png
+                and after.png beside target.png; and loss.png where matplotlib is installed.
         Returns:
             The files.
         """

@@ -12,8 +12,7 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.scene import Visibility, check_supersampling
 
-LAST_RATE = 0.1
-"""Share of its learning rate that a stage ends with."""
+LAST_RATE = 0.1  # share of its learning rate that a stage ends with
 
 
 @dataclass(frozen=True)

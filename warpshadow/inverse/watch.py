@@ -24,14 +24,9 @@ from warpshadow.inverse.schedule import Stage
 from warpshadow.viewer import FitViewer
 from warpshadow.viewer.painter import picture
 
-_SECONDS = 0.5
-"""Between two pictures, at least."""
-
-_SHARE = 0.02
-"""Of the fit's time that pictures may take; encoding and sending in other threads come on top."""
-
-_ACROSS = 768
-"""Pixels of a picture, about."""
+_SECONDS = 0.5  # between two pictures, at least
+_SHARE = 0.02  # of the fit's time that pictures may take; encoding and sending in other threads come on top
+_ACROSS = 768  # pixels of a picture, about
 
 
 class Watched(Protocol):

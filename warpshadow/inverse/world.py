@@ -28,7 +28,6 @@ class Setting:
         scene: The scene, its blockers fitted where its method has spheres.
         cameras: One for each target, of one size.
         unit: Radiance that counts as 1: the root mean square of the targets.
-        device: Where tensors and arrays live.
     """
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], unit: float, device: torch.device):
@@ -104,7 +103,6 @@ class World:
     Args:
         renderer: Of the scene, at a stage's size and softness, with a camera for each view.
         cameras: The same.
-
     Attributes:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
         rotations, translations, scales: Of each body.

@@ -34,7 +34,6 @@ def find_squares(
     Args:
         points: Receivers with their blockers.
         positions, normals: Of the vertices, vec3 of shape [batch, vertex].
-        fragments: The fragments of the samples.
         spheres: Centers and radii of all spheres.
         is_adaptive: The bodies, which are flat, bool of shape [body].
         supersampling: Samples of a pixel across and down.

@@ -57,8 +57,7 @@ LARGE_FACE = 16.0
 LARGE_SHARE = 2.0**-12
 """… and in larger images its share of them, since cost grows with pixels and the error of interpolation does not …"""
 
-COARSE_FACE = 400.0
-"""… up to so many pixels: beyond, interpolation shows, and draws a warning if the user asked for it."""
+COARSE_FACE = 400.0  # … up to so many pixels: beyond, interpolation shows, and draws a warning if the user asked for it
 
 SMALL_FACE = 4.0
 """Pixels of an average face up to which the vertices of a flat body are as close as shadows need; in a small image an
@@ -71,8 +70,7 @@ a shadow on a side is seen at its ends or not at all, and few faces of few pixel
 and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and the image off by 11.2% in place of 7.0%
 (0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
 
-_LONG_SHARE = 0.05
-"""Share of a body's pixels that its longest faces show …"""
+_LONG_SHARE = 0.05  # share of a body's pixels that its longest faces show …
 
 _LENGTHS = 4.0
 """… and how often such a face may be as long as the side of a square of as many pixels as an average face may have."""
@@ -81,10 +79,8 @@ _LENGTHS = 4.0
 class FaceSize(NamedTuple):
     """How large the faces of a body are in images."""
 
-    area: float
-    """Pixels of an average face that is seen [pixels²]."""
-    length: float
-    """Longest edge beyond which faces show 5% of the body's pixels [pixels]."""
+    area: float  # pixels of an average face that is seen [pixels²]
+    length: float  # longest edge beyond which faces show 5% of the body's pixels [pixels]
 
     def exceeds(self, area: float) -> bool:
         """Whether an average face has more pixels, or long faces are longer than four times the side of so many."""
@@ -97,10 +93,8 @@ class FaceSize(NamedTuple):
 class Choice(NamedTuple):
     """Where light is evaluated on a body."""
 
-    receivers: str
-    """At every "vertex", at every "pixel" that shows the body, or "adaptive"."""
-    size: FaceSize | None
-    """Of its faces; None where nobody had to know."""
+    receivers: str  # at every "vertex", at every "pixel" that shows the body, or "adaptive"
+    size: FaceSize | None  # of its faces; None where nobody had to know
 
 
 def choose_receivers(

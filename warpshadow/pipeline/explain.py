@@ -47,7 +47,6 @@ class Explanation:
         is_host: Whether launches wait until they are done, as they do on a CPU.
         hidden: Nodes that are left out.
         notes: Lines below the table.
-
     Attributes:
         stages: By name, in the order in which they run.
         notes: Further notes, a line each.

@@ -24,8 +24,7 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-PART = 1 << 13
-"""Receivers of each instance that are lit at once where no gradient is asked for."""
+PART = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
 def solid_bodies(merged_scene: MergedScene) -> list[int]:

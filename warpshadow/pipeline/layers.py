@@ -44,14 +44,10 @@ class Layers(NamedTuple):
 class LayerArrays(NamedTuple):
     """:class:`Layers` as arrays of a device, of shape [batch, height, width]; all but bodies are differentiable."""
 
-    depth: wp.array
-    """float32."""
-    normals: wp.array
-    """vec3."""
-    bodies: wp.array
-    """int32."""
-    masks: list[wp.array]
-    """vec4: those of four bodies each; 0 where there are fewer."""
+    depth: wp.array  # float32
+    normals: wp.array  # vec3
+    bodies: wp.array  # int32
+    masks: list[wp.array]  # vec4: those of four bodies each; 0 where there are fewer
 
 
 @wp.kernel
@@ -83,10 +79,8 @@ def find_layer_arrays(view: View, size: tuple[int, int], *, supersampling: int) 
     """Find the layers of the images of a view.
 
     Args:
-        view: The view.
         size: Width and height [pixels].
         supersampling: Samples of a pixel across and down.
-
     Differentiable: view. Depth and normals as the surface that a pixel shows moves, and not as another one comes in
     front; masks as the image is, at silhouettes.
     """

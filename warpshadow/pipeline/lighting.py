@@ -130,11 +130,9 @@ class Method:
         merged_scene: The bodies.
         native_basis: Basis in which the method computes light.
         basis: Basis of free light; None for the method's own.
-        progress: Show progress where something takes longer than a second.
     """
 
-    lights_samples = False
-    """Whether every sample is a receiver, overriding the bodies."""
+    lights_samples = False  # whether every sample is a receiver, overriding the bodies
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""

@@ -21,8 +21,7 @@ from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 
-Array = TypeVar("Array")
-"""Element type of a geometry: Warp's arrays, or tensors."""
+Array = TypeVar("Array")  # element type of a geometry: Warp's arrays, or tensors
 
 Other = TypeVar("Other")
 
@@ -66,11 +65,8 @@ class Geometry(Generic[Array]):
         return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
 
 
-PLACED = "placed(…) makes a geometry of poses"
-"""Message for arrays that do not form a geometry."""
-
-CENTER = "center"
-"""Of pivots: the middle of the bounds of a body's mesh."""
+PLACED = "placed(…) makes a geometry of poses"  # message for arrays that do not form a geometry
+CENTER = "center"  # of pivots: the middle of the bounds of a body's mesh
 
 Pivot = str | npt.ArrayLike | wp.array | None
 """Pivots of the bodies, each in its own space: "center", a point, or one for each body; None: the origin."""
@@ -101,9 +97,6 @@ class MergedScene:
 
     Args:
         scene: The scene; its spheres are fitted when first asked for.
-        device: Where the arrays live.
-        progress: Show progress of the fits.
-
     Attributes:
         faces: Indices of vertices, vec3i of shape [face]; the faces of a body wind alike.
         uvs: Texture coordinates, vec2 of shape [1, uv].
@@ -420,7 +413,6 @@ class MergedScene:
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [vertex]; they are copied.
             bodies: Which bodies count, from 0; None for all.
-
         Returns:
             None where no such body casts a shadow.
         """
@@ -489,10 +481,8 @@ def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callabl
         whole: Shape [batch, item].
         runs: Where each begins and ends, rising.
         part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
-
     Returns:
         Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
-
     Differentiable: whole, where it is not exchanged, and parts.
     """
     pieces, last = [] if runs else [whole], 0

@@ -24,7 +24,6 @@ class Input:
         name: Name of the stage.
         value: The value; or a function that makes it when it is first asked for.
         news: Why it takes the place of another, in words, such as "light is given".
-
     Attributes:
         requires_grad: Whether a gradient to it is asked for.
     """
@@ -106,7 +105,6 @@ class Node:
         extra_inputs: Other nodes that run for this one, or are explained beside it.
 
     Items and idle may be functions that make the words.
-
     Attributes:
         before: The nodes and sources that it depends on at once.
         sources: All sources that it depends on.

@@ -18,8 +18,7 @@ from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_CORNERS = 64
-"""Directions in which the vertices of a body are sought that are farthest out."""
+_CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
 
 
 class PlanesOfGroup(NamedTuple):

@@ -23,8 +23,7 @@ from warpshadow.stages.traced_transfer import trace_transfer
 if TYPE_CHECKING:  # it is imported where light bounces
     from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 
-Meshes = list[wp.Mesh | None]
-"""Mesh that blocks the light of each instance of receivers; None for no blocker."""
+Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
 
 
 class Rays(Method):

@@ -37,7 +37,6 @@ class Materials:
         merged_scene: The bodies.
         albedo: Of each body, vec3 of shape [batch, 1] or [batch, vertex].
         textures: Of each body, vec3 of shape [batch, height, width], None without one.
-
     Attributes:
         images: The textures that there are.
         sizes: Heights and widths of the bodies' textures, None without one.

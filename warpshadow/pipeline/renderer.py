@@ -51,8 +51,7 @@ from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import check_clip_space
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 
-METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}
-"""How light is blocked."""
+METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}  # how light is blocked
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
 
@@ -72,8 +71,7 @@ def _said(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Conca
     return announced
 
 
-_OF_CAMERAS = ("_own_view", "_without_others")
-"""Cached values of a renderer's cameras."""
+_OF_CAMERAS = ("_own_view", "_without_others")  # cached values of a renderer's cameras
 
 
 class SceneRenderer:
@@ -83,14 +81,10 @@ class SceneRenderer:
     are differentiable under Warp's tape in their array arguments, as far as these require gradients.
 
     Args:
-        scene: The scene.
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
             batch.
-        device: Warp device, "cpu" by default.
         basis: Basis of free light; None for the method's own: cells of directions ("directional") or spherical
             harmonics.
-        progress: Show progress where something takes longer than a second.
-
     Attributes:
         scene: The scene; a method "auto" has been replaced by the chosen one, and so have receivers "auto".
         cameras: The cameras of the scene.
@@ -233,7 +227,6 @@ class SceneRenderer:
             pivot: Point of each body's own space that it is turned about and that translations put in its place:
                 "center", the middle of its mesh's bounds; a point [3] for all; one for each, [body, 3], or vec3 of
                 shape [batch, body]; None for the origin. ``scene_poses(pivot=…)`` are the poses to begin with.
-
         Differentiable: poses, rest, pivot.
         """
         return self.merged_scene.placed(poses, rest, moving=moving, pivot=pivot)
@@ -257,14 +250,11 @@ class SceneRenderer:
                 its spheres follow its vertices, both centers and radii, unless ``centers`` are given
                 (:mod:`warpshadow.stages.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
-
         Returns:
             All bodies at rest, for :meth:`placed`, in arrays of their own.
-
         Raises:
             ValueError: for other vertices of a flat body where light bounces by spheres, for which it stays in its
                 plane.
-
         Differentiable: positions, centers, radii, rest.
         """
         if positions is not None and isinstance(self._method, SphereMethod) and self._method.bounces is not None:
@@ -283,7 +273,6 @@ class SceneRenderer:
         Args:
             body: The body, its number or name.
             count: Nodes that carry a vertex.
-
         Raises:
             ValueError: for a body with too few spheres.
         """
@@ -307,7 +296,6 @@ class SceneRenderer:
             geometry: Instances of vertices and spheres, by default the scene's own.
             clip_matrices: Cameras, mat44 of shape [batch], by default :attr:`clip_matrices`; see
                 :func:`warpshadow.stages.project.compose_clip_matrices`.
-
         Differentiable: geometry, clip_matrices.
         """
         is_scenes = geometry is None and clip_matrices is None
@@ -397,7 +385,6 @@ class SceneRenderer:
             points: Positions [scene units], vec3 of shape [batch, receiver].
             normals: Unit normals, vec3 of shape [batch, receiver].
             geometry: Geometry of the blockers, by default the scene's bodies.
-
         Differentiable: all.
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
@@ -417,7 +404,6 @@ class SceneRenderer:
                 consecutive.
             barycentrics: Where on it, shape [receiver, 3].
             geometry: Where the bodies are, by default where the scene has them.
-
         Differentiable: geometry.
         """
         blocking, merged_scene, vertices, spheres = (
@@ -511,14 +497,11 @@ class SceneRenderer:
                 method can. Free light, an array of coefficients in :attr:`basis`, vec3 of shape [batch, coefficient],
                 is differentiable.
             view: From :meth:`view` or :meth:`at_points`, by default the scene's own.
-
         Returns:
             Light that each receiver, as a white surface, reflects: vec3 of shape [batch, receiver]. Not to be written
             to.
-
         Raises:
             ValueError: where rays are asked for a gradient to geometry.
-
         Differentiable: light, view.
         """
         view = self._own(view)
@@ -538,10 +521,8 @@ class SceneRenderer:
                 a mapping for some, by their numbers or names.
             textures: Likewise, vec3 of shape [batch, height, width], which needs uvs.
             view: By default the scene's own.
-
         Returns:
             vec3 of shape [batch, height, width]. Not to be written to.
-
         Differentiable: albedo, textures, view.
         """
         view = self._own(view)
@@ -554,11 +535,9 @@ class SceneRenderer:
 
         Args:
             body: The body, its number or name; it needs a texture.
-
         Returns:
             Float32 of shape [height, width]: 0 where no sample sees the texel; see
             :func:`warpshadow.stages.textures.seen.seen_texels`.
-
         Raises:
             ValueError: for a body without a texture.
         """
@@ -591,10 +570,8 @@ class SceneRenderer:
                 shape [batch, 1] or [batch, vertex] for bodies, as albedo is given.
             view: From :meth:`view`, by default the scene's own.
                 Batches of 1 serve every instance of the others.
-
         Returns:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
-
         Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._own(view)
@@ -607,7 +584,6 @@ class SceneRenderer:
 
         Args:
             light: Environment map or SH coefficients [order², 3] in place of the scene's.
-
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or
             [camera, height, width, 4] where cameras were given; the background is 0.
@@ -635,15 +611,11 @@ class SceneRenderer:
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
             textures: As for :meth:`draw`.
             geometry: As for :meth:`view`; but bodies that do not move have no kept rows.
-            clip_matrices: As for :meth:`view`.
-                Batches of 1 serve every instance of the others.
-
+            clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
             Linear RGB, vec3 of shape [batch, height, width].
-
         Raises:
             ValueError: where no body of the scene is a catcher.
-
         Differentiable: all, as :meth:`draw` is; see :mod:`warpshadow.stages.photograph`.
         """
         if not self.scene.catchers:
@@ -711,7 +683,6 @@ class SceneRenderer:
 
         Args:
             view: From :meth:`view`, by default the scene's own.
-
         Returns:
             Arrays with a leading dimension of images where a view or cameras were given. Not differentiable;
             :meth:`layer_arrays` are, and ``TorchRenderer.layers``.
@@ -780,7 +751,6 @@ class SceneRenderer:
             view: As for :meth:`draw`: then only the stages after it are explained.
             geometry: As for :meth:`view`, which is explained with it.
             clip_matrices: As for :meth:`view`.
-
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
             it does or does not run; then the same of the adjoints. Nothing is computed.

@@ -47,8 +47,7 @@ from warpshadow.stages.self_visibility.probes import (
 from warpshadow.stages.self_visibility.sun_cells import RayProbes
 from warpshadow.stages.self_visibility.trace import RAYS, RUN, VisibilityRows, ray_count, trace_rows, trace_seconds
 
-VERSION = 4
-"""Part of the key of cached rows: raise it whenever they would come out differently."""
+VERSION = 4  # part of the key of cached rows: raise it whenever they would come out differently
 
 
 Found = TypeVar("Found")
@@ -67,8 +66,7 @@ class Blocking(NamedTuple):
     convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
 
 
-BY_SPHERES = Blocking()
-"""All bodies block by their spheres."""
+BY_SPHERES = Blocking()  # all bodies block by their spheres
 
 
 class SelfVisibilityLookup(NamedTuple):
@@ -103,7 +101,6 @@ class SelfVisibility:
     Args:
         merged_scene: The bodies.
         samples_receive: Bodies on which samples are receivers, bool of shape [body]: they have probes within faces.
-        progress: Show progress where something takes longer than a second.
     """
 
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):

@@ -31,13 +31,11 @@ class StaticBodies:
     Args:
         merged_scene: All bodies.
         geometry: Geometry with the static bodies; its moving bodies are ignored.
-
     Attributes:
         moving: The other bodies, from 0.
         has_vertex: Whether each vertex is static, bool of shape [vertex].
         normals: Node of the normals of all vertices, vec3 of shape [1, vertex]; normals of moving vertices are
             undefined.
-
     Raises:
         ValueError: where the static bodies of the instances differ.
     """

@@ -48,7 +48,6 @@ class View(LitPoints):
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
         is_static: As for :class:`LitPoints`.
-
     Attributes:
         given: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.

@@ -29,8 +29,7 @@ from warpshadow.stages.visibility.zonal_logs import LOGS
 
 SPHERE_METHODS = ("directional", "log-sh")
 METHODS = (*SPHERE_METHODS, "none", "ray-traced")
-DEFAULT_METHOD = "directional"
-"""Method of renderers that are kept, where none is named."""
+DEFAULT_METHOD = "directional"  # method of renderers that are kept, where none is named
 AUTO = "auto"
 READ_BY = {
     "directions": ("directional",),
@@ -49,13 +48,11 @@ READ_BY = {
 _NAMING = {name for name, methods in READ_BY.items() if DEFAULT_METHOD in methods and "ray-traced" not in methods}
 """Settings that name :data:`DEFAULT_METHOD` where they are not the default."""
 
-BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)
-"""The methods that find light that bounces."""
+BOUNCING = (*SPHERE_METHODS, "ray-traced", AUTO)  # the methods that find light that bounces
 
 MOST_BOUNCES = 16
 
-Bounces = int | Literal["all"]
-"""How often light bounces."""
+Bounces = int | Literal["all"]  # how often light bounces
 
 RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
 
@@ -68,14 +65,9 @@ SHARED_DIRECTIONS = 512
 direct light) stills have a mean error of 1.7%, at worst 3.5%, in a cage. With 256 edges of dim shadows show as streaks.
 """
 
-_RAYS = 1024
-"""Rays unless ``samples`` says how many, where each receiver has its own."""
-
-SCENE = "a Scene; load_scene(path) reads one"
-"""The types of scenes that functions accept, for messages."""
-
-COLORS = ".npy"
-"""Suffixes of files with a color for each vertex; other text is no albedo."""
+_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
+SCENE = "a Scene; load_scene(path) reads one"  # the types of scenes that functions accept, for messages
+COLORS = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
 
 VALUES = ".npy"
 """Suffix of files with a number for each vertex."""
@@ -91,8 +83,7 @@ GLOSSY = ("directional", "none", "ray-traced", AUTO)
 MEANT = {"color": "albedo", "colour": "albedo", "position": "translation"}
 """Replacements for likely mistakes in a body's arguments, and keys."""
 
-BodyLike = int | str
-"""A body of a scene: its number, from 0, or its name."""
+BodyLike = int | str  # a body of a scene: its number, from 0, or its name
 
 Item = TypeVar("Item")
 PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item | None]
@@ -644,7 +635,6 @@ class Scene:
         Args:
             body: The number or the name.
             argument: Its name in messages.
-
         Raises:
             ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
         """
@@ -679,7 +669,6 @@ class Scene:
         Args:
             value: A list of as many as there are bodies; or a mapping of some of them, by numbers or names.
             argument: Its name in messages.
-
         Raises:
             ValueError: for a list of another length, and for bodies that there are not, or that come twice.
         """

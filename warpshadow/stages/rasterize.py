@@ -20,8 +20,7 @@ from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import strip_count
 from warpshadow.stages.barycentrics import find_barycentrics
 
-MAX_SIZE = 1 << 15
-"""Largest image width or height [samples]: beyond, fixed-point edge functions could overflow."""
+MAX_SIZE = 1 << 15  # largest image width or height [samples]: beyond, fixed-point edge functions could overflow
 
 # Fixed-point positions [samples] have 12 fractional bits and, with sign, 29 bits in all. So edge coefficients
 # have at most 30 bits, their products with positions 59, and their sums fit 64.
@@ -166,8 +165,7 @@ def _first_index(fixed: int):
 def _at_centers(edge: _Edge, sign: wp.int64):
     """Edge function of sample indices instead of positions, non-negative exactly on the samples inside.
 
-    Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight
-    below it.
+    Top-left rule: a center on the line is inside if the inside lies to the right of the line or straight below it.
     """
     x = sign * edge[0]
     y = sign * edge[1]
@@ -373,9 +371,8 @@ def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int
     Returns:
         Fragments. Distances along the view are ``interpolate(fragments, faces, w)``.
     Raises:
-        ValueError: for NaN or Inf positions and for indices of no vertex. (Reading
-            the two counts back waits for the device. While a CUDA graph is captured that cannot be, and
-            nothing is checked.)
+        ValueError: for NaN or Inf positions and for indices of no vertex. (Reading the two counts back waits for the
+            device. While a CUDA graph is captured that cannot be, and nothing is checked.)
     Differentiable: barycentrics in clip_positions. Not: face_ids; nor a weight that is clamped to 0 where
         snapping put a sample's center just outside of its face.
     """

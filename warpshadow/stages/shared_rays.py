@@ -28,11 +28,8 @@ from warpshadow.stages.ray_tracing import parts
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import ALIKE, LEVEL
 
-_PACKET_COST = 2000.0
-"""Nanoseconds that a packet takes."""
-
-_PILOTS = 256
-"""Receivers that stand for all, where directions are chosen."""
+_PACKET_COST = 2000.0  # nanoseconds that a packet takes
+_PILOTS = 256  # receivers that stand for all, where directions are chosen
 
 SQUARES = 128
 """Squares at whose corners all rays are traced, across the shorter side of an image, or more: their side in pixels is a
@@ -169,10 +166,8 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
         points: Receiver positions [scene units], vec3 of shape [receiver]; a few stand for all.
         normals: Unit normals, vec3 of shape [receiver].
         samples: As for :func:`trace_shared`.
-
     Returns:
         Shares, of shape [direction], whose sum is 1, or less where some receivers see no light.
-
     Differentiable: no.
     """
     count = points.shape[0]
@@ -222,7 +217,6 @@ def trace_shared(
 
     Returns:
         Shading, vec3 of shape [receiver].
-
     Differentiable: no.
     """
     tracing, size = _Tracing(tree, points, normals, samples), 2**24 // samples.directions.shape[1]

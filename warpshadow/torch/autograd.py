@@ -79,13 +79,10 @@ def apply(
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
         names: Names of the tensors in messages, by default ``tensors[0]`` and so on.
         affine: Names of tensors in each of which alone the function is affine.
-
     Returns:
         The array as a tensor, or a tuple of tensors for a tuple of arrays.
-
     Raises:
         NotImplementedError: where a gradient to a tensor that is not among the affine ones is differentiated again.
-
     Differentiable: as the function is, once; gradients to affine tensors again, in all tensors.
     """
     names = names or [f"tensors[{number}]" for number in range(len(tensors))]

@@ -16,13 +16,10 @@ def clip_matrices_from_opengl(matrices: torch.Tensor) -> torch.Tensor:
 
     Args:
         matrices: Projection times view, perspectives that multiply column vectors, [4, 4] or [batch, 4, 4].
-
     Returns:
         The same cameras, near planes included, as :meth:`TorchRenderer.forward` takes them, of the same shape.
-
     Raises:
         ValueError: for matrices without perspective, or whose near plane is not at z/w = −1, such as Direct3D's.
-
     Differentiable: matrices, but for the near plane.
     """
     check_float32("matrices", matrices)

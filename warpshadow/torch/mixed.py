@@ -46,7 +46,6 @@ class MixedRenderer(torch.nn.Module):
 
     Args:
         renderers: One for each scene, of one basis, device, image size and near plane.
-
     Attributes:
         renderers: The same, as a ``torch.nn.ModuleList``. Each caches the results of its scene.
 
@@ -98,11 +97,9 @@ class MixedRenderer(torch.nn.Module):
             geometry: From :meth:`placed` with the same ``which``; or a list of the results of the renderers' own
                 ``placed``, for each scene that of its images, in their order, None where it has no image.
             clip_matrices: As of a TorchRenderer; any of the renderers composes them.
-
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [batch, height, width, 4]: the images of the
             renderers of each scene.
-
         Differentiable: light, albedo, textures, geometry, clip_matrices.
         """
         batch = _Batch(which, len(self.renderers))
@@ -150,10 +147,8 @@ class MixedRenderer(torch.nn.Module):
             moving: Bodies that the poses move, as of a TorchRenderer; a scene passes over those that it has not.
             pivot: "center" for rotations about the middle of each body, as of a TorchRenderer; None for the origin of
                 its own space.
-
         Returns:
             For each scene the geometry of its images, None where it has none.
-
         Differentiable: rotations, translations, scales.
         """
         batch = _Batch(which, len(self.renderers))
@@ -181,7 +176,6 @@ class MixedRenderer(torch.nn.Module):
 
         Args:
             pivot: As for :meth:`placed`.
-
         Returns:
             Rotations [scene, body, 3, 3], translations [scene, body, 3] and scales [scene, body], for as many bodies as
             the scene with the most has; bodies that a scene lacks stand as they are modeled.

@@ -57,8 +57,6 @@ class TorchRenderer(torch.nn.Module):
         device: Device of the tensors and the kernels.
         basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
             the scene's method.
-        progress: Show progress where something takes longer than a second.
-
     Attributes:
         warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
 
@@ -149,9 +147,8 @@ class TorchRenderer(torch.nn.Module):
         """Render images.
 
         Args:
-            light: Free light, coefficients in :attr:`basis`, linear RGB, shape [coefficient, 3] or
-                [batch, coefficient, 3]; or known light, which is shaded more accurately than free light can be, by
-                default the scene's.
+            light: Free light, coefficients in :attr:`basis`, linear RGB, shape [coefficient, 3] or [batch, coefficient,
+                3]; or known light, which is shaded more accurately than free light can be, by default the scene's.
             albedo: Reflectance of bodies in linear RGB, one color [3], one for each vertex [vertex, 3], or either in a
                 batch, [batch, 1 or vertex, 3]: a list for all bodies, None for the scene's own, or a mapping for some,
                 by their numbers or names: ``{"bunny": color}``. Values above 1, which a Body refuses, are taken as they
@@ -165,11 +162,9 @@ class TorchRenderer(torch.nn.Module):
             roughness, metallic, specular: Of bodies that have roughness in the scene, in [0, 1], one number, [] or [1],
                 or one for each vertex, [vertex], or either in a batch, [batch, 1 or vertex]; a list or a mapping, as
                 albedo.
-
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
-
         Differentiable: all; stages/README.md says how exactly. Gradients to light,
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
@@ -197,7 +192,6 @@ class TorchRenderer(torch.nn.Module):
 
         Args:
             geometry, clip_matrices: As for :meth:`forward`.
-
         Differentiable: geometry, clip_matrices. Depth and normals change as the surface at a pixel's center moves, and
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
@@ -231,13 +225,10 @@ class TorchRenderer(torch.nn.Module):
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
             light, albedo, textures, geometry, clip_matrices: As for :meth:`forward`.
-
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
-
         Raises:
             ValueError: where no body of the scene is a catcher.
-
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
         stored = self._given(light, albedo, textures, geometry, clip_matrices)
@@ -354,12 +345,10 @@ class TorchRenderer(torch.nn.Module):
             pivot: Point of each body's own space that it is turned about and that ``translations`` put in its place:
                 "center", the middle of its mesh's bounds, or points, [body, 3] or [batch, body, 3]; None for the
                 origin, which is the one of the mesh's file. ``scene_poses(pivot=…)`` are the poses to begin with.
-
         Returns:
             Vertices and spheres for :meth:`forward`, with a batch dimension if an argument has one; tensors of their
             own, which may be written to. Who changes a body's shape that way gives a geometry without ``rotations``:
             with them the body's shadow on itself is that of its mesh.
-
         Differentiable: all.
         """
         count = len(self.scene.bodies)
@@ -390,7 +379,6 @@ class TorchRenderer(torch.nn.Module):
 
         Args:
             pivot: As for :meth:`placed`, without a batch: translations are then where the pivots are.
-
         Returns:
             Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body]. A
             ``Body.rotation`` is in degrees; :func:`rotation_matrices` takes radians.
@@ -437,10 +425,8 @@ class TorchRenderer(torch.nn.Module):
                 spheres follow its vertices, both centers and radii, unless ``centers`` are given
                 (:mod:`warpshadow.stages.bound_spheres`).
             rest: All bodies at rest, by default as their meshes are.
-
         Returns:
             All bodies at rest, for :meth:`placed`; tensors of their own, which may be written to.
-
         Differentiable: all.
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
@@ -475,10 +461,8 @@ class TorchRenderer(torch.nn.Module):
             rotations: R, world to camera, [3, 3] or [batch, 3, 3].
             translations: t, world to camera [scene units], [3] or [batch, 3].
             intrinsics: K [pixels], last row (0, 0, 1), [3, 3] or [batch, 3, 3].
-
         Returns:
             Maps from world to clip space, [4, 4] or [batch, 4, 4].
-
         Differentiable: all, so focal lengths and the principal point, too.
         """
         camera = self.cameras[0]

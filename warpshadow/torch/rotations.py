@@ -20,14 +20,11 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
         parameters: Shape [..., n], where n decides their meaning: 4, quaternions (x, y, z, w) of any length but 0; 3,
             axis-angle vectors [radians], smooth at 0; 6, the first two columns; 9, the rows of any matrix, whose
             nearest rotation is taken (``matrices.flatten(-2)``).
-
     Returns:
         Rotations, shape [..., 3, 3].
-
     Raises:
         ValueError: for another n, and for parameters without a rotation, as
         :func:`warpshadow.stages.rotations.rotation_matrices` says.
-
     Differentiable: parameters.
     """
     check_float32("parameters", parameters)

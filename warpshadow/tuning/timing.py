@@ -67,7 +67,6 @@ def median_times(
         functions: Functions without arguments.
         runs: Timed calls of each.
         clock: Clock [s]; on one thread, ``time.process_time`` leaves out other processes of a busy machine.
-        progress: Show progress.
     """
     times: list[list[float]] = [[] for _ in functions]
     turns = range(runs * len(functions))

@@ -19,8 +19,7 @@ from warpshadow.stages.textures.seen import fill_unseen
 
 _SHORT = 1e-3
 """Length of a difference of reflectances below which its variation is smooth: lengths have no derivative at 0."""
-_PLAIN = 1e-3
-"""Deviation below which texels are of one color."""
+_PLAIN = 1e-3  # deviation below which texels are of one color
 
 
 def _one_color(body: Body) -> np.ndarray:

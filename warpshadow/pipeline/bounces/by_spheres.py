@@ -43,8 +43,7 @@ from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.bounces.total import total_light
 from warpshadow.stages.receivers import Receivers
 
-_OF_SOURCES = " of sources"
-"""Put after the names of stages."""
+_OF_SOURCES = " of sources"  # put after the names of stages
 
 
 def _words(senders: Senders) -> str:

@@ -36,11 +36,8 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-CELLS = fibonacci(64)
-"""Where receivers look for bounced light if direct light is found in harmonics."""
-
-ALL_FLAT = "all that reflects is flat"
-"""Why no body sends light to itself, in words."""
+CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
+ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
 
 class CellTransmittance(NamedTuple):
@@ -272,7 +269,6 @@ class Gathering:
         where: Put after the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
-
     Attributes:
         stages: Nodes of its parts.
     """

@@ -29,14 +29,9 @@ from warpshadow.stages.bounces.radiosity import mean_over_sources
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
-_SCENE_PATCHES = 2048
-"""Patches of a scene of more than 8 bodies, but no fewer than _FEWEST of each."""
-
-_FEWEST = 32
-"""Patches of each of many bodies, at least: a side of a box has some."""
-
-_SCENE_SOURCES = 4096
-"""Sources of the patches of a scene, but at least one of each."""
+_SCENE_PATCHES = 2048  # patches of a scene of more than 8 bodies, but no fewer than _FEWEST of each
+_FEWEST = 32  # patches of each of many bodies, at least: a side of a box has some
+_SCENE_SOURCES = 4096  # sources of the patches of a scene, but at least one of each
 
 
 def _area(mesh: Mesh) -> float:
@@ -50,7 +45,6 @@ class ScenePatches:
 
     Args:
         merged_scene: The bodies.
-
     Attributes:
         planes: The flat bodies among them.
     """
@@ -164,7 +158,6 @@ class Senders:
         merged_scene: All bodies.
         bodies: The bodies that reflect.
         patches: Of each of them.
-
     Attributes:
         merged_scene, bodies, patches: As given.
         first: Where the patches of each begin, and the end of the last, NumPy of shape [body + 1].

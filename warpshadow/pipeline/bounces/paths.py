@@ -16,11 +16,8 @@ from warpshadow.stages.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.textures.pyramid import Textures
 
-_LIGHT_SAMPLES = 1024
-"""Directions of each set from which hits draw light."""
-
-_ALL = 64
-"""Most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there."""
+_LIGHT_SAMPLES = 1024  # directions of each set from which hits draw light
+_ALL = 64  # most bounces of a path where it may have any number: in a closed room of albedo 0.9 one in 800 ends there
 
 _RAYS_OF_PATH = 2
 """Rays of direct light for each path, which varies about as much and takes 2.4 times as long with two bounces."""
@@ -38,7 +35,6 @@ def path_traced(
         light: Known light.
         materials: Reflectance of the bodies.
         samples: Rays of direct light for each receiver.
-        progress: Show progress where it takes longer than a second.
     """
     merged_scene = points.merged_scene
     maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)

@@ -10,8 +10,7 @@ import warp as wp
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.tail import TERM_COUNT, with_tail
 
-SELF_BOUNCES = 8
-"""How often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then."""
+SELF_BOUNCES = 8  # how often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then
 
 
 def after_bounces(

@@ -21,11 +21,8 @@ from warpshadow.stages.sparse import SparseMatrix
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-VERSION = 1
-"""Part of the key of cached form factors: raise it whenever they would come out differently."""
-
-_RAYS = 512
-"""Rays of a probe."""
+VERSION = 1  # part of the key of cached form factors: raise it whenever they would come out differently
+_RAYS = 512  # rays of a probe
 
 
 class SelfFormFactors:
@@ -34,7 +31,6 @@ class SelfFormFactors:
     Args:
         self_visibility: Has the bodies' probes.
         patches: Has their patches.
-        progress: Show progress where it takes longer than a second.
     """
 
     def __init__(self, self_visibility: SelfVisibility, patches: ScenePatches, *, progress: bool = False):
@@ -97,9 +93,6 @@ def self_form_factors(
         positions, faces: Its mesh, NumPy.
         points: Its probes, shape [probe, 3].
         normals: Unit normals, shape [probe, 3].
-        device: Where rays are traced.
-        progress: Show a progress bar where it takes longer than a second.
-
     Returns:
         As :func:`~warpshadow.stages.bounces.factors.trace_factors` does.
     """

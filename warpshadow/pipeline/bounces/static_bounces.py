@@ -50,8 +50,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-RAYS = 1024
-"""Rays of a node or source, which find its form factors …"""
+RAYS = 1024  # rays of a node or source, which find its form factors …
 
 STILL_RAYS = 256
 """… and those of a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
@@ -88,7 +87,6 @@ class StaticBounces:
         patches: Of the scene.
         bounces: How often, 1 or more; "all" until nothing is left.
         rays: Of a node or source.
-        progress: Show progress where it takes longer than a second.
     """
 
     def __init__(self, patches: ScenePatches, bounces: Bounces, *, rays: int = RAYS, progress: bool = False):

@@ -44,11 +44,8 @@ from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 _ROOM = wp.constant(1.25)
 """A source is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's radius."""
 
-_LIFT = wp.constant(5.0)
-"""How far receivers in a plane are lifted off it, in its margins."""
-
-_TINY = wp.constant(1.0e-18)
-"""Radius up to which a sphere blocks nothing."""
+_LIFT = wp.constant(5.0)  # how far receivers in a plane are lifted off it, in its margins
+_TINY = wp.constant(1.0e-18)  # radius up to which a sphere blocks nothing
 
 
 class NearestBlockers(NamedTuple):
@@ -192,11 +189,8 @@ def find_fronts(
         spheres: The blockers nearest to sources of light; None where no receiver is one.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
-        planes: The planes.
-
     Returns:
         Float32 of shape [batch, receiver, plane], 0 to 1.
-
     Differentiable: points, normals, corners, centers and radii of spheres, frames.
     """
     centers, radii, numbers = (None, None, None) if spheres is None else spheres
@@ -261,10 +255,8 @@ def lifted_points(
         points, frames, planes: As for :func:`find_fronts`.
         fronts: Found by it.
         skip: Number of the plane that the receivers are part of; None for none.
-
     Returns:
         Points, vec3 of shape [batch, receiver].
-
     Differentiable: points, fronts, frames.
     """
     lifted = wp.empty(fronts.shape[:2], dtype=wp.vec3, device=points.device)

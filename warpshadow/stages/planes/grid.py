@@ -8,17 +8,10 @@ import numpy as np
 
 from warpshadow.maths.plane import plane_normal
 
-_GRID = 24
-"""Texels along a grid's longer side."""
-
-_EVEN = 100.0
-"""Spread of a grid that is even, in sizes of its body."""
-
-_ROUNDING = 1e-6
-"""How far off a face a point may lie and still count as on it, as a part of the face or texel."""
-
-_TESTED = 3
-"""Points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one."""
+_GRID = 24  # texels along a grid's longer side
+_EVEN = 100.0  # spread of a grid that is even, in sizes of its body
+_ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
+_TESTED = 3  # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
 
 
 class PlaneTexture(NamedTuple):
@@ -31,19 +24,13 @@ class PlaneTexture(NamedTuple):
     texels divide the rectangle from ``low`` to ``high`` evenly in ξ and in η, row by row in η.
     """
 
-    frame: np.ndarray
-    """Rows: both axes and the normal, float64 of shape [3, 3]."""
-    origin: np.ndarray
-    """Point of the plane around which texels are small, float64 of shape [3]."""
-    spread: float
-    """Distance from there within which texels are about even [units of the body]."""
+    frame: np.ndarray  # rows: both axes and the normal, float64 of shape [3, 3]
+    origin: np.ndarray  # point of the plane around which texels are small, float64 of shape [3]
+    spread: float  # distance from there within which texels are about even [units of the body]
     low: np.ndarray
-    high: np.ndarray
-    """Corners of the rectangle in (ξ, η), float64 of shape [2]."""
-    covered: np.ndarray
-    """Share of each texel that the mesh covers, float32 of shape [row, column]."""
-    sides: int
-    """1 if the front alone sends light, 2 if the back does, too; its patches follow the front's."""
+    high: np.ndarray  # corners of the rectangle in (ξ, η), float64 of shape [2]
+    covered: np.ndarray  # share of each texel that the mesh covers, float32 of shape [row, column]
+    sides: int  # 1 if the front alone sends light, 2 if the back does, too; its patches follow the front's
 
     def middles(self) -> np.ndarray:
         """Middles of the texels in the plane, (a, b), float64 of shape [row, column, 2]."""
@@ -108,10 +95,8 @@ def find_grid(
         is_two_sided: Whether the back sends light, too.
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
-
     Returns:
         The grid, and a point in each texel of which the mesh covers some.
-
     Raises:
         ValueError: for a body that does not lie in a plane.
     """

@@ -16,24 +16,18 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_MARGIN = 0.001
-"""Margin of planes, in widths of the smallest texel."""
+_MARGIN = 0.001  # margin of planes, in widths of the smallest texel
 
 
 class PlaneBody(NamedTuple):
     """A body with a grid, among all bodies."""
 
     grid: PlaneTexture
-    positions: np.ndarray
-    """Its vertices at rest, in its own frame, shape [vertex, 3]."""
-    faces: np.ndarray
-    """Its faces, indices into all faces, shape [face, 3]."""
-    first_vertex: int
-    """Offset of its vertices among the vertices of all bodies."""
-    first_patch: int
-    """Offset of its patches among the patches of all bodies."""
-    blocks: bool
-    """Whether it casts shadows."""
+    positions: np.ndarray  # its vertices at rest, in its own frame, shape [vertex, 3]
+    faces: np.ndarray  # its faces, indices into all faces, shape [face, 3]
+    first_vertex: int  # offset of its vertices among the vertices of all bodies
+    first_patch: int  # offset of its patches among the patches of all bodies
+    blocks: bool  # whether it casts shadows
 
 
 @wp.struct
@@ -116,10 +110,8 @@ class PlaneBlockers:
         Args:
             positions: Vertices of all bodies [scene units], vec3 of shape [batch, vertex]. Three of each flat count, so
                 bodies must be moved and scaled only, not bent.
-
         Returns:
             vec3 of shape [batch, 3 · plane].
-
         Differentiable: positions.
         """
         return multiply(self.frames_of_vertices, positions)

@@ -39,11 +39,8 @@ from warpshadow.stages.planes.cells import (
 )
 from warpshadow.stages.planes.prepared import PlaneBlockers, PlaneGrid
 
-_CELL_COST = 4.0
-"""Mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not."""
-
-_PASS_COST = 0.4
-"""Time of a cell that is only multiplied [ns]."""
+_CELL_COST = 4.0  # mean time of a cell of a receiver [ns], over cells that hit a plane and cells that do not
+_PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
 
 
 @wp.struct
@@ -271,7 +268,6 @@ def plane_coverage(
         points: Receivers [scene units], vec3 of shape [batch, receiver].
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`; the batch may
             be 1.
-        planes: The planes.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad], how soft edges and horizons are; by default that of so many
             even ones, which do.
@@ -279,11 +275,9 @@ def plane_coverage(
         fronts: Part of the front of each plane that receivers see, from :func:`.fronts.find_fronts`, float32 of shape
             [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
-
     Returns:
         Float32 of shape [batch, receiver, direction], 1 or more where nothing passes; None where no flat casts a
         shadow on them.
-
     Differentiable: points, frames, fronts. Not: facing, which decides by steps.
     """
     check_planes(planes, points, frames, directions, skip)
@@ -332,10 +326,8 @@ def transmittance_past_planes(transmittance: wp.array, covered: wp.array) -> wp.
     Args:
         transmittance: Past all else, float32 of shape [batch, receiver, direction]; its batch may be 1.
         covered: Coverage by planes, :func:`plane_coverage`, of the same shape; its batch may be 1.
-
     Returns:
         Float32 of the same shape.
-
     Differentiable: transmittance, covered.
     """
     check.shape("transmittance", transmittance.shape, ("batch", *covered.shape[1:]))
