@@ -43,9 +43,9 @@ sums to the one before and are left out.
     return value;
 #endif
 """)
-def sum_over_warp(value: float, place: int) -> float:
+def sum_over_warp(value: float, place: int) -> float:  # type: ignore[empty-body]
     """Sum of the values of a warp's threads that are here with the same place, on one of them; on the others 0."""
-    ...  # type: ignore[empty-body]
+    ...
 
 
 @wp.func_native(f"""
@@ -60,4 +60,4 @@ def sum_over_warp(value: float, place: int) -> float:
 """)
 def sums_over_warp(values: wp.vec4, place: int) -> wp.vec4:
     """:func:`sum_over_warp` of four values."""
-    ...  # type: ignore[empty-body]
+    ...

@@ -167,9 +167,9 @@ def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
     return (step, change), (step, step), (change, change)
 
 
-def _curves(across: float, step: float, change: float) -> bool:
+def _curves(mixed: float, step: float, change: float) -> bool:
     """Whether the loss curves upwards over a step, by its :func:`_products` with how the gradient changed."""
-    return across > _CURVED * math.sqrt(step * change)
+    return mixed > _CURVED * math.sqrt(step * change)
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
