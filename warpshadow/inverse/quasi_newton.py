@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 
 T = TypeVar("T")
@@ -145,11 +146,11 @@ class QuasiNewton(torch.optim.Optimizer):
         if not steps:
             return downhill
         vectors = torch.stack([*steps, *changes, downhill]).double() * moves
-        products = torch.tensor(_read(*(vectors @ vectors.T)), dtype=torch.float64)
+        products = np.array(_read(*(vectors @ vectors.T)))
         count = len(steps)
         pairs = [(k, count + k) for k in range(count)]
-        pairs = [(k, j) for k, j in pairs if _curves(*(float(products[pair]) for pair in _products(k, j)))]
-        factors, parts = torch.zeros(2 * count + 1, dtype=torch.float64), []
+        pairs = [(k, j) for k, j in pairs if _curves(*(products[pair] for pair in _products(k, j)))]
+        factors, parts = np.zeros(2 * count + 1), []
         factors[-1] = 1.0
         for step, change in reversed(pairs):
             parts.append(products[step] @ factors / products[step, change])
@@ -159,7 +160,7 @@ class QuasiNewton(torch.optim.Optimizer):
             factors *= products[step, change] / products[change, change]
         for (step, change), part in zip(pairs, reversed(parts), strict=True):
             factors[step] += part - products[change] @ factors / products[step, change]
-        return (factors.to(vectors) @ vectors).to(downhill)
+        return (torch.from_numpy(factors).to(vectors) @ vectors).to(downhill)
 
 
 def _products(step: T, change: T) -> tuple[tuple[T, T], ...]:
