@@ -282,6 +282,33 @@ def test_transmittance_past_planes(double, planes, check):
     check(lambda p, t, f: past.transmittance_past_planes(t, past.plane_coverage(p, f, planes, directions)), *given)
 
 
+def test_transmittance_past_convex_parts(double, check, device):
+    """A wedge and a tetrahedron, which share a body, and a second tetrahedron."""
+    module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts
+    past = double("stages.convex.transmittance").transmittance_past_parts
+    directions = double("maths.directions").fibonacci(32)
+    wedge = np.array([[0, 0, 0], [2, 0, 0.1], [0.1, 1, 0], [0, 0, 1], [2, 0, 1.1], [0.1, 1, 1]])
+    sides = np.int32([[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
+    shifts = np.array([[-1.2, -0.4, 0.6], [1.1, 0.9, 0.4], [0.3, -1.5, -0.2]])
+    corners = [wedge, 0.6 * VERTICES, VERTICES]
+    first, second, third = (
+        find(points, faces)[0] for points, faces in zip(corners, (sides, FACES, FACES), strict=True)
+    )
+    bodies = [
+        module.ConvexBody([first, second._replace(corners=second.corners + 6)], 0),
+        module.ConvexBody([third], 10),
+    ]
+    blockers = module.ConvexBlockers.of(bodies, 14, device=device)
+    positions = np.concatenate([points + shift for points, shift in zip(corners, shifts, strict=True)])[None]
+    points = np.array([[[0.1, 2.2, 0.3], [-0.4, 0.7, -1.9], [2.5, 0.2, 1.5]]])
+    given = (wp.vec3d, points), (wp.vec3d, positions)
+    passing = past(
+        put(points, wp.vec3d, device), blockers.placed(put(positions, wp.vec3d, device)), blockers, directions
+    )
+    assert ((passing.numpy() > 0) & (passing.numpy() < 1)).mean() > 0.2
+    check(lambda p, v: past(p, blockers.placed(v), blockers, directions), *given)
+
+
 def test_what_patches_show(double, planes, check, device):
     directions = double("maths.directions").fibonacci(16)
     areas, sparse = double("stages.bounces.projected_areas"), double("stages.sparse").SparseMatrix

@@ -13,7 +13,7 @@ within the disc, are
 and the area of the disc inside the silhouette is that of the whole disc, if ω is inside, and a term for each edge that
 crosses the disc, what lies between the edge and the disc's border:
 
-    π ρ² h = π ρ² [ω inside] + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) (atan(s₁/|d|) − atan(s₀/|d|))
+    π ρ² h = π ρ² [ω inside] + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 
 As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, so with y the direction in the middle of it
 
@@ -28,14 +28,20 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.constants import constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import Scratch, scratch_place, split_row
-from warpshadow.maths.directions import cell_radius
+from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
+from warpshadow.stages.visibility.culling import DirectionCells, make_cells
 
 _PART_COST = 300.0
 """Mean time of a part of a receiver [ns]."""
+
+_UNKNOWN = wp.constant(-2)
+"""Number of edges of a silhouette that is not found yet."""
+
+_ROOM = wp.constant(1.001)
+"""Bounds are so much larger, for rounding."""
 
 _TINY = wp.constant(1.0e-6)
 """Sine of the least angle under which a receiver sees an edge."""
@@ -102,7 +108,7 @@ class Chord:
 
 @wp.func
 def _along_line(end: wp.vec3, along: wp.vec3, direction: wp.vec3, half: float, behind: float):
-    """Where an end of an edge lies on its line, no farther than the disc reaches; which way an end behind is, is known."""
+    """Where an end of an edge lies on its line, up to the disc's border; ``behind`` if it is behind the receiver."""
     ahead = wp.dot(end, direction)
     if ahead <= 0.0:
         return behind
@@ -132,24 +138,25 @@ def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, dire
 @wp.func
 def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float):
     """Share of a cell that a silhouette takes."""
-    inside = float(1.0)
-    area = float(0.0)
     limit = radius / wp.sqrt(1.0 + radius * radius)
+    nearest = limit
+    for e in range(count):
+        nearest = wp.min(nearest, wp.dot(silhouette[_ROWS * e], direction))
+        if nearest <= -limit:
+            return 0.0
+    if nearest >= limit:
+        return 1.0
+    area = float(0.0)
     for e in range(count):
         cosine = wp.dot(silhouette[_ROWS * e], direction)
-        if cosine < -limit:
-            return 0.0
         if cosine < limit:
-            if cosine <= 0.0:
-                inside = 0.0
             chord = _find_chord(silhouette, e, cosine, direction, radius)
             if chord.end > chord.begin:
-                d = wp.abs(chord.distance)
-                angle = wp.atan2(chord.end, d) - wp.atan2(chord.begin, d)
-                area += 0.5 * (
-                    chord.distance * (chord.end - chord.begin) - radius * radius * wp.where(cosine > 0.0, angle, -angle)
-                )
-    return wp.clamp(inside + area / (wp.pi * radius * radius), 0.0, 1.0)
+                length = chord.end - chord.begin
+                d = chord.distance
+                angle = wp.atan2(wp.abs(d) * length, d * d + chord.begin * chord.end)
+                area += 0.5 * (d * length - radius * radius * wp.where(cosine > 0.0, angle, -angle))
+    return wp.clamp(wp.where(nearest > 0.0, 1.0, 0.0) + area / (wp.pi * radius * radius), 0.0, 1.0)
 
 
 @wp.func
@@ -191,7 +198,8 @@ class PartBound:
 
     is_seen: wp.bool  # whether some of it is above the horizon
     axis: wp.vec3
-    cosine: float  # of its half-angle and that of a cell
+    cosine: float  # of its half-angle and that of a cell together, and sine
+    sine: float
 
 
 @wp.func
@@ -201,14 +209,25 @@ def _find_bound(point: wp.vec3, normal: wp.vec3, bound: wp.vec4, radius: float):
     away = wp.vec3(bound[0], bound[1], bound[2]) - point
     result.is_seen = wp.dot(normal, away) > -bound[3] or wp.length_sq(normal) == 0.0
     distance2 = wp.length_sq(away)
-    result.cosine = -2.0
+    result.cosine = -1.0
     if distance2 > bound[3] * bound[3]:
         distance = wp.sqrt(distance2)
         result.axis = away / distance
-        sine = bound[3] / distance
+        sine = _ROOM * bound[3] / distance
         cosine = wp.sqrt(wp.max(0.0, 1.0 - sine * sine))
-        result.cosine = (cosine - sine * radius) / wp.sqrt(1.0 + radius * radius) - 1.0e-5
+        scale = 1.0 / wp.sqrt(1.0 + radius * radius)
+        result.cosine = (cosine - sine * radius) * scale
+        result.sine = (sine + cosine * radius) * scale
     return result
+
+
+@wp.func
+def _reaches(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
+    """Whether the cone around a part reaches that of a bundle."""
+    # as far as π together, else all does
+    cosine = bound.cosine * half_angle[0] - bound.sine * half_angle[1]
+    is_wide = bound.sine * half_angle[0] + bound.cosine * half_angle[1] <= 0.0
+    return is_wide or wp.dot(axis, bound.axis) > cosine
 
 
 @wp.func
@@ -220,7 +239,7 @@ def _add_coverage(
     bounds: wp.array(dtype=wp.vec4),
     parts: ConvexArrays,
     body: int,
-    directions: wp.array(dtype=wp.vec3),
+    cells: DirectionCells,
     radius: float,
     silhouette: wp.array(dtype=wp.vec3),
     coverage: wp.array(dtype=wp.float32),
@@ -230,22 +249,24 @@ def _add_coverage(
     for part in range(parts.first_part[body], parts.first_part[body + 1]):
         bound = _find_bound(point, normal, bounds[part], radius)
         if bound.is_seen:
-            if not covers:
-                for q in range(directions.shape[0]):
-                    coverage[q] = 0.0
-                covers = True
-            count = _find_silhouette(point, corners, planes, parts, part, silhouette)
-            for q in range(directions.shape[0]):
-                direction = directions[q]
-                if (
-                    wp.dot(direction, bound.axis) > bound.cosine
-                    and coverage[q] < 1.0
-                    and (wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0)
-                ):
-                    share = float(1.0)
-                    if count >= 0:
-                        share = _share(silhouette, count, direction, radius)
-                    coverage[q] = coverage[q] + share
+            count = int(_UNKNOWN)
+            for bundle in range(cells.axes.shape[0]):
+                if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
+                    for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
+                        direction = cells.directions[q]
+                        if (not covers or coverage[q] < 1.0) and (
+                            wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
+                        ):
+                            if not covers:
+                                for k in range(cells.directions.shape[0]):
+                                    coverage[k] = 0.0
+                                covers = True
+                            if count == _UNKNOWN:
+                                count = _find_silhouette(point, corners, planes, parts, part, silhouette)
+                            share = float(1.0)
+                            if count >= 0:
+                                share = _share(silhouette, count, direction, radius)
+                            coverage[q] = coverage[q] + share
     return covers
 
 
@@ -268,7 +289,7 @@ def _pass(
     planes: wp.array2d(dtype=wp.vec4),
     bounds: wp.array2d(dtype=wp.vec4),
     parts: ConvexArrays,
-    directions: wp.array(dtype=wp.vec3),
+    cells: DirectionCells,
     radius: float,
     skip: int,
     # scratch
@@ -283,7 +304,7 @@ def _pass(
     place = scratch_place(worker, row)
     instance = instance_in(batch, corners.shape[0])
     normal = _facing(facing, batch, receiver)
-    for q in range(directions.shape[0]):
+    for q in range(cells.directions.shape[0]):
         passing[batch, receiver, q] = 1.0
     for body in range(parts.first_part.shape[0] - 1):
         if (
@@ -297,13 +318,13 @@ def _pass(
                 bounds[instance],
                 parts,
                 body,
-                directions,
+                cells,
                 radius,
                 silhouettes[place],
                 coverages[place],
             )
         ):
-            for q in range(directions.shape[0]):
+            for q in range(cells.directions.shape[0]):
                 passing[batch, receiver, q] = passing[batch, receiver, q] * wp.max(0.0, 1.0 - coverages[place, q])
 
 
@@ -318,7 +339,7 @@ def _pass_adjoint(
     planes: wp.array2d(dtype=wp.vec4),
     bounds: wp.array2d(dtype=wp.vec4),
     parts: ConvexArrays,
-    directions: wp.array(dtype=wp.vec3),
+    cells: DirectionCells,
     radius: float,
     skip: int,
     passing: wp.array3d(dtype=wp.float32),
@@ -350,7 +371,7 @@ def _pass_adjoint(
                 bounds[instance],
                 parts,
                 body,
-                directions,
+                cells,
                 radius,
                 silhouettes[place],
                 coverages[place],
@@ -359,20 +380,19 @@ def _pass_adjoint(
             for part in range(parts.first_part[body], parts.first_part[body + 1]):
                 bound = _find_bound(point, normal, bounds[instance, part], radius)
                 if bound.is_seen:
-                    count = _find_silhouette(
-                        point, corners[instance], planes[instance], parts, part, silhouettes[place]
-                    )
-                    for q in range(directions.shape[0]):
-                        direction, left = directions[q], 1.0 - coverages[place, q]
-                        if (
-                            wp.dot(direction, bound.axis) > bound.cosine
-                            and left > 0.0
-                            and left < 1.0
-                            and count > 0
-                            and adj_passing[batch, receiver, q] != 0.0
-                        ):
-                            adj = -adj_passing[batch, receiver, q] * passing[batch, receiver, q] / left
-                            _share_adjoint(silhouettes[place], count, direction, radius, adj)
+                    count = int(_UNKNOWN)
+                    for bundle in range(cells.axes.shape[0]):
+                        if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
+                            for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
+                                left = 1.0 - coverages[place, q]
+                                adj = adj_passing[batch, receiver, q] * passing[batch, receiver, q]
+                                if adj != 0.0 and left > 0.0 and left < 1.0:
+                                    if count == _UNKNOWN:
+                                        count = _find_silhouette(
+                                            point, corners[instance], planes[instance], parts, part, silhouettes[place]
+                                        )
+                                    direction = cells.directions[q]
+                                    _share_adjoint(silhouettes[place], count, direction, radius, -adj / left)
                     adj_point += _silhouette_adjoint(silhouettes[place], wp.max(count, 0), instance, adj_corners)
     if adj_points:
         adj_points[batch, receiver] = adj_points[batch, receiver] + adj_point
@@ -409,10 +429,8 @@ def transmittance_past_parts(
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
-    own_radius, cells = (
-        cell_radius(len(directions)) if radius is None else radius,
-        constant(directions, wp.vec3, points.device),
-    )
+    own_radius = cell_radius(len(directions)) if radius is None else radius
+    cells = make_cells(directions, 0.0, points.device)
     inputs = [points, facing, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]
     cost = _PART_COST * placed.bounds.shape[1]

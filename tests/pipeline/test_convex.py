@@ -1,0 +1,94 @@
+"""Bodies that consist of convex parts block the light of others by these."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import warpshadow as ws
+from warpshadow.torch import TorchRenderer
+
+STEP = 1e-3
+
+
+def mesh_of(*boxes):
+    whole = trimesh.util.concatenate([trimesh.creation.box(size).apply_translation(at) for size, at in boxes])
+    return ws.Mesh(whole.vertices, whole.faces).creased()
+
+
+TABLE = mesh_of(
+    ((1.2, 0.04, 0.8), (0, 0.6, 0)), ((0.06, 0.6, 0.06), (-0.5, 0.3, 0)), ((0.06, 0.6, 0.06), (0.5, 0.3, 0))
+)
+
+
+def scene_of(*, method="directional", blockers="auto", bounces=0, **options):
+    """A table beside a ball, over a ground."""
+    table = ws.Body(TABLE, albedo=(0.8, 0.5, 0.3), blockers=blockers, name="table", **options)
+    ball = ws.Body(
+        ws.icosphere(0.3, 3), blockers=ws.Spheres([[0, 0, 0]], [0.3]), translation=(0.3, 1.1, 0.1), name="ball"
+    )
+    floor = ws.Body(ws.plane(4.0, 1), albedo=(0.6, 0.6, 0.6), name="ground")
+    sky = ws.EnvironmentMap(np.linspace(2, 0.1, 32)[:, None, None] * np.ones((32, 64, 3)))
+    camera = ws.Camera.look_at((0.6, 1.8, 3), (0, 0.4, 0), size=(32, 32))
+    settings = {"directions": 128} if method == "directional" else {"samples": 4096}
+    return ws.Scene([table, ball, floor], sky, camera, visibility=ws.Visibility(method, **settings), bounces=bounces)
+
+
+def covered(image):
+    return image[image[..., 3] > 0.99][:, :3]
+
+
+def test_images_are_those_of_rays_and_spheres_are_farther_off():
+    truth = covered(ws.render(scene_of(method="ray-traced")))
+    errors = [
+        np.abs(covered(ws.Renderer(scene_of(blockers=blockers)).render()) - truth).mean() / truth.mean()
+        for blockers in ("auto", 32)
+    ]
+    assert errors[0] < 0.015
+    assert errors[1] > 2 * errors[0]
+
+
+def test_explanations_tell_of_convex_parts():
+    assert "3 convex parts" in str(ws.Renderer(scene_of()).explain())
+    assert "convex" not in str(ws.Renderer(scene_of(blockers=32)).explain())
+    assert "convex" not in str(ws.Renderer(scene_of(self_shadows="spheres")).explain())
+
+
+MOVES = {
+    "table": np.float32([[0.6, 1, 0.4], [0, 0, 0], [0, 0, 0]]),
+    "ball": np.float32([[0, 0, 0], [0.5, 1, 0.2], [0, 0, 0]]),
+}
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+@pytest.mark.parametrize("moving", [None, ["table"], ["ball"]], ids=["all", "table", "ball"])
+def test_gradients_of_the_ground_are_those_of_differences(moving, bounces):
+    """The table moves above a ground, whose pixels stay what they are."""
+    if moving and bounces:
+        pytest.skip("where light bounces nothing of static bodies is cached")
+    camera = ws.Camera.look_at((0, 0.3, 4), (0, 0.1, 1.2), fov_y=20, size=(24, 24))
+    scene = scene_of(bounces=bounces)
+    renderer = TorchRenderer(dataclasses.replace(scene, camera=camera))
+    assert (renderer.warp.body_ids()[0, 16:] == 2).all()
+    rotations, translations, scales = renderer.scene_poses()
+    step = torch.from_numpy(MOVES["table" if moving is None else moving[0]])
+
+    def loss(shift):
+        geometry = renderer.placed(rotations, translations + shift * step, scales, moving=moving)
+        return (renderer(geometry=geometry)[16:, :, :3].double() * torch.linspace(0, 1, 24)[:, None]).sum()
+
+    shift = torch.tensor(0.5, requires_grad=True)
+    loss(shift).backward()
+    with torch.no_grad():
+        ends = [float(loss(torch.tensor(0.5 + sign * STEP))) for sign in (1, -1)]
+    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=0.01)
+
+
+def test_a_table_whose_shape_is_free_blocks_by_spheres():
+    renderer = ws.Renderer(scene_of())
+    geometry = renderer.placed(renderer.scene_poses(), moving=None)
+    deformed = dataclasses.replace(geometry, deformed=(0,)) if hasattr(geometry, "deformed") else None
+    assert deformed is not None
+    assert "convex" not in str(renderer.explain(geometry=deformed))
