@@ -106,14 +106,14 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     for (a, b), f, g in zip(edges.tolist(), face[left].tolist(), face[right].tolist(), strict=True):
         if f < g:
             runs.setdefault((f, g), []).append([a, b])
-    found = []
+    straight = []
     for (f, g), run in runs.items():  # pieces of a straight edge follow each other
         (starts, ends) = map(set, zip(*run, strict=True))
         (begin,), (end,) = (starts - ends) or {None}, (ends - starts) or {None}
         if begin is None or end is None:
             return None
-        found.append([begin, end, f, g])
-    return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(found), used))
+        straight.append([begin, end, f, g])
+    return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(straight), used))
 
 
 def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:

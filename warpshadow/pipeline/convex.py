@@ -48,14 +48,14 @@ class SceneParts:
     @functools.cached_property
     def parts(self) -> dict[int, list[ConvexPart]]:
         """The parts of each body that consists of some and casts shadows, unless spheres of the user's own block."""
-        found: dict[int, list[ConvexPart] | None] = {}
+        of_mesh: dict[int, list[ConvexPart] | None] = {}
         result = {}
         for number, body in enumerate(self._merged_scene.scene.bodies):
             mesh = body.mesh
             if body.casts_shadow and isinstance(body.blockers, str) and not self._merged_scene.is_flat[number]:
-                if id(mesh) not in found:
-                    found[id(mesh)] = find_convex_parts(mesh.positions, mesh.surface.faces)
-                parts = found[id(mesh)]
+                if id(mesh) not in of_mesh:
+                    of_mesh[id(mesh)] = find_convex_parts(mesh.positions, mesh.surface.faces)
+                parts = of_mesh[id(mesh)]
                 if parts:
                     result[number] = parts
         return result

@@ -19,6 +19,8 @@ As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, so 
 
     ∂(π ρ² h) = Σ_edges (s₁ − s₀) / √(1 − (m·ω)²) ∂n·y / |n|
 
+Where a corner is nearer to ω than some 1e-6, rounding decides how its edges share the disc.
+
 Parts of one body are beside each other, so they cover different parts of a cell; bodies are independent. Edges are
 exact, and so are thin parts: spheres bulge out of them.
 """
@@ -107,12 +109,12 @@ class Chord:
 
 
 @wp.func
-def _along_line(end: wp.vec3, along: wp.vec3, direction: wp.vec3, half: float, behind: float):
+def _along_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half: float, behind: float):
     """Where an end of an edge lies on its line, up to the disc's border; ``behind`` if it is behind the receiver."""
     ahead = wp.dot(end, direction)
     if ahead <= 0.0:
         return behind
-    aside = wp.dot(end, along)
+    aside = wp.dot(end, axis)
     if ahead * half <= wp.abs(aside):
         return wp.where(aside > 0.0, half, -half)
     return aside / ahead
