@@ -23,6 +23,7 @@ from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.free.base import PRIOR, Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.free.views import OutlineOffset
 from warpshadow.inverse.loss import bounded
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
@@ -105,7 +106,7 @@ class Uncertainty:
         return [sd / np.log(2.0) for name, sd in self.deviations.items() if name.startswith("exposure.log[")]
 
 
-class _Normal:
+class NormalMatrix:
     """The normal matrix at some values, and the sum over tiles."""
 
     def __init__(self, problem: Problem, setting: Setting, values: Mapping[str, Values]):
@@ -184,24 +185,34 @@ class _Normal:
 
     def _prior(self) -> np.ndarray:
         """Precision that priors have, [number, number]: the curvature of the regularizers of poses and offsets."""
-        sizes = [self.values[name][key].view(-1)[number] for name, key, number in self.places]
-        start = torch.stack(sizes) if sizes else torch.zeros(0)
+        rows = []
+        for name, key, number in self.places:
+            ends = []
+            for step in (_STEP, -_STEP):
+                self.values[name][key].view(-1)[number] += step
+                ends.append(self._prior_slopes())
+                self.values[name][key].view(-1)[number] -= step
+            rows.append((ends[0] - ends[1]) / (2 * _STEP))
+        return np.reshape(rows, (len(rows), len(rows))) / (2 * PRIOR)
 
-        def regularizer(flat: torch.Tensor) -> torch.Tensor:
-            parts: dict[str, dict[str, list[torch.Tensor]]] = {}
-            for (name, key, _), value in zip(self.places, flat, strict=True):
-                parts.setdefault(name, {}).setdefault(key, []).append(value)
-            total = flat.sum() * 0
-            for free in self.problem.free:
-                if free.name in parts and (isinstance(free, Pose) or free.key == "outline_offset"):
-                    own = self.values[free.name]
-                    values = {key: torch.stack(part).view_as(own[key]) for key, part in parts[free.name].items()}
-                    term = free.regularizer(values, self.setting)
-                    total = total if term is None else total + term
-            return total
-
-        hessian = torch.autograd.functional.hessian(regularizer, start)
-        return hessian.double().cpu().numpy() / (2 * PRIOR)
+    def _prior_slopes(self) -> np.ndarray:
+        """Derivatives of the regularizers of poses and offsets by the numbers, [number]."""
+        leaves = {
+            name: {key: t.clone().requires_grad_() for key, t in own.items()} for name, own in self.values.items()
+        }
+        terms = [
+            free.regularizer(leaves[free.name], self.setting)
+            for free in self.problem.free
+            if isinstance(free, (Pose, OutlineOffset))
+        ]
+        terms = [term for term in terms if term is not None]
+        if terms:
+            torch.stack(terms).sum().backward()
+        slopes = []
+        for name, key, number in self.places:
+            gradient = leaves[name][key].grad
+            slopes.append(0.0 if gradient is None else float(gradient.view(-1)[number]))
+        return np.array(slopes)
 
 
 def _by_tiles(pixels: np.ndarray) -> np.ndarray:
@@ -215,7 +226,7 @@ def uncertainty(result: Result) -> Uncertainty | None:
     """How well a fit knows its few parameters; None where it has none."""
     if not _places(result.values):
         return None
-    normal = _Normal(result.problem, result.setting, result.values)
+    normal = NormalMatrix(result.problem, result.setting, result.values)
     inverse = np.linalg.inv(normal.form)
     covariance = inverse @ normal.middle @ inverse
     poses = {
@@ -227,7 +238,7 @@ def uncertainty(result: Result) -> Uncertainty | None:
     return Uncertainty(names, covariance, poses, normal.light)
 
 
-def _pose_uncertainty(free: Pose, normal: _Normal, covariance: np.ndarray) -> PoseUncertainty:
+def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) -> PoseUncertainty:
     """The uncertainty of a pose in scene units and degrees."""
     setting, own = normal.setting, normal.values[free.name]
     rows = [index for index, (name, _, _) in enumerate(normal.places) if name == free.name]
@@ -266,7 +277,7 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
     """Values beside some, along the direction of the poses that the images tell least of, either way, farther and
     farther; the light is solved for anew.
     """
-    normal = _Normal(problem, setting, values)
+    normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.places) if name.startswith(f"{Pose.key}[")]
     beside: list[dict[str, Values]] = []
     if poses:
