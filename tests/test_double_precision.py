@@ -610,7 +610,14 @@ def test_transmittance_of_lobes(double, device, check, glossy):
 def test_sums_of_lobes(quantity, double, device, check):
     sums = double("stages.gloss.reflection").sum_lobes
     weights, light = (wp.vec3d, random(0, 1, 2, 3, 3)), (wp.vec3d, random(1, 2, 2, 3, 3))
-    check(lambda *arguments: sums(*arguments)[quantity], weights, light, (wp.float64, random(2, 1, 2, 3)))
+    rest = (wp.float64, random(2, 1, 2, 3)), (wp.vec3d, random(3, 1, 2, 3))
+    check(lambda *arguments: sums(*arguments)[quantity], weights, light, *rest)
+
+
+def test_radiance_of_blockers(double, device, check):
+    blocked = double("stages.gloss.reflection").blocked_radiance
+    direct, openness = random(0, 1, 3, 3), np.repeat(np.linspace(0, 0.9, 3)[None, :, None], 3, axis=2)
+    check(blocked, (wp.vec3d, direct + 0.5 + random(1, 1, 3, 3) ** 2), (wp.vec3d, direct), (wp.vec3d, openness))
 
 
 @pytest.mark.parametrize("quantity", [0, 1])

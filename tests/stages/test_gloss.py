@@ -109,6 +109,20 @@ def test_transmittance_of_samples_is_the_mean_of_the_cells_around(device):
     assert np.abs(got - expected).max() < 20 * FLOAT32
 
 
+def test_blockers_send_what_is_blocked(device):
+    """Of even light that all bounces bring back, nothing is missing."""
+    even = wp.full((1, 2), wp.vec3(0.7), dtype=wp.vec3, device=device)
+    direct = wp.array([[[0.35] * 3, [0.7] * 3]], dtype=wp.vec3, device=device)
+    openness = wp.array([[[0.5] * 3, [1.0] * 3]], dtype=wp.vec3, device=device)
+    blocked = reflection.blocked_radiance(even, direct, openness)
+    np.testing.assert_allclose(blocked.numpy()[0], [[0.7] * 3, [0.0] * 3], rtol=1e-6)
+    weights = wp.full((1, 2, 4), wp.vec3(0.25), dtype=wp.vec3, device=device)
+    light = wp.full((1, 2, 4), wp.vec3(0.7), dtype=wp.vec3, device=device)
+    through = wp.array(np.linspace(0, 1, 8).reshape(1, 2, 4), dtype=wp.float32, device=device)
+    for total in reflection.sum_lobes(weights, light, through, blocked):
+        np.testing.assert_allclose(total.numpy()[0, 0], 0.7, rtol=1e-6)
+
+
 def test_diffuse_receivers_keep_their_light(device):
     rng = np.random.default_rng(3)
     numbers = wp.array([-1, 0, -1], dtype=wp.int32, device=device)

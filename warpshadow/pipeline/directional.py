@@ -15,13 +15,22 @@ from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
 from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, Transmittance
-from warpshadow.pipeline.lighting import LARGEST_COEFFICIENT, KnownLight, LitPoints, joined, map_of, receiver_words
+from warpshadow.pipeline.lighting import (
+    LARGEST_COEFFICIENT,
+    KnownLight,
+    LitPoints,
+    converted,
+    joined,
+    map_of,
+    receiver_words,
+)
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.self_visibility import Blocking, SelfVisibilityLookup
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells
+from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_towards
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
@@ -29,7 +38,7 @@ from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance, multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells, trace_sun_cells
-from warpshadow.stages.shading import shade_cells
+from warpshadow.stages.shading import shade, shade_cells
 from warpshadow.stages.sides import split_sides
 from warpshadow.stages.transfer import directional_transfer
 from warpshadow.stages.visibility import directional
@@ -270,17 +279,45 @@ class Directional(SphereMethod):
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes, between cells; of known light, to where it comes from in them."""
+        cells, projected_light = self._lobe_cells(points, light)
+        words = functools.partial(receiver_words, points)
+        arguments = cells, points.receivers_node, directions, projected_light
+        return Node("transmittance of lobes", _towards, *arguments, items=words)
+
+    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+        """Mean radiance of what blocks the light of points, by their light with bounces and without."""
+        cells, projected_light = self._lobe_cells(points, light)
+        free = light if isinstance(light.value(), wp.array) else None
+        return Node("light of blockers", self._blocked, cells, points.receivers_node, projected_light, diffuse, free)
+
+    def _blocked(
+        self,
+        cells: list[wp.array],
+        receivers: Receivers,
+        projected_light: ProjectedCells,
+        diffuse: wp.array,
+        free: wp.array | None,
+    ) -> wp.array:
+        if not diffuse.size:
+            return diffuse
+        count = len(projected_light.directions)
+        transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.directions)
+        light = projected_light.coefficients if free is None else converted(free, self.native_from_basis)
+        assert light is not None
+        even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
+        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(transfer, even)
+        return blocked_radiance(diffuse, direct, openness)
+
+    def _lobe_cells(self, points: LitPoints, light: Input) -> tuple[Node, Any]:
+        """Node of the transmittance of cells, in parts, and the projected light that says which."""
         is_free = isinstance(light.value(), wp.array)
         make = functools.partial(self.projected, light)
         projected_light = self.free_projection if is_free else points.cached("projected", light, make)
-        words = functools.partial(receiver_words, points)
 
         def in_cells() -> Node:
             return CellTransmittances(self, points, projected_light, None, list, where=" of gloss", is_shaded=False)
 
-        cells = points.cached("cells", None if is_free else light, in_cells)
-        arguments = cells, points.receivers_node, directions, projected_light
-        return Node("transmittance of lobes", _towards, *arguments, items=words)
+        return points.cached("cells", None if is_free else light, in_cells), projected_light
 
     def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
         """The light S_q that static bodies let through, [row, 3, direction]; but for the scene's, of 1: [row, 1, …]."""
@@ -320,9 +357,14 @@ def _towards(
     count = len(projected_light.directions)
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    rows = joined([part.reshape((len(part), -1)) for part in cells])
-    transmittance = rows.reshape((len(rows), -1, count))
+    transmittance = _joined_cells(cells, count)
     return transmittance_towards(transmittance, receivers.normals, directions, projected_light.directions)
+
+
+def _joined_cells(cells: list[wp.array], count: int) -> wp.array:
+    """Transmittance of all parts, [batch, receiver, direction]. Differentiable."""
+    rows = joined([part.reshape((len(part), -1)) for part in cells])
+    return rows.reshape((len(rows), -1, count))
 
 
 def _has_light(cached: CachedRows) -> bool:

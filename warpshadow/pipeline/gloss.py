@@ -72,11 +72,18 @@ class GlossyPoints(LitPoints):
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
         radiance = Node("prefiltered light", look_up_light, texels, directions, weights, items=words)
         through = self.method.lobe_transmittance(self, directions, source)
-        sums = Node("gloss", sum_lobes, weights, radiance, through, items=words)
+        blocked = None
+        if self.merged_scene.scene.bounces:
+            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, self._view)
+        sums = Node("gloss", sum_lobes, weights, radiance, through, blocked, items=words)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
         mix = Node("reflection", reflect, *arguments, items=words)
         return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)
+
+    def chosen(self, light: Node) -> Node:
+        """Node of light on these receivers, given that of all receivers of the view."""
+        return Node("", _chosen, light, Fixed(self._view.receivers_node), self.merged_scene.is_glossy)
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
@@ -147,6 +154,19 @@ def _numbers(is_glossy: np.ndarray, receivers: Receivers) -> wp.array:
     return wp.array(numbers, dtype=wp.int32, device=receivers.points.device)
 
 
+def _chosen(light: wp.array, receivers: Receivers, is_glossy: np.ndarray) -> wp.array:
+    """Light on the glossy ones among a view's receivers, vec3 of shape [batch, receiver]. Differentiable: light."""
+    return _of_spans(light, _spans(is_glossy, receivers), -len(receivers.on_static))
+
+
+def _of_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
+    """Items of spans, whose counting begins at an item."""
+    parts = [cut(array, span.first - first, span.end - first) for span in spans]
+    if not parts:
+        return wp.empty((len(array), 0), dtype=array.dtype, device=array.device)
+    return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
+
+
 def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
     """The glossy ones among the receivers of a view, all of which pixels see. Differentiable: points, normals."""
     spans, count = _spans(is_glossy, receivers), 0
@@ -157,17 +177,11 @@ def _glossy_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
         renumbered.append(Span(span.body, count, count + span.end - span.first))
         count = renumbered[-1].end
 
-    def chosen(array: wp.array, first: int) -> wp.array:
-        parts = [cut(array, span.first - first, span.end - first) for span in spans]
-        if not parts:
-            return wp.empty((len(array), 0), dtype=array.dtype, device=array.device)
-        return parts[0] if len(parts) == 1 else concatenate(parts, [part.shape[1] for part in parts])
-
     if seen is None:
         device = receivers.points.device
         seen = Fragments(*(wp.empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
-    fragments = Fragments(chosen(seen.face_ids, at_vertices), chosen(seen.barycentrics, at_vertices))
+    fragments = Fragments(*(_of_spans(array, spans, at_vertices) for array in (seen.face_ids, seen.barycentrics)))
     none = constant(np.empty(0, int), wp.int32, receivers.points.device)
-    points, normals = chosen(receivers.points, 0), chosen(receivers.normals, 0)
+    points, normals = (_of_spans(array, spans, 0) for array in (receivers.points, receivers.normals))
     arguments = points, normals, receivers.faces, none, fragments
     return Receivers(*arguments, spans=tuple(renumbered), vertices=none, seen=fragments)

@@ -236,6 +236,16 @@ class Method:
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
+    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+        """Mean radiance of what blocks the light of points, where light bounces, vec3 of shape [batch, receiver].
+
+        Args:
+            points, light: As for :meth:`lobe_transmittance`.
+            diffuse: Node of their shading.
+            view: The receivers among which they are, which are shaded.
+        """
+        raise NotImplementedError
+
     def openness(self, points: LitPoints) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None

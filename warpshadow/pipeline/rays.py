@@ -12,6 +12,7 @@ from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.lobes import TRACED_SAMPLES
+from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
 from warpshadow.stages.light_samples import cut_map, sample_map
 from warpshadow.stages.ray_packets import PACKET, FaceTree, build_face_tree
@@ -24,6 +25,7 @@ if TYPE_CHECKING:  # it is imported where light bounces
     from warpshadow.pipeline.bounces.static_bounces import StaticBounces
 
 Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
+_EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
 
 
 class Rays(Method):
@@ -100,6 +102,18 @@ class Rays(Method):
         trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
         words = functools.partial(receiver_words, points)
         return Node("transmittance of lobes", _trace_lobes, trees, points.receivers_node, directions, items=words)
+
+    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+        """Mean radiance of what blocks the light of points, by their light with bounces and without."""
+        if isinstance(light.value(), wp.array):
+            direct = super().free_shading(view, light, view.materials)
+        else:
+            direct = view.cached(
+                "direct", light, lambda: Node("", self._shade, self._meshes(view), view.receivers_node)
+            )
+        trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
+        openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        return Node("light of blockers", blocked_radiance, diffuse, points.chosen(direct), openness)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -208,6 +222,17 @@ def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.arr
         arguments = points[located], normals[located], directions[instance]
         wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
     return traced
+
+
+def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
+    """Light under an even sky of 1, vec3 of shape [batch, receiver]."""
+    points, normals = _without_gradient(receivers.points), receivers.normals
+    result = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+    samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
+    for instance in range(len(points) if points.size else 0):
+        arguments = trees[min(instance, len(trees) - 1)], points[instance], normals[instance], samples
+        wp.copy(result[instance], trace_shared(*arguments))
+    return result
 
 
 def _without_gradient(points: wp.array) -> wp.array:

@@ -1,11 +1,13 @@
 """Reflection: the light of a lobe and diffuse light, as glTF mixes them for metals and for all else.
 
-With G = Σ w (T L + R) and G' = Σ w' (T L + R) over the samples of a lobe, T their transmittance and R the radiance of
-what blocks them, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects a A + C:
+With G = Σ w (T L + (1 − T) R) and G' = Σ w' (T L + (1 − T) R) over the samples of a lobe, T their transmittance and R
+the radiance of what blocks them, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects
+a A + C:
 
     A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),
     C = (1 − m) s (F₀ G + (1 − F₀) G') + m G'.
 
+R is the same in all directions that are blocked: their mean by the cosine, which bounced light tells.
 E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is taken for all light.
 """
 
@@ -22,6 +24,9 @@ from warpshadow.device.parallel import split_row
 STRAIGHT = 0.04
 """F₀ of all that is not metal: an index of refraction of 1.5."""
 
+LEAST_SHARE = 0.02
+"""Part of the hemisphere below which it says little of blockers' radiance how much light they send."""
+
 _COST = 10.0
 """Nanoseconds that a sample takes."""
 
@@ -36,6 +41,7 @@ def _sum_lobes(
     weights: wp.array3d(dtype=wp.vec3),
     light: wp.array3d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
+    blocked: wp.array2d(dtype=wp.vec3),
     # out
     straight: wp.array2d(dtype=wp.vec3),
     grazing: wp.array2d(dtype=wp.vec3),
@@ -45,41 +51,85 @@ def _sum_lobes(
     located = instance_in(batch, weights.shape[0])
     lit = instance_in(batch, light.shape[0])
     through = instance_in(batch, transmittance.shape[0])
+    instead = wp.vec3()
+    if blocked:
+        instead = blocked[instance_in(batch, blocked.shape[0]), receiver]
     total = wp.vec3()
     total_grazing = wp.vec3()
     for i in range(weights.shape[2]):
         weight = weights[located, receiver, i]
-        radiance = transmittance[through, receiver, i] * light[lit, receiver, i]
+        share = transmittance[through, receiver, i]
+        radiance = share * light[lit, receiver, i] + (1.0 - share) * instead
         total += weight[0] * radiance
         total_grazing += weight[1] * radiance
     straight[batch, receiver] = total
     grazing[batch, receiver] = total_grazing
 
 
-def sum_lobes(weights: wp.array, light: wp.array, transmittance: wp.array) -> tuple[wp.array, wp.array]:
+def sum_lobes(
+    weights: wp.array, light: wp.array, transmittance: wp.array, blocked: wp.array | None = None
+) -> tuple[wp.array, wp.array]:
     """Sum the light of lobes.
 
     Args:
         weights: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
+        blocked: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not bounce.
 
     Returns:
         G and G', vec3 of shape [batch, receiver].
 
     Differentiable: all.
     """
-    count = common_batch({"weights": weights, "light": light, "transmittance": transmittance})
+    arrays = {"weights": weights, "light": light, "transmittance": transmittance, "blocked": blocked}
+    count = common_batch(arrays)
     sums = [wp.empty((count, weights.shape[1]), dtype=wp.vec3, device=weights.device) for _ in range(2)]
     launch(
         _sum_lobes,
         count * weights.shape[1],
-        inputs=[weights, light, transmittance],
+        inputs=[weights, light, transmittance, blocked],
         outputs=sums,
-        shared=[weights, light, transmittance],
+        shared=[weights, light, transmittance, blocked],
         cost=_COST * weights.shape[2],
     )
     return sums[0], sums[1]
+
+
+@wp.kernel
+def _find_blocked(
+    # in
+    bounced: wp.array2d(dtype=wp.vec3),
+    direct: wp.array2d(dtype=wp.vec3),
+    openness: wp.array2d(dtype=wp.vec3),
+    # out
+    blocked: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver."""
+    batch, receiver = wp.tid()
+    light = bounced[instance_in(batch, bounced.shape[0]), receiver]
+    rest = light - direct[instance_in(batch, direct.shape[0]), receiver]
+    share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
+    blocked[batch, receiver] = wp.max(rest, wp.vec3()) / wp.max(share, LEAST_SHARE)
+
+
+def blocked_radiance(bounced: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
+    """Mean radiance of all that blocks a receiver's light, (E − S) / (1 − O).
+
+    Args:
+        bounced: E, light that receivers would reflect as white diffuse surfaces, with bounces; vec3 [batch, receiver].
+        direct: S, the same without bounces.
+        openness: O, the same under an even sky of 1 without bounces.
+
+    Returns:
+        Vec3 of shape [batch, receiver].
+
+    Differentiable: all.
+    """
+    count = common_batch({"bounced": bounced, "direct": direct, "openness": openness})
+    blocked = wp.empty((count, bounced.shape[1]), dtype=wp.vec3, device=bounced.device)
+    launch(_find_blocked, blocked.shape, inputs=[bounced, direct, openness], outputs=[blocked])
+    return blocked
 
 
 @functools.cache
