@@ -96,6 +96,14 @@ def kernels_take_their_arguments_as_warp_passes_them():
     assert all(map(np.array_equal, expected, found))
 
 
+def a_module_that_was_unloaded_is_loaded_again():
+    values = wp.zeros(4, dtype=wp.int32, device="cpu")
+    for first in (1, 2):
+        warp_internals.run_kernel(_count_up, (2,), [first, values], wp.get_device("cpu"))
+        _count_up.module.unload()
+    assert values.numpy().tolist() == [0, 1, 2, 2]
+
+
 def arguments_of_a_wrong_type_are_refused():
     values = wp.zeros(3, dtype=wp.float32, device="cpu")
     for arguments in ([0, values], [0, wp.zeros((3, 1), dtype=wp.int32, device="cpu")], [0.5, "text"], [0]):
@@ -155,6 +163,7 @@ def check(works):
     [
         a_thread_has_a_tape_of_its_own,
         kernels_take_their_arguments_as_warp_passes_them,
+        a_module_that_was_unloaded_is_loaded_again,
         arguments_of_a_wrong_type_are_refused,
         a_dtype_says_of_what_its_items_are,
         views_know_that_they_are_views,

@@ -71,25 +71,29 @@ def _cpu_signature(kernel: wp.Kernel) -> tuple[type, type, list[Any], dict] | No
     """
     if kernel.is_generic or not kernel.uses_warp_entry_point_abi:
         return None
-    fields, kinds = [], []
+    fields: list[tuple[str, Any]] = []
+    kinds: list[Any] = []
     for number, argument in enumerate(kernel.adj.args):
         kind = argument.type
         if _types.is_array(kind):
             if type(kind) is not wp.array:
                 return None
-            field, known = _types.array_t, (kind.dtype, kind.ndim)
+            field = _types.array_t
+            kinds.append((kind.dtype, kind.ndim))
         elif isinstance(kind, wp._src.codegen.Struct):
-            field, known = kind.ctype, None
+            field = kind.ctype
+            kinds.append(None)
         elif isinstance(kind, type) and issubclass(kind, ctypes.Array):
-            field, known = kind, ()
+            field = kind
+            kinds.append(())
         elif kind in (wp.bool, wp.int32, wp.uint32, wp.int64, wp.uint64, wp.float32, wp.float64):
-            field, known = kind._type_, ()
+            field = kind._type_
+            kinds.append(())
         else:
             return None
         fields.append((f"argument_{number}", field))
-        kinds.append(known)
-    structs = (type(name, (ctypes.Structure,), {"_fields_": fields}) for name in ("Arguments", "Gradients"))
-    return (*structs, kinds, {})
+    arguments, gradients = (type(name, (ctypes.Structure,), {"_fields_": fields}) for name in ("Values", "Gradients"))
+    return arguments, gradients, kinds, {}
 
 
 def _packed(kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
@@ -138,10 +142,13 @@ def run_kernel(
         dim = tuple(dim)
         if 0 in dim:
             return
-        executable = kernel.module.load(device, 1)
-        if signature[3].get("executable") is not executable:
-            signature[3].update(executable=executable, hooks=executable.get_kernel_hooks(kernel))
-        hooks, bounds = signature[3]["hooks"], _cpu_bounds(dim, kernel.adj.kernel_dim)
+        module, loaded = kernel.module, signature[3]
+        hasher = module.hashers.get(1)  # another one if anything of the module changed
+        if hasher is None or loaded.get("hasher") is not hasher or module.execs.get((None, 1)) is not loaded["module"]:
+            executable = module.load(device, 1)
+            hooks = executable.get_kernel_hooks(kernel)
+            loaded.update(module=executable, hooks=hooks, hasher=module.hashers.get(1))
+        hooks, bounds = loaded["hooks"], _cpu_bounds(dim, kernel.adj.kernel_dim)
         if gradients is None:
             hooks.forward(bounds, ctypes.byref(fields[0]))
         else:
