@@ -7,11 +7,10 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.cells import spread_in_cells
+from warpshadow.assets.harmonic_light import HarmonicLight, as_light
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci
-
-_ROWS = 64  # of maps of harmonics: the last of eight bands loses 0.5% to the size of a pixel
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,7 @@ class HarmonicBasis:
 
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
-        if isinstance(light, EnvironmentMap):
-            return light.sh(self.order).copy()
-        sh.order_of("light", light)
-        coefficients = np.zeros((self.size, 3), np.float32)
-        count = min(self.size, len(light))
-        coefficients[:count] = light[:count]
-        return coefficients
+        return as_light(light).sh(self.order).copy()
 
     def to_map(self, coefficients: npt.ArrayLike) -> EnvironmentMap:
         """Make a map of light in the basis, for functions that take maps alone: files, ``rotated``, the viewer, other
@@ -62,7 +55,7 @@ class HarmonicBasis:
             coefficients: Linear RGB, shape [order², 3].
         """
         light = _checked_coefficients(self, coefficients)
-        return EnvironmentMap(np.maximum(sh.reconstruct_map(light, _ROWS), 0))
+        return EnvironmentMap(np.maximum(HarmonicLight(light).radiance, 0))
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -101,10 +94,7 @@ class CellBasis:
 
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
-        if isinstance(light, EnvironmentMap):
-            return light.cells(self.directions).radiance.copy()
-        order = sh.order_of("light", light)
-        return (sh.evaluate(order, self.directions) @ light).astype(np.float32)
+        return as_light(light).cells(self.directions).radiance.copy()
 
     def to_map(self, coefficients: npt.ArrayLike) -> EnvironmentMap:
         """Make a map of light in the basis, by which a Scene is lit, files are written, and other renderers, too.

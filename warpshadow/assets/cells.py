@@ -25,13 +25,13 @@ class CellLight(NamedTuple):
         spots: Mean directions, weighted with the square of luminance: of a sun, where it is, whatever sky is around
             it; float32 [direction, 3].
         spreads: Half-angles of the evenly bright caps whose mean vectors with that weight are as long: 0 for a point,
-            about 2/√Q for an even cell [radians]; float32 [direction].
+            about 2/√Q for an even cell [radians]; float32 [direction]. None, as spots, where light is soft.
     """
 
     radiance: np.ndarray
     directions: np.ndarray
-    spots: np.ndarray
-    spreads: np.ndarray
+    spots: np.ndarray | None
+    spreads: np.ndarray | None
 
 
 def gather_cells(radiance: np.ndarray, directions: np.ndarray) -> CellLight:

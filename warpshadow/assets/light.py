@@ -191,6 +191,10 @@ class EnvironmentMap:
         """Solid angle of one pixel of each row [sr], exact, float64, shape [height]; all pixels sum to 4π."""
         return sh.pixel_solid_angles(len(self.radiance))
 
+    def bands(self, order: int) -> int:
+        """Number of bands of spherical harmonics, of some, in which there may be light: all."""
+        return order
+
     def sh(self, order: int) -> np.ndarray:
         """Project onto spherical harmonics: the integral over the solid angles of the pixels, however few they are.
 
@@ -220,7 +224,7 @@ class EnvironmentMap:
         if key not in self._cached_cells:
             self._cached_cells[key] = gather_cells(self.radiance, directions)
             for array in self._cached_cells[key]:
-                array.setflags(write=False)
+                array.setflags(write=False)  # type: ignore[union-attr]
         return self._cached_cells[key]
 
     @functools.cached_property

@@ -42,7 +42,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.scene.scene import AUTO, Scene, Visibility
@@ -178,9 +178,11 @@ def for_picture(scene: Scene) -> Scene:
 
 def _has_sun(scene: Scene) -> bool:
     """Whether the directional method is to find shadows of a sun."""
-    if scene.visibility.method != "directional" or not isinstance(scene.light, EnvironmentMap):
+    if scene.visibility.method != "directional":
         return False
-    cells = scene.light.cells(fibonacci(scene.visibility.directions))
+    cells = as_light(scene.light).cells(fibonacci(scene.visibility.directions))
+    if cells.spots is None or cells.spreads is None:
+        return False
     return find_sharp_cells(cells.radiance @ LUMINANCE, cells.spots, cells.spreads) is not None
 
 

@@ -9,7 +9,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.cells import draw_in_cells
 from warpshadow.assets.color import LUMINANCE
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import CHUNK, cell_radius, fibonacci
 from warpshadow.pipeline.by_spheres import InParts, SphereMethod
@@ -75,9 +75,10 @@ class Directional(SphereMethod):
 
     def project_light(self, light: KnownLight) -> ProjectedCells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
-        if not isinstance(light, EnvironmentMap):
-            return ProjectedCells(self._directions, self._on_device(self.native_basis.coefficients(light)))
+        light = as_light(light)
         cells = light.cells(self._directions)
+        if cells.spots is None or cells.spreads is None:
+            return ProjectedCells(cells.directions, self._on_device(cells.radiance))
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
         draw = functools.partial(draw_in_cells, light.radiance, self._directions)

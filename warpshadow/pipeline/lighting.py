@@ -9,10 +9,10 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
-from warpshadow.maths import sh
 from warpshadow.pipeline.merged_scene import Geometry, MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
@@ -261,7 +261,7 @@ def check_light(light: object) -> None:
 
 def map_of(light: KnownLight) -> np.ndarray:
     """Radiance of known light as a map, shape [height, 2 height, 3]."""
-    return light.radiance if isinstance(light, EnvironmentMap) else sh.reconstruct_map(light, 64)
+    return as_light(light).radiance
 
 
 def receiver_words(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:

@@ -7,10 +7,9 @@ import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.harmonic_light import as_light
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
-from warpshadow.maths import sh
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Transmittance
 from warpshadow.pipeline.lighting import KnownLight
@@ -48,19 +47,16 @@ class LogSH(SphereMethod):
 
     def project_light(self, light: KnownLight) -> ProjectedBands:
         """The bands that the light has."""
-        count = self._band_count(light)
+        count = as_light(light).bands(self._order)
         coefficients = self.native_basis.coefficients(light)[None, : count**2]
         return ProjectedBands(count, wp.array(coefficients, dtype=wp.vec3, device=self.merged_scene.device))
-
-    def _band_count(self, light: KnownLight) -> int:
-        return self._order if isinstance(light, EnvironmentMap) else min(self._order, sh.order_of("light", light))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part."""
         known = None if light is None else light.value()
         if known is None or isinstance(known, wp.array):
             return self.free_projection.bands**2
-        return self._band_count(known) ** 2
+        return as_light(known).bands(self._order) ** 2
 
     def look_up(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands
