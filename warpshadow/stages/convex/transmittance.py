@@ -35,6 +35,7 @@ from warpshadow.device.parallel import Scratch, scratch_place, split_row
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.prepared import ConvexArrays, ConvexBlockers, PlacedParts
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
+from warpshadow.stages.visibility.directional import SOFTNESS
 
 _PART_COST = 300.0
 """Mean time of a part of a receiver [ns]."""
@@ -432,7 +433,7 @@ def transmittance_past_parts(
         check.choice("skip", skip, range(blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed.corners}))
     own_radius = cell_radius(len(directions)) if radius is None else radius
-    cells = make_cells(directions, 0.0, points.device)
+    cells = make_cells(directions, SOFTNESS, points.device)
     inputs = [points, facing, *placed, blockers.arrays, cells, own_radius, -1 if skip is None else skip]
     scratch = [Scratch((_ROWS * blockers.edge_count,), wp.vec3), Scratch((len(directions),), wp.float32)]
     cost = _PART_COST * placed.bounds.shape[1]
