@@ -17,7 +17,6 @@ from typing import ParamSpec, TypeGuard, TypeVar
 import numpy as np
 import warp as wp
 
-from warpshadow.device.memory import zeros
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -391,7 +390,7 @@ def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
 def _outside_on_device(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
     """The same by a kernel, with one readback."""
     device = next(iter(arrays.values())).device
-    faults = zeros(len(arrays), dtype=wp.int32, device=device)
+    faults = wp.zeros(len(arrays), dtype=wp.int32, device=device)
     for argument, (name, array) in enumerate(arrays.items()):
         values = _scalars(array)
         wp.launch(

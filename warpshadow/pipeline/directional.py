@@ -75,13 +75,13 @@ class Directional(SphereMethod):
 
     def project_light(self, light: KnownLight) -> ProjectedCells:
         """Cells that look to where their light comes from: a sun is rarely in the middle of one."""
-        light = as_light(light)
-        cells = light.cells(self._directions)
+        known = as_light(light)
+        cells = known.cells(self._directions)
         if cells.spots is None or cells.spreads is None:
             return ProjectedCells(cells.directions, self._on_device(cells.radiance))
         power, softness = cells.radiance @ LUMINANCE, self.visibility.softness
         find = functools.partial(find_sharp_cells, power, cells.spots, cells.spreads, softness)
-        draw = functools.partial(draw_in_cells, light.radiance, self._directions)
+        draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
         return ProjectedCells(

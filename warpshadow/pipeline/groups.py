@@ -138,11 +138,9 @@ class Grouping:
             return groups
         on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
         moving = self._merged_scene.spheres_of(self._solid(self._static.moving), spheres)
-        surroundings = {
-            "planes": self._planes_around(frames, self._static.moving),
-            "parts_around": self._parts_around(placed, self._static.moving),
-        }
-        group = Group(*on_static, *moving, cached_rows, **surroundings)
+        planes = self._planes_around(frames, self._static.moving)
+        parts_around = self._parts_around(placed, self._static.moving)
+        group = Group(*on_static, *moving, cached_rows, planes=planes, parts_around=parts_around)
         return [group, *groups] if receivers.points.shape[1] else [group]
 
     def _that_move(
@@ -201,8 +199,8 @@ class Grouping:
     ) -> Group:
         """Points of a flat body, and their blockers."""
         blocking = self._merged_scene.spheres_of(self._solid(range(len(self._merged_scene.scene.bodies))), spheres)
-        surroundings = {"planes": self._planes_around(frames, but=body), "parts_around": self._parts_around(placed)}
-        return Group(points, normals, *blocking, **surroundings)
+        planes, parts_around = self._planes_around(frames, but=body), self._parts_around(placed)
+        return Group(points, normals, *blocking, planes=planes, parts_around=parts_around)
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
         """The spheres of some blockers."""
