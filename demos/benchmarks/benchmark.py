@@ -225,10 +225,11 @@ def time_fits(device: str) -> None:
 
 
 def small_scene() -> ws.Scene:
-    """A ball of 42 vertices and 8 spheres on a ground of 16 quads, 16 × 16 pixels."""
+    """A ball of 42 vertices and 8 spheres on a ground of 16 quads, 16 × 16 pixels, light in 16 cells."""
     ground = ws.Body(ws.plane(6.0, 4), blockers=0)
     scene = on_ground(ws.icosphere(1.0, 1), ws.synthetic_sky(), blockers=8, ground=ground)
-    return dataclasses.replace(scene, camera=scene.camera.resized(1 / 16), supersampling=1)
+    visibility = ws.Visibility(directions=16)
+    return dataclasses.replace(scene, camera=scene.camera.resized(1 / 16), supersampling=1, visibility=visibility)
 
 
 def time_host(device: str, runs: int) -> None:
