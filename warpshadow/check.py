@@ -17,7 +17,6 @@ from typing import ParamSpec, TypeGuard, TypeVar
 import numpy as np
 import warp as wp
 
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -59,15 +59,17 @@ def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any
 
 def gradients_of(arguments: Sequence[Any], tape: wp.Tape | None = None) -> list[Any]:
     """Gradients of a kernel's arguments, None of an argument that has none; a tape that is given keeps them, too."""
-    tape = tape or wp.Tape()
-    return [
-        (tape.get_adjoint(value) if value.requires_grad else None)
-        if type(value) is wp.array
-        else None
-        if value is None or isinstance(value, (int, float))
-        else tape.get_adjoint(value)
-        for value in arguments
-    ]
+    gradients: list[Any] = []
+    for value in arguments:
+        gradient = None
+        if type(value) is wp.array:
+            gradient = value.grad
+            if gradient is not None and tape is not None:
+                tape.gradients[value] = gradient
+        elif value is not None and not isinstance(value, (int, float)):  # a struct has gradients of its arrays
+            gradient = (tape or wp.Tape()).get_adjoint(value)
+        gradients.append(gradient)
+    return gradients
 
 
 def record(function: Callable[[], None]) -> None:
