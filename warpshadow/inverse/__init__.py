@@ -10,6 +10,7 @@ from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
 from warpshadow.inverse.free.base import Free
+from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
@@ -41,6 +42,7 @@ __all__ = [
     "Free",
     "Light",
     "Loss",
+    "Metallic",
     "OutlineOffset",
     "Pose",
     "PoseUncertainty",
@@ -48,6 +50,7 @@ __all__ = [
     "QuasiNewton",
     "Radii",
     "Result",
+    "Roughness",
     "Stage",
     "Target",
     "Texture",

@@ -15,6 +15,7 @@ from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import Result, default_optimizer, fit, short_adam
 from warpshadow.inverse.free.base import Free
+from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
@@ -34,7 +35,9 @@ _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "stil
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose, OutlineOffset)}
-_FREE_OF_BODIES: dict[str, type[Free]] = {kind.key: kind for kind in (Albedo, Texture, Pose, Deformation, Radii)}
+_FREE_OF_BODIES: dict[str, type[Free]] = {
+    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Pose, Deformation, Radii)
+}
 
 
 def _pair(key: str, value: object) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ import torch
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.scene.blockers import scene_blockers
-from warpshadow.scene.scene import SPHERE_METHODS, Scene, Visibility
+from warpshadow.scene.scene import GLOSS, SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.torch import TorchRenderer
@@ -105,6 +105,7 @@ class World:
         cameras: The same.
     Attributes:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
+        gloss: Its roughness and the like, by name.
         rotations, translations, scales: Of each body.
         rest: The bodies in their own spaces, None for the scene's.
         moving: Bodies that do not stand where the scene has them.
@@ -120,6 +121,7 @@ class World:
         self.light: torch.Tensor | None = None
         self.albedo: list[torch.Tensor | None] = [None] * count
         self.textures: list[torch.Tensor | None] = [None] * count
+        self.gloss: dict[str, list[torch.Tensor | None]] = {name: [None] * count for name in GLOSS}
         self.rotations, self.translations, self.scales = (list(poses.unbind()) for poses in renderer.scene_poses())
         self.rest: Geometry | None = None
         self.moving: set[int] = set()
@@ -146,6 +148,7 @@ class World:
             textures=self.textures,
             geometry=self.geometry,
             clip_matrices=self.clip_matrices,
+            **self.gloss,
         )
         if self.exposures is not None:
             color = images[..., :3] * self.exposures[:, None, None]

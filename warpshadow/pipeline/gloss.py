@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -28,9 +27,6 @@ from warpshadow.stages.rasterize import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
 
-if TYPE_CHECKING:
-    from warpshadow.pipeline.view import View
-
 _CELL_ROWS = 64
 """Rows of the map of free light in cells: each pixel has the light of the nearest cell."""
 
@@ -40,11 +36,12 @@ class GlossyPoints(LitPoints):
 
     Args:
         view: The view.
+        cameras: Clip matrices of its cameras, or one for all.
     """
 
-    def __init__(self, view: View):
+    def __init__(self, view: LitPoints, cameras: Input):
         glossy = view.merged_scene.is_glossy
-        self._view = view
+        self._view, self._cameras = view, cameras
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocking=view.blocking, is_static=view.is_static)
@@ -63,7 +60,7 @@ class GlossyPoints(LitPoints):
         key = materials.gloss["roughness"]
 
         def lobes() -> Node:
-            inputs = self.receivers_node, roughness, self._view.cameras, self.method.lobe_samples
+            inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples
             return Node("lobes", _sample, *inputs, items=words)
 
         sampled = self.cached("lobes", key, lobes)

@@ -11,6 +11,7 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.adaptive import find_squares
+from warpshadow.pipeline.gloss import GlossyPoints
 from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Given, Materials, VisibleSurfaces
@@ -200,9 +201,7 @@ class View(LitPoints):
 
     def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
-        from warpshadow.pipeline.gloss import GlossyPoints
-
-        points = self.cached("gloss", None, lambda: GlossyPoints(self))
+        points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
         colored, white = points.mixed(lit, light, materials)
         parts = self._radiance(colored, reflected), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else film.sum_radiance, *parts, caches=False)

@@ -46,8 +46,8 @@ def _neighbors(directions: bytes) -> np.ndarray:
     texels /= np.linalg.norm(texels, axis=1, keepdims=True)
     reach = 2 * np.sin(min(REACH * cell_radius(len(cells)) + 2.2 / _ROWS, np.pi) / 2)
     tree = cKDTree(cells)
-    most = max(len(near) for near in tree.query_ball_point(texels, reach))
-    return tree.query(texels, min(max(most, 3), len(cells)))[1].astype(np.int32)
+    count = max(len(near) for near in tree.query_ball_point(texels, reach))
+    return tree.query(texels, min(max(count, 3), len(cells)))[1].astype(np.int32)
 
 
 @wp.func
