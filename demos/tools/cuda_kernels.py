@@ -14,6 +14,7 @@ from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
 from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
+from warpshadow.stages.gloss import traced
 from warpshadow.stages.interpolate import _make_interpolate
 from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
@@ -69,6 +70,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     "trace._make_trace": trace._make_trace,
     "sun_cells._make_trace": sun_cells._make_trace,
     "shared_rays._make_trace": shared_rays._make_trace,
+    "gloss.traced._make_trace": traced._make_trace,
     "_make_trace_cosines": traced_transfer._make_trace_cosines,
     "_make_empty": partial(lanes._make_empty, ""),
 }

@@ -1,6 +1,7 @@
 """The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -285,7 +286,9 @@ class Directional(SphereMethod):
         arguments = cells, points.receivers_node, directions, projected_light
         return Node("transmittance of lobes", _towards, *arguments, items=words)
 
-    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+    def blocked_radiance(
+        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+    ) -> Node:
         """Mean radiance of what blocks the light of points, by their light with bounces and without."""
         cells, projected_light = self._lobe_cells(points, light)
         free = light if isinstance(light.value(), wp.array) else None

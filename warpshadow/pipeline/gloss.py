@@ -71,7 +71,7 @@ class GlossyPoints(LitPoints):
         through = self.method.lobe_transmittance(self, directions, source)
         blocked = None
         if self.merged_scene.scene.bounces:
-            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, self._view)
+            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, self._view, self.chosen)
         sums = Node("gloss", sum_lobes, weights, radiance, through, blocked, items=words)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular

@@ -236,13 +236,16 @@ class Method:
         """
         return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
 
-    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+    def blocked_radiance(
+        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+    ) -> Node:
         """Mean radiance of what blocks the light of points, where light bounces, vec3 of shape [batch, receiver].
 
         Args:
             points, light: As for :meth:`lobe_transmittance`.
             diffuse: Node of their shading.
             view: The receivers among which they are, which are shaded.
+            choose: Makes a node of light on the view's receivers one of light on these.
         """
         raise NotImplementedError
 

@@ -1,6 +1,7 @@
 """The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +104,9 @@ class Rays(Method):
         words = functools.partial(receiver_words, points)
         return Node("transmittance of lobes", _trace_lobes, trees, points.receivers_node, directions, items=words)
 
-    def blocked_radiance(self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints) -> Node:
+    def blocked_radiance(
+        self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
+    ) -> Node:
         """Mean radiance of what blocks the light of points, by their light with bounces and without."""
         if isinstance(light.value(), wp.array):
             direct = super().free_shading(view, light, view.materials)
@@ -113,7 +116,7 @@ class Rays(Method):
             )
         trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
         openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", blocked_radiance, diffuse, points.chosen(direct), openness)
+        return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
     def transfers(self, points: LitPoints) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
