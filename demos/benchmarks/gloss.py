@@ -2,9 +2,9 @@
 
     python -m demos.benchmarks.gloss [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
 
-FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface, of which the
-difference to its own ``principled`` is printed first: a ball alone, whose light is that of its surface. Errors are of
-the whole image, and of the body that shines alone, relative L2, noise of the reference taken off.
+FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
+(demos/mitsuba_gloss.py), so that nothing is due to another one. Errors are of the whole image, and of the body that
+shines alone, relative L2, noise of the reference taken off.
 """
 
 import argparse
