@@ -5,7 +5,7 @@ be rendered, relit and written. Needs torch.
 """
 
 from warpshadow.inverse.checkpoint import CheckpointError
-from warpshadow.inverse.descent import FitWarning, Result, default_optimizer, fit, short_adam
+from warpshadow.inverse.descent import FitWarning, default_optimizer, fit, short_adam
 from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
@@ -21,6 +21,7 @@ from warpshadow.inverse.many import Ending, find_fits, fit_many
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.report import write_result
+from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, deformation_stages, photograph_stages, pose_stages
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.uncertainty import PoseUncertainty, Uncertainty

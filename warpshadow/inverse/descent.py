@@ -3,40 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_of
-from warpshadow.inverse.found_light import FoundLight, found_light
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.views import OutlineOffset
-from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
 from warpshadow.inverse.preview import write_preview
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
+from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
-from warpshadow.inverse.uncertainty import Uncertainty, along_flat, uncertainty
+from warpshadow.inverse.uncertainty import along_flat
 from warpshadow.inverse.variable_projection import make_model
 from warpshadow.inverse.watch import Watch, watching
-from warpshadow.inverse.world import FittedScene, Setting
-from warpshadow.scene.scene import Scene
 from warpshadow.viewer import FitViewer
 
 FEW = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
@@ -51,80 +44,6 @@ class FitWarning(UserWarning):
 
 
 GOOD_ENDINGS = ("converged", "finished")  # why a fit ends whose values can be used as they are
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """Result of a fit.
-
-    Args:
-        problem: The problem that was fitted.
-        setting: Its scene at the start and its units.
-        values: Free parameters by name, at the least loss of the last stage.
-        losses: Loss of each iteration before its step, a list for each candidate of each stage.
-        reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or the name
-            of a non-finite quantity.
-        seconds: Median time of an iteration of the last stage [s].
-    """
-
-    problem: Problem
-    setting: Setting = field(repr=False)
-    values: dict[str, Values] = field(repr=False)
-    losses: list[list[float]] = field(repr=False)
-    reason: str
-    seconds: float
-
-    def __repr__(self) -> str:
-        free = ", ".join(self.values)
-        count = sum(map(len, self.losses))
-        loss = min(self.losses[-1], default=math.nan)
-        return f"Result({free}: {self.reason} after {count} iterations, loss {loss:.3g})"
-
-    @functools.cached_property
-    def found(self) -> FittedScene:
-        """Scene, cameras and exposures."""
-        return self.problem.found(self.values, self.setting)
-
-    @property
-    def scene(self) -> Scene:
-        """The scene that explains the targets."""
-        return self.found.scene
-
-    @functools.cached_property
-    def light(self) -> FoundLight | None:
-        """The light that was found, and which directions of it the images determined; None where it was not free."""
-        if self.problem.basis is None:
-            return None
-        return found_light(self.scene.light, self.problem, self.setting, self.values)
-
-    @functools.cached_property
-    def uncertainty(self) -> Uncertainty | None:
-        """How well it knows its few numbers, such as poses and exposures; None where it has none."""
-        return uncertainty(self)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras of the views."""
-        return self.found.cameras
-
-    @property
-    def figures(self) -> dict[str, list[float]]:
-        """The fitted parameters that are a few numbers, by their keys in scene files."""
-        figures: dict[str, list[float]] = {}
-        for free in self.problem.free:
-            for key, numbers in free.summary(self.found).items():
-                figures[key] = np.ravel(numbers).astype(float).tolist()
-        return figures
-
-    def images(self, values: Mapping[str, Values] | None = None) -> np.ndarray:
-        """Images of the views, [view, height, width, 4], of the result or of other values."""
-        model = Model(self.problem, self.setting, Stage())
-        with torch.no_grad():
-            return model.images(self.values if values is None else values).cpu().numpy()
-
-    def images_at_start(self) -> np.ndarray:
-        """Images of the views before the fit, [view, height, width, 4]."""
-        return self.images(self.problem.start(self.setting))
 
 
 class _Diverged(Exception):

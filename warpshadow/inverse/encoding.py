@@ -57,7 +57,7 @@ def _metadata(path: Path) -> tuple[dict[str, Any], bool]:
 
     try:
         with Image.open(path, formats=["PNG", "JPEG"]) as picture:
-            return dict(picture.info), "16B" in str(picture.tile)
+            return {str(key): value for key, value in picture.info.items()}, "16B" in str(picture.tile)
     except (OSError, SyntaxError, Image.DecompressionBombError):
         return {}, False  # which read_image refuses
 

@@ -13,7 +13,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
-from warpshadow.inverse.descent import Result, default_optimizer, fit, short_adam
+from warpshadow.inverse.descent import default_optimizer, fit, short_adam
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
@@ -24,6 +24,7 @@ from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
+from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
 from warpshadow.inverse.target import Target
 from warpshadow.scene import toml_tables

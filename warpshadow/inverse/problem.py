@@ -93,8 +93,8 @@ class Problem:
             with check.located(f"free[{number}]"):
                 item.check_scene(self.scene)
         for number, target in enumerate(self.targets):
-            for body in target.outlines:
-                self.scene.body_number(body, f"targets[{number}].outlines")
+            for outlined in target.outlines:
+                self.scene.body_number(outlined, f"targets[{number}].outlines")
         self.cameras()  # raises for an image of other proportions
 
     def __repr__(self) -> str:

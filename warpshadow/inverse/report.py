@@ -16,11 +16,11 @@ from warpshadow.assets.image import write_image
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
-from warpshadow.inverse.descent import Result
 from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
+from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import FLAT
 from warpshadow.pipeline.lighting import map_of

@@ -159,7 +159,7 @@ def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:
 def _share(saturation: float) -> np.ndarray:
     if not (check.is_number(saturation) and 0 < saturation <= 1):
         raise ValueError(f"saturation: got {check.described(saturation)}, expected above 0 and up to 1, such as 0.98")
-    return np.float64(saturation) - 1e-6
+    return np.asarray(saturation - 1e-6)
 
 
 class Stacked(NamedTuple):

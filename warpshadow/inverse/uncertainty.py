@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,10 +27,7 @@ from warpshadow.inverse.loss import bounded
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.variable_projection import ProjectedModel
-from warpshadow.inverse.world import Setting
-
-if TYPE_CHECKING:
-    from warpshadow.inverse.descent import Result
+from warpshadow.inverse.world import FittedScene, Setting
 
 FEW = 32
 """Numbers that a parameter has at most to be among the uncertain ones; textures are taken as they are."""
@@ -200,14 +196,13 @@ class NormalMatrix:
         leaves = {
             name: {key: t.clone().requires_grad_() for key, t in own.items()} for name, own in self.values.items()
         }
-        terms = [
-            free.regularizer(leaves[free.name], self.setting)
-            for free in self.problem.free
-            if isinstance(free, (Pose, OutlineOffset))
-        ]
-        terms = [term for term in terms if term is not None]
-        if terms:
-            torch.stack(terms).sum().backward()
+        total = torch.zeros(())
+        for free in self.problem.free:
+            if isinstance(free, (Pose, OutlineOffset)):
+                term = free.regularizer(leaves[free.name], self.setting)
+                total = total if term is None else total + term
+        if total.requires_grad:
+            total.backward()
         slopes = []
         for name, key, number in self.places:
             gradient = leaves[name][key].grad
@@ -222,16 +217,23 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
     return np.add.reduceat(rows, np.arange(0, sums.shape[2], _TILE), axis=2).reshape(-1, sums.shape[-1])
 
 
-def uncertainty(result: Result) -> Uncertainty | None:
-    """How well a fit knows its few parameters; None where it has none."""
-    if not _places(result.values):
+def uncertainty(
+    problem: Problem, setting: Setting, values: Mapping[str, Values], fitted: FittedScene
+) -> Uncertainty | None:
+    """How well a fit knows its few parameters; None where it has none.
+
+    Args:
+        problem, setting, values: Of the result.
+        fitted: The scene that was found.
+    """
+    if not _places(values):
         return None
-    normal = NormalMatrix(result.problem, result.setting, result.values)
+    normal = NormalMatrix(problem, setting, values)
     inverse = np.linalg.inv(normal.form)
     covariance = inverse @ normal.middle @ inverse
     poses = {
-        free.called(result.found): _pose_uncertainty(free, normal, covariance)
-        for free in result.problem.free
+        free.called(fitted): _pose_uncertainty(free, normal, covariance)
+        for free in problem.free
         if isinstance(free, Pose)
     }
     names = [f"{name}.{key}[{number}]" for name, key, number in normal.places]
@@ -259,16 +261,16 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
     cov = both @ covariance[np.ix_(rows, rows)] @ both.T
     units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
     sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
-    least = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
+    weakest = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
     view = middle.double().numpy(force=True) - setting.cameras[0].eye
-    length = float(np.linalg.norm(least[:3]))
-    along = abs(float(least[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
+    length = float(np.linalg.norm(weakest[:3]))
+    view_share = abs(float(weakest[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
     return PoseUncertainty(
         np.sqrt(np.diag(cov)[:3]),
         float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))),
-        least[:3],
-        float(np.degrees(np.linalg.norm(least[3:]) / half)),
-        along,
+        weakest[:3],
+        float(np.degrees(np.linalg.norm(weakest[3:]) / half)),
+        view_share,
         2 * half,
     )
 
@@ -279,7 +281,7 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
     """
     normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.places) if name.startswith(f"{Pose.key}[")]
-    beside: list[dict[str, Values]] = []
+    starts: list[dict[str, Values]] = []
     if poses:
         spread = np.linalg.inv(normal.form)[np.ix_(poses, poses)]
         direction = np.linalg.eigh(spread)[1][:, -1]
@@ -289,8 +291,8 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
         for index, part in zip(poses, direction if poses else (), strict=True):
             name, key, place = normal.places[index]
             moved[name][key].view(-1)[place] += step * float(part)
-        beside.append(moved)
-    return beside
+        starts.append(moved)
+    return starts
 
 
 def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:

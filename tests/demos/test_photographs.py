@@ -1,0 +1,30 @@
+"""The photographs whose truth is known: what lies beside their script is what it says."""
+
+import numpy as np
+import pytest
+
+import warpshadow as ws
+from demos.examples.photographs.cases import BODY, CASES, alone
+from demos.examples.photographs.table import lamp_error, problem
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_painted_outlines_are_those_of_the_truth_to_a_pixel_or_so(case):
+    target, truth = case.target(), case.truth()
+    assert abs(truth.bodies[0].world_mesh().bounds[0][1]) < 1e-5  # it stands on the table
+    body = ws.render(alone(truth, 0))[..., 3] > 0.5
+    painted = target.outlines[BODY] > 0.5
+    assert (body & painted).sum() / (body | painted).sum() > 0.93
+    assert (painted != body).any()
+    assert case.target(1).outlines[BODY].sum() > target.outlines[BODY].sum() > case.target(-1).outlines[BODY].sum()
+    assert 0.3 < (target.mask > 0).mean() < 0.95
+
+
+def test_starts_are_away_and_light_is_measured_from_the_lamp():
+    case = CASES[0]
+    start = problem(case, 0).scene.bodies[0]
+    assert np.linalg.norm(np.array(start.translation) - case.truth().bodies[0].translation) > 0.05
+    cells = ws.fibonacci(256)
+    lamp = np.array(case.lamp) - (0, 0.5, 0)
+    radiance = np.where((cells @ lamp / np.linalg.norm(lamp))[:, None] > 0.97, 5.0, 0.1) * np.ones(3)
+    assert lamp_error(case, ws.CellBasis(cells).to_map(radiance)) < 5
