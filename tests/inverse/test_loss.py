@@ -11,7 +11,7 @@ from warpshadow.inverse.model import LightModel
 from warpshadow.inverse.target import stacked
 
 KINDS = [Loss(), Loss("l1"), Loss("huber"), Loss("geman-mcclure", 0.3)]
-KINDS += [Loss("barron", 0.3, alpha) for alpha in (2.0, 1.0, 0.0, -2.0, -7.5)]
+KINDS += [Loss("barron", 0.3, alpha=alpha) for alpha in (2.0, 1.0, 0.0, -2.0, -7.5)]
 CPU = torch.device("cpu")
 
 
@@ -31,8 +31,8 @@ def test_reweighted_squares_have_the_gradient_of_the_loss(loss):
 def test_barrons_loss_has_its_special_cases():
     got, target, weights = images(0), images(1)[..., :3], torch.ones(1, 3, 5, dtype=torch.float64)
 
-    def cost(*options) -> float:
-        return float(Loss(*options)(got, target, weights, 1.0))
+    def cost(kind: str, delta: float = 0.1, alpha: float = -2.0) -> float:
+        return float(Loss(kind, delta, alpha=alpha)(got, target, weights, 1.0))
 
     assert cost("barron", 0.3, 2.0) == pytest.approx(cost("l2"))
     assert cost("barron", 0.3, -2.0) == pytest.approx(cost("geman-mcclure", 0.6))

@@ -23,16 +23,16 @@ class Loss:
             together, so that an occluder or a highlight hardly counts: "geman-mcclure", x² / (1 + x² / delta²); and
             "barron", the general robust loss of ``alpha`` [Barron 2019], x² near 0 like the others.
         delta: Where "huber" changes over, and the scale of redescending ones [root mean squares of the target].
+        coverage: Weight of the coverage, for targets that have it, and of outlines.
+        reduction: "mean" over pixels, or "sum", for plain gradient descent on parameters of single pixels.
         alpha: Shape of "barron": 2 is "l2", 1 about "huber", 0 Cauchy's, -2 Geman and McClure's (of twice the delta).
-        coverage: Weight of the coverage, for targets that have it. reduction: "mean" over pixels, or "sum", for plain
-            gradient descent on parameters of single pixels.
     """
 
     kind: str = "l2"
     delta: float = 0.1
-    alpha: float = -2.0
     coverage: float = 1.0
     reduction: str = "mean"
+    alpha: float = -2.0
 
     def __post_init__(self) -> None:
         check.choice("kind", self.kind, KINDS)
