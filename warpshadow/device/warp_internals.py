@@ -7,6 +7,7 @@ have passed it.
 import contextlib
 import ctypes
 import functools
+import inspect
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -53,6 +54,15 @@ def own_tape(tape: wp.Tape | None) -> Iterator[None]:
     finally:
         own.pop()
 
+
+if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose compiler decides on its own
+    _func = wp.func
+
+    @functools.wraps(_func)
+    def _decide_on_its_own(*arguments: Any, inline: bool | None = None, **options: Any) -> Any:
+        return _func(*arguments, **options)
+
+    wp.func = _decide_on_its_own
 
 _types = wp._src.types
 
