@@ -51,7 +51,8 @@ Up = Annotated[
 ]
 
 Size = Annotated[
-    Optional[tuple[int, int]], typer.Option(help="Of a mesh: width and height of the image, in pixels: 256 256.")
+    Optional[tuple[int, int]],
+    typer.Option(help="Of a mesh: width and height of the image, in pixels; without it 512 512."),
 ]
 
 Light = Annotated[

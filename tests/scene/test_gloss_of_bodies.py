@@ -21,7 +21,7 @@ def test_a_body_without_roughness_is_diffuse():
         ({"roughness": 1.2}, "roughness: got 1 values out of range"),
         ({"roughness": "matte"}, "roughness: got 'matte', expected a number from 0 to 1"),
         ({"roughness": np.zeros(7)}, r"roughness: got shape \(7,\), expected \[42\]"),
-        ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected both"),
+        ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected roughness, too"),
         ({"roughness": 0.5, "receivers": "vertex"}, "receivers: got 'vertex' beside roughness"),
     ],
 )

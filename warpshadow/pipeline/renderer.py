@@ -775,16 +775,17 @@ class SceneRenderer:
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """Cameras whose images are a batch, checked."""
+    """Cameras whose images are a batch, checked; all get the nearest of their near planes."""
     check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
     if not cameras:
         raise ValueError("cameras: got none, expected at least one, or None for the scene's")
     first = cameras[0]
     for number, camera in enumerate(cameras):
         check.instance(f"cameras[{number}]", camera, Camera, "a Camera")
-        if (camera.width, camera.height, camera.near) != (first.width, first.height, first.near):
+        if (camera.width, camera.height) != (first.width, first.height):
             raise ValueError(
-                f"cameras[{number}]: got {camera.width} × {camera.height} pixels and near = {camera.near}, "
-                f"expected {first.width} × {first.height} and {first.near}, as the first has"
+                f"cameras[{number}]: got {camera.width} × {camera.height} pixels, "
+                f"expected {first.width} × {first.height}, as the first has"
             )
-    return tuple(cameras)
+    near = min(camera.near for camera in cameras)
+    return tuple(camera if camera.near == near else replace(camera, near=near) for camera in cameras)

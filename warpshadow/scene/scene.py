@@ -196,7 +196,7 @@ class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
 
     A point p of the mesh is at R(s p) + t. The world is right-handed with y up; a rotation turns about the origin of
-    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse. Colors are linear RGB:
+    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine (``roughness``). Colors are linear RGB:
     ``srgb_to_linear`` converts those that color pickers show.
 
     A path, relative to the current folder, stands for its file, as in scene files.
@@ -238,7 +238,8 @@ class Body:
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
             shines by a GGX lobe of width α = roughness². None, the default, is a diffuse surface. Below 0.1 it is shown
-            as 0.1. Such a body has receivers at pixels; all methods but "log-sh" show it.
+            as 0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
+            where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
     """
@@ -389,7 +390,7 @@ class Body:
             if value is None:
                 continue
             if self.roughness is None:
-                raise ValueError(f"{name}: got {check.described(value)} without roughness, expected both, or neither")
+                raise ValueError(f"{name}: got {check.described(value)} without roughness, expected roughness, too")
             numbers = np.atleast_1d(check.numbers(name, value, expected=expected))
             check.shape(name, numbers.shape, (1 if numbers.shape == (1,) else self.mesh.vertex_count,), expected)
             check.finite(name, numbers, minimum=0.0, maximum=1.0)
