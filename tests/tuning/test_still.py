@@ -89,6 +89,20 @@ def test_a_still_is_that_of_all_rays_at_all_receivers(monkeypatch):
     assert 0 < error(image, ws.render(scene(64))) < 0.005
 
 
+def test_a_still_does_not_add_up_light_that_is_not_traced_yet(monkeypatch):
+    empty = wp.empty
+
+    def huge(*args, **kwargs):
+        array = empty(*args, **kwargs)
+        if array.dtype == wp.vec3:
+            array.fill_(3e38)
+        return array
+
+    monkeypatch.setattr(wp, "empty", huge)
+    with np.errstate(over="raise"):
+        assert np.isfinite(ws.render(scene(size=256))).all()
+
+
 def test_directions_go_where_receivers_see_light():
     lid = ws.plane(2.0, segments=1)
     lid = np.concatenate([lid.positions[lid.faces] + [x, 0.5, 0] for x in (-1.2, 1.2)]).reshape(-1, 3)

@@ -233,8 +233,10 @@ def trace_shared(
     if len(names):
         rows = np.full(corners.receivers.shape, -1)
         rows[has_corners] = slots.reshape(-1, 4)
-        light = np.abs(tracing.shading.numpy()).sum(axis=1)[corners.receivers]
-        tracing.take_over(known, rows, corners.weights, TOLERANCE * np.pi * (light * corners.weights).sum(axis=1))
+        light = np.zeros(len(points), np.float32)  # of corners; the others are not traced yet
+        light[names] = np.abs(tracing.shading.numpy()[names]).sum(axis=1)
+        light = (light[corners.receivers] * corners.weights).sum(axis=1)
+        tracing.take_over(known, rows, corners.weights, TOLERANCE * np.pi * light)
     others = np.flatnonzero(~is_corner)
     for part in parts(len(others), size, progress):
         tracing.trace(others[part])
