@@ -417,6 +417,15 @@ def test_an_stl_is_merged_but_at_sharp_edges(tmp_path):
     np.testing.assert_array_equal(other.faces, mesh.faces)
 
 
+def test_an_stl_without_many_sharp_edges_is_as_smooth_as_the_obj(tmp_path):
+    """A rough ball: its edges bend by all angles up to 92°."""
+    ball = icosphere(subdivisions=2)
+    rough = ball.positions * np.random.default_rng(0).uniform(0.85, 1.15, (ball.vertex_count, 1))
+    stl, obj = (load_mesh(export(tmp_path, name, vertices=rough, faces=ball.faces)) for name in ("a.stl", "a.obj"))
+    assert stl.vertex_count == obj.vertex_count == ball.vertex_count
+    np.testing.assert_allclose(stl.positions[stl.faces], obj.positions[obj.faces], atol=1e-6)
+
+
 PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
 PENTAGON = "0 0 0\n1 0 0\n2 1 0\n1 2 0\n0 1 0\n"
 

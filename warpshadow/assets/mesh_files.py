@@ -14,7 +14,7 @@ from warpshadow import check
 from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
-from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases
+from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -55,7 +55,8 @@ def load_mesh(path: MeshSource) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file, or trimesh's objects, as one mesh.
 
     Vertices keep the file's order and none is merged or dropped; but STL, where each face has three vertices of its
-    own, is welded where edges bend by 30° or less. Faces that are listed twice are dropped. Polygons become fans of
+    own, is welded, except that edges which bend by more than 30° stay parted where the mesh has many sharp ones (its
+    ``rounds_edges`` would be true), as boxes have. Faces that are listed twice are dropped. Polygons become fans of
     triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
     faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same
     normal where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does
@@ -411,16 +412,20 @@ _PLY_BYTES = {b"char": 1, b"uchar": 1, b"short": 2, b"ushort": 2, b"int": 4, b"u
 def _merged(part: MeshPart) -> MeshPart:
     """Weld vertices of the same place and color, where every face has three of its own.
 
-    Edges that are sharp keep two.
+    Sharp edges keep two where they are many, as of boxes. Where angles of all sizes occur, normals round them, as those
+    of the same mesh in other files without normals.
     """
     vertex_attributes = [] if part.colors is None else [part.colors]
     is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
     remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
     used, faces = np.unique(_weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
     positions, faces = part.positions[used], faces.reshape(-1, 3)
-    faces, origins = part_at_creases(faces, join_faces(positions, faces, None), positions, CREASE)
-    colors = None if part.colors is None else part.colors[used][origins]
-    return part._replace(positions=positions[origins], faces=faces, colors=colors, remark=remark)
+    colors = None if part.colors is None else part.colors[used]
+    surface = join_faces(positions, faces, None)
+    if rounds_edges(surface, positions):
+        faces, origins = part_at_creases(faces, surface, positions, CREASE)
+        positions, colors = positions[origins], None if colors is None else colors[origins]
+    return part._replace(positions=positions, faces=faces, colors=colors, remark=remark)
 
 
 def _gltf_tree(path: Path) -> dict:
