@@ -241,6 +241,19 @@ def test_a_turntable_goes_around_at_one_exposure(scene, tmp_path):
     assert frames.shape == (4, 12, 16, 3) and np.abs(frames[1] - frames[0]).mean() > 3
 
 
+@pytest.mark.parametrize("options", [(), ("--stills",)])
+def test_frames_of_a_video_are_stills_where_that_is_asked_for(scene, tmp_path, monkeypatch, options):
+    scene.write_text(SCENE.replace("directions = 32\n", ""))
+    frames = []
+    monkeypatch.setattr("warpshadow.cli.write_video", lambda path, pictures, fps: frames.extend(pictures))
+    assert run("render", scene, "-o", tmp_path / "turn.gif", "--turntable", 4, *options).exit_code == 0
+    loaded = ws.load_scene(scene)
+    assert loaded.visibility.method is None
+    camera = loaded.camera.around(loaded, 4)[1]
+    still = ws.Picture(ws.render(dataclasses.replace(loaded, camera=camera)), exposure=frames[0].exposure)
+    assert np.array_equal(frames[1].pixels, still.pixels) == bool(options)
+
+
 def test_a_camera_path_is_a_video_through_its_keyframes(scene, tmp_path):
     from PIL import Image, ImageSequence
 
@@ -283,6 +296,7 @@ def test_render_also_writes_layers(scene, tmp_path):
         ("turn.gif", ("--turntable", 4, "--layers"), "--layers: got it beside --turntable"),
         ("turn.gif", ("--camera-path", "no.toml"), "no.toml: no such camera path"),
         ("turn.gif", ("--turntable", 4, "--fps", 60), "fps: got 60.0, expected 0.1 to 50 for .gif"),
+        ("turn.exr", ("--stills",), "--stills: got it for an image, expected --turntable FRAMES or --camera-path FILE"),
         ("turn.exr", ("--fps", 12), "--fps: got 12 without --turntable, expected --turntable FRAMES with it"),
     ],
 )

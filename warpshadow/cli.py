@@ -183,6 +183,14 @@ def render(
             help="Write a video along the keyframes of a TOML file, whose keys warpshadow/scene/README.md lists."
         ),
     ] = None,
+    stills: Annotated[
+        bool,
+        typer.Option(
+            "--stills",
+            help="Render each frame of a video as an image alone: by rays, if the scene names no method. Shadows are "
+            "better, and nothing is prepared, but each frame takes two to three times as long.",
+        ),
+    ] = False,
     layers: Annotated[
         bool,
         typer.Option(
@@ -225,6 +233,8 @@ def render(
         video = "--turntable" if turntable is not None else "--camera-path" if camera_path is not None else None
         path = None if camera_path is None else CameraPath.read(camera_path)
         if video is None:
+            if stills:
+                raise ValueError("--stills: got it for an image, expected --turntable FRAMES or --camera-path FILE")
             is_video = output.suffix.lower() in VIDEO_SUFFIXES
             remedy = "; videos take --turntable FRAMES or --camera-path FILE" if is_video else ""
             _check_output(output, ".exr", *SUFFIXES, instead=remedy)
@@ -257,7 +267,7 @@ def render(
         if parsed.visibility.method == AUTO:
             loaded = resolved(parsed, device=where, progress=True)
             _note(f"auto: {describe(loaded)}", is_quiet)
-        loaded = for_picture(loaded if video is None else loaded.with_method())
+        loaded = for_picture(loaded if video is None or stills else loaded.with_method())
         start = time.perf_counter()
         if video is not None:
             cameras = path.cameras(loaded.camera) if path is not None else loaded.camera.around(loaded, turntable or 1)
