@@ -380,27 +380,27 @@ def _stl_fault(content: bytes) -> str:
 
 
 def _ply_fault(content: bytes) -> str:
-    """What a PLY file lacks that is cut off, for messages; "" where its items may all be there."""
+    """Where a PLY file is cut off, for messages; "" if its items may all be there."""
     header, mark, body = content.partition(b"end_header")
     if not mark:
         return "its header has no end" if header.startswith(b"ply") else ""
-    count, needed, wanted = 0, 0, []
+    count, needed, elements = 0, 0, []
     is_ascii = b"format ascii" in header
     for words in map(bytes.split, header.splitlines()):
         if words[:1] == [b"element"]:
             count = int(words[2])
-            wanted.append(f"{count} of {words[1].decode(errors='replace')}")
+            elements.append(f"{count} of {words[1].decode(errors='replace')}")
             needed += is_ascii * count
         elif words[:1] == [b"property"] and not is_ascii:
             has_list = words[1] == b"list"
-            least = 3 if has_list and words[-1] in (b"vertex_indices", b"vertex_index") else 0
+            entries = 3 if has_list and words[-1] in (b"vertex_indices", b"vertex_index") else 0
             sizes = [_PLY_BYTES.get(word, 0) for word in words[2:4]] if has_list else [0, 0]
-            needed += count * (sizes[0] + least * sizes[1] if has_list else _PLY_BYTES.get(words[1], 0))
+            needed += count * (sizes[0] + entries * sizes[1] if has_list else _PLY_BYTES.get(words[1], 0))
     lines = [line for line in body.splitlines() if line.strip()] if is_ascii else []
     got, unit = (len(lines), "lines") if is_ascii else (len(body.split(b"\n", 1)[-1]), "bytes")
     if got >= needed:
         return ""
-    return f"got {got} {unit} after its header, which says {', '.join(wanted)}, at least {needed} {unit}"
+    return f"got {got} {unit} after its header, which says {', '.join(elements)}, at entries {needed} {unit}"
 
 
 _PLY_BYTES = {b"char": 1, b"uchar": 1, b"short": 2, b"ushort": 2, b"int": 4, b"uint": 4, b"float": 4, b"double": 8} | {

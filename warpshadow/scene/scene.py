@@ -196,8 +196,8 @@ class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
 
     A point p of the mesh is at R(s p) + t. The world is right-handed with y up; a rotation turns about the origin of
-    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine (``roughness``). Colors are linear RGB:
-    ``srgb_to_linear`` converts those that color pickers show.
+    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine
+    (``roughness``). Colors are linear RGB: ``srgb_to_linear`` converts those that color pickers show.
 
     A path, relative to the current folder, stands for its file, as in scene files.
 

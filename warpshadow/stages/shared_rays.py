@@ -93,7 +93,7 @@ def _make_trace() -> wp.Kernel:
         known: wp.array2d(dtype=wp.int32),
         # out
         shading: wp.array(dtype=wp.vec3),
-        found: wp.array2d(dtype=wp.int32),
+        open_lanes: wp.array2d(dtype=wp.int32),
         received: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a chosen receiver: it traces the rays that its corners leave open.
@@ -151,8 +151,8 @@ def _make_trace() -> wp.Kernel:
                         if (open_rays >> lane) % 2 == 1:
                             brightness = wp.length(wp.vec3(color.x[lane], color.y[lane], color.z[lane]))
                             received[receiver, packet, lane] = cosine[lane] * brightness
-            if found.shape[0] > 0:
-                found[row, packet] = open_rays | ((facing_rays & ~open_rays) << PACKET)
+            if open_lanes.shape[0] > 0:
+                open_lanes[row, packet] = open_rays | ((facing_rays & ~open_rays) << PACKET)
         shading[receiver] = total / wp.pi
 
     return trace_shared
@@ -226,7 +226,7 @@ def trace_shared(
     names, slots = np.unique(corners.receivers[has_corners], return_inverse=True)
     known = wp.empty((len(names), tracing.packet_count), dtype=wp.int32, device=points.device)
     for part in parts(len(names), size, progress):
-        tracing.trace(names[part], found=known[part])
+        tracing.trace(names[part], open_lanes=known[part])
     is_corner = np.zeros(len(has_corners), bool)
     is_corner[names] = True
     assert not (is_corner & has_corners).any()
@@ -305,18 +305,18 @@ class _Tracing:
         self._corners = *(wp.array(values, dtype=dtype, device=known.device) for values, dtype in dtypes), known
 
     def trace(
-        self, chosen: np.ndarray | None = None, *, found: wp.array | None = None, received: wp.array | None = None
+        self, chosen: np.ndarray | None = None, *, open_lanes: wp.array | None = None, received: wp.array | None = None
     ) -> None:
         """Trace chosen receivers, or all, into :attr:`shading`."""
         device = self.shading.device
         count = len(self.shading) if chosen is None else len(chosen)
         numbers = None if chosen is None else wp.array(chosen, dtype=wp.int32, device=device)
-        found = wp.empty((0, 0), dtype=wp.int32, device=device) if found is None else found
+        open_lanes = wp.empty((0, 0), dtype=wp.int32, device=device) if open_lanes is None else open_lanes
         received = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if received is None else received
         launch(
             _make_trace(),
             count,
             inputs=[*self._inputs, numbers, *self._corners],
-            outputs=[self.shading, found, received],
+            outputs=[self.shading, open_lanes, received],
             cost=_PACKET_COST * self.packet_count,
         )

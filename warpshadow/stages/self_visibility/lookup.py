@@ -107,11 +107,11 @@ class KernelArrays:
 @wp.func
 def _look_from(kernels: KernelArrays, rotation: wp.mat33, direction: int):
     """Find d·|Rᵀω|, d, cos h, and the directions among which a cell looks."""
-    along = wp.transpose(rotation) * kernels.directions[direction]
+    turned = wp.transpose(rotation) * kernels.directions[direction]
     candidates = kernels.cells
     if kernels.looks_at_rays[direction] == 1:
         candidates = kernels.rays
-    return along, wp.normalize(along), kernels.reaches[direction], candidates
+    return turned, wp.normalize(turned), kernels.reaches[direction], candidates
 
 
 @wp.func
@@ -136,7 +136,7 @@ def _find_lookups(
     """A thread owns a cell of directions of an instance."""
     row, direction = wp.tid()
     batch = first_row + row
-    _along, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
+    _turned, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
     count = int(0)
     total = float(0.0)
     for candidate in range(candidates.shape[0]):
@@ -174,7 +174,7 @@ def _find_lookups_adjoint(
     v̄ = (d̄ − d d·d̄) / |v|,  R̄ += ω v̄ᵀ
     """
     batch, direction = wp.tid()
-    along, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
+    turned, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
     total = float(0.0)
     mean = float(0.0)
     for k in range(counts[batch, direction]):
@@ -186,8 +186,8 @@ def _find_lookups_adjoint(
         candidate = candidates[indices[batch, direction, k]]
         height = _height(wp.dot(candidate, toward), reach)
         adj_toward += 2.0 * height * (adj_weights[batch, direction, k] - mean) / total / (1.0 - reach) * candidate
-    adj_along = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(along)
-    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_along))
+    adj_turned = (adj_toward - wp.dot(adj_toward, toward) * toward) / wp.length(turned)
+    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_turned))
 
 
 def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingKernels) -> ResamplingWeights:

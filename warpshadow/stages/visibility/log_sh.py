@@ -265,8 +265,8 @@ def accumulate(
     lanes = lane_count(device)
     batch_count, vertex_count = points.shape
     row_count = batch_count * block_count(vertex_count, lanes)
-    nodes, given = make_inputs(points, normals, centers, radii, merging, cell_radius(order**2), skip, clusters)
-    inputs = [given, zonal_table(order, log, str(device))]
+    nodes, traversed = make_inputs(points, normals, centers, radii, merging, cell_radius(order**2), skip, clusters)
+    inputs = [traversed, zonal_table(order, log, str(device))]
     scratch = [Scratch((order**2,), lane_type(lanes))]
     cost = _PAIR_COST * lanes * radii.shape[1] * order**2
     return differentiable(
