@@ -72,3 +72,54 @@ def test_bodies_that_are_not_all_convex_have_no_parts():
     assert parts_of(trimesh.creation.cylinder(1, 1, sections=MOST_FACES - 1)) is None
     assert len(parts_of(trimesh.creation.cylinder(1, 1, sections=MOST_FACES - 2))) == 1
     assert find_convex_parts(np.zeros((3, 3)), np.array([[0, 1, 2]])) is None
+
+
+def extruded(outline):
+    """The solid of unit height over a convex outline, counterclockwise, [corner, 2]."""
+    count = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.zeros(count)], np.c_[outline, np.ones(count)]])
+    fan = np.c_[np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)]
+    here, there = np.arange(count), np.roll(np.arange(count), -1)
+    sides = np.concatenate([np.c_[here, there, there + count], np.c_[here, there + count, here + count]])
+    return vertices, np.concatenate([fan[:, ::-1], fan + count, sides])
+
+
+@pytest.mark.parametrize("facets", [223, 240, 256])
+def test_facets_that_bend_little_each_are_no_face_together(facets):
+    """Each bends by less than 0.81°; as one face, the arc would be a plate."""
+    angles = np.linspace(0, np.pi, facets + 1)
+    assert find_convex_parts(*extruded(np.stack([np.cos(angles), np.sin(angles)], axis=1))) is None
+
+
+@pytest.mark.parametrize(("height", "count"), [(5e-5, 6), (2e-3, None)])
+def test_a_ridge_within_a_face_is_no_higher_than_the_tolerance(height, count):
+    parts = find_convex_parts(*extruded(np.array([[0, 0], [1, 0], [1, 1], [0.5, 1 + height], [0, 1]])))
+    assert (parts and len(parts[0].faces)) == count
+
+
+def roof(ridge, top, slope):
+    """A block with a roof of two slopes: points of the ridge, and triangles of them and the eaves, the last four."""
+    base, four = [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.full(4, 1.0)
+    vertices = np.concatenate([ridge, np.c_[base, -slope * four], np.c_[base, -four]])
+    upper = len(ridge) + np.arange(4)
+    lower, following = upper + 4, np.roll(upper, -1)
+    sides = np.concatenate([np.c_[lower, following + 4, following], np.c_[lower, following, upper]])
+    bottom = [lower[[0, 2, 1]], lower[[0, 3, 2]]]
+    return vertices, np.concatenate([sides, bottom, top])
+
+
+@pytest.mark.parametrize(("aside", "is_convex"), [(0.0, True), (0.008, False)])
+def test_edges_of_a_part_are_straight(aside, is_convex):
+    """Both slopes are flat within the tolerance, but the ridge between them is straight only where it does not bend."""
+    top = [(0, 4, 1), (4, 5, 1), (1, 5, 2), (0, 1, 3), (3, 1, 6), (1, 2, 6), (3, 4, 0), (2, 5, 6)]
+    parts = find_convex_parts(*roof(np.array([[0, -1, 0], [aside, 0, 0], [0, 1, 0]]), top, 0.01))
+    assert (parts is not None) == is_convex
+
+
+def test_faces_that_share_two_edges_are_of_no_part():
+    """A face as wide as a hair lies on the middle of the ridge."""
+    ridge = np.array([[0, -1, 0], [0, -0.3, 0], [5e-4, 0, -2.5e-5], [-5e-4, 0, -2.5e-5], [0, 0.3, 0], [0, 1, 0]])
+    right = [(0, 7, 1), (1, 7, 2), (7, 8, 2), (2, 8, 4), (4, 8, 5)]
+    left = [(0, 1, 6), (1, 3, 6), (3, 9, 6), (3, 4, 9), (4, 5, 9)]
+    top = [*right, *left, (1, 2, 3), (2, 4, 3), (6, 7, 0), (5, 8, 9)]
+    assert find_convex_parts(*roof(ridge, top, 0.05)) is None

@@ -13,7 +13,8 @@ _MOST_TRIANGLES = 16 * MOST_FACES
 """Triangles of a part at most: its faces may be divided."""
 
 _FLATNESS = 1e-4
-"""Relative height up to which neighboring triangles lie in one face, and corners in its plane."""
+"""Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
+1 − cos α of the angle between neighboring triangles up to which they are of one face."""
 
 
 class ConvexPart(NamedTuple):
@@ -35,8 +36,8 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
-        The parts, which may touch and overlap; None where a piece of the mesh is open or hollow, or has more than 64
-        faces.
+        The parts, which may touch and overlap; None where a piece of the mesh is open, hollow or curved, or has more
+        than 64 faces.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -102,18 +103,29 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     if face_count > MOST_FACES:
         return None
     largest = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
+    from_plane = points[triangles] - points[triangles[largest, 0]][face][:, None]
+    if np.abs(from_plane @ units[largest][face][..., None]).max() > _FLATNESS * size:
+        return None  # small bends add up to a curve
     runs: dict[tuple[int, int], list[list[int]]] = {}
     for (a, b), f, g in zip(edges.tolist(), face[left].tolist(), face[right].tolist(), strict=True):
         if f < g:
             runs.setdefault((f, g), []).append([a, b])
     straight = []
     for (f, g), run in runs.items():  # pieces of a straight edge follow each other
-        (starts, ends) = map(set, zip(*run, strict=True))
-        (begin,), (end,) = (starts - ends) or {None}, (ends - starts) or {None}
-        if begin is None or end is None:
+        starts, ends = map(set, zip(*run, strict=True))
+        if len(starts - ends) != 1 or len(ends - starts) != 1:
+            return None
+        (begin,), (end,) = starts - ends, ends - starts
+        if _bulge(points[[*starts | ends]], points[begin], points[end]) > _FLATNESS * size:
             return None
         straight.append([begin, end, f, g])
     return ConvexPart(used, np.searchsorted(used, triangles[largest]), _renumbered(np.array(straight), used))
+
+
+def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
+    """Largest distance of points from a line."""
+    along = (end - begin) / np.linalg.norm(end - begin)
+    return float(np.linalg.norm(np.cross(points - begin, along), axis=1).max())
 
 
 def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
