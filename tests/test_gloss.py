@@ -64,6 +64,16 @@ def test_a_diffuse_scene_makes_the_same_launches_and_bits_beside_no_gloss():
     assert "gloss" not in str(renderer.explain()) and "lobes" not in str(renderer.explain())
 
 
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_an_explanation_changes_no_later_call(bounces):
+    other, renderer = ws.EnvironmentMap.constant(), ws.Renderer(scene_of(bounces=bounces))
+    image, before = renderer.render(), str(renderer.explain())
+    assert str(renderer.explain(light=other)) != before
+    assert str(renderer.explain()) == before
+    np.testing.assert_array_equal(renderer.render(), image)
+    np.testing.assert_array_equal(renderer.render(other), ws.Renderer(scene_of(bounces=bounces)).render(other))
+
+
 def test_a_rough_dielectric_without_specular_is_diffuse():
     """All that differs is that its receivers are pixels."""
     plain = dataclasses.replace(BALL, roughness=None, metallic=None, receivers="pixel")

@@ -41,16 +41,17 @@ class GlossyPoints(LitPoints):
 
     def __init__(self, view: LitPoints, cameras: Input):
         glossy = view.merged_scene.is_glossy
-        self._view, self._cameras = view, cameras
+        self._all_receivers, self._cameras = view.receivers_node, cameras
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocking=view.blocking, is_static=view.is_static)
         self._numbers = Node("", functools.partial(_numbers, glossy), Fixed(view.receivers_node))
 
-    def mixed(self, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
+    def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
         """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
 
         Args:
+            view: The view, or its preview.
             diffuse: Node of the view's shading.
             light: As for :meth:`LitPoints.shading`.
             materials: Of the bodies.
@@ -71,7 +72,7 @@ class GlossyPoints(LitPoints):
         through = self.method.lobe_transmittance(self, directions, source)
         blocked = None
         if self.merged_scene.scene.bounces:
-            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, self._view, self.chosen)
+            blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, view, self.chosen)
         sums = Node("gloss", sum_lobes, weights, radiance, through, blocked, items=words)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
@@ -80,7 +81,7 @@ class GlossyPoints(LitPoints):
 
     def chosen(self, light: Node) -> Node:
         """Node of light on these receivers, given that of all receivers of the view."""
-        return Node("", _chosen, light, Fixed(self._view.receivers_node), self.merged_scene.is_glossy)
+        return Node("", _chosen, light, Fixed(self._all_receivers), self.merged_scene.is_glossy)
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""

@@ -1,5 +1,6 @@
 """Lighting: where light is evaluated, and the interface of visibility methods."""
 
+import copy
 import functools
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
@@ -28,6 +29,7 @@ Light = KnownLight | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 Cached = TypeVar("Cached")
+Points = TypeVar("Points", bound="LitPoints")
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 """Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
@@ -80,6 +82,15 @@ class LitPoints:
         if name not in self._cached or self._cached[name][0] != key:
             self._cached[name] = key, make()
         return self._cached[name][1]
+
+    def preview(self: Points) -> Points:
+        """The points with the values cached so far, which does not add its own to them."""
+        points = copy.copy(self)
+        points._cached = {
+            name: (key, value.preview() if isinstance(value, LitPoints) else value)
+            for name, (key, value) in self._cached.items()
+        }
+        return points
 
     @property
     def receivers(self) -> Receivers:

@@ -4,6 +4,7 @@ import copy
 import functools
 import operator
 from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
@@ -28,6 +29,8 @@ from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.sample import textured_radiance
+
+AnyView = TypeVar("AnyView", bound="View")
 
 MOST_SHARED = 2
 """Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
@@ -188,21 +191,21 @@ class View(LitPoints):
         materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
         if materials.gloss:
-            return self._averaged(self._glossy(lit, light, materials, reflected.samples), is_moving=self._is_moving)
-        if reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
+            samples = self._glossy(lit, light, materials, reflected.samples)
+        elif reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
             result = (Node("reflectance", None, idle="found with the radiance"),)
             reflecting = reflected.vertex_albedo, reflected.pyramids, reflected.footprints
             arguments = fragments, self.merged_scene.faces, *reflecting, self._white_radiance_of(lit)
             samples = Node("radiance", textured_radiance, *arguments, items=words, caches=False, extra_inputs=result)
         else:
             samples = self._radiance(lit, reflected.samples)
-        averaged = self._averaged(samples, is_moving=clip.requires_grad)
+        averaged = self._averaged(samples, is_moving=self._is_moving)
         return averaged
 
     def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
         points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
-        colored, white = points.mixed(lit, light, materials)
+        colored, white = points.mixed(self, lit, light, materials)
         parts = self._radiance(colored, reflected), self._radiance(white, self._white_reflectance)
         return Node("radiance", _sum_moving if self._is_moving else film.sum_radiance, *parts, caches=False)
 
@@ -322,9 +325,9 @@ class View(LitPoints):
             static = int(self.static.has_vertex.sum())
         return f"{count - static:,} vertices, {static:,} kept" if static else f"{count:,} vertices"
 
-    def preview(self) -> "View":
-        """A view for :meth:`explain`: it does not store its inputs."""
-        view = copy.copy(self)
+    def preview(self: AnyView) -> AnyView:
+        """A view for :meth:`explain`: neither does it store its inputs."""
+        view = super().preview()
         view.surfaces = copy.copy(self.surfaces)
         return view
 
