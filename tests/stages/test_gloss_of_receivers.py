@@ -62,6 +62,17 @@ def test_lobes_take_as_much_even_light_as_the_surface_reflects(device, roughness
         assert part == pytest.approx(expected, abs=ENERGY)
 
 
+@pytest.mark.parametrize("normal", [(0.36, 0.48, 0.8), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)])
+def test_lobes_that_are_seen_from_straight_above_are_as_wide_around_any_normal(device, normal):
+    normal = twins.unit(np.array(normal, float))
+    point = twins.eye_of(CAMERA) - 2 * normal
+    values = point[None, None], normal[None, None], np.array([[0.7]]), CAMERA[None]
+    directions, _, _ = lobes.sample_lobes(*arrays(device, *values))
+    got = directions.numpy()[0, 0]
+    spread = np.linalg.eigvalsh(got.T @ got / len(got))
+    assert spread[0] > 0.05 and np.abs(got @ normal - np.sort(got @ normal)[::-1]).max() < 0.1
+
+
 def test_prefiltered_light_is_blurred_by_gaussians(device):
     rng = np.random.default_rng(1)
     radiance = (rng.uniform(size=(16, 32, 3)) ** 4).repeat(4, axis=0).repeat(4, axis=1)

@@ -72,6 +72,17 @@ def _slant(x: float, width: float):
     return wp.sqrt(x * x * (1.0 - width * width) + width * width)
 
 
+@wp.func
+def _axis_across(direction: wp.vec3):
+    """The axis along which a direction has its smallest component."""
+    x, y, z = wp.abs(direction[0]), wp.abs(direction[1]), wp.abs(direction[2])
+    if x <= y and x <= z:
+        return wp.vec3(1.0, 0.0, 0.0)
+    if y <= z:
+        return wp.vec3(0.0, 1.0, 0.0)
+    return wp.vec3(0.0, 0.0, 1.0)
+
+
 @wp.kernel
 def _sample_lobes(
     first_row: int,
@@ -99,7 +110,7 @@ def _sample_lobes(
     sine = wp.sqrt(1.0 - cosine * cosine)
     across_view = view - wp.dot(normal, view) * normal
     if wp.length_sq(across_view) < 1.0e-10:
-        across_view = wp.cross(normal, wp.vec3(0.36, 0.48, 0.8))
+        across_view = wp.cross(normal, _axis_across(normal))
     tangent = wp.normalize(across_view)
     bitangent = wp.cross(normal, tangent)
     slant = _slant(cosine, width)

@@ -72,6 +72,8 @@ def trace_lobes(tree: FaceTree, points: wp.array, normals: wp.array, directions:
 
     Differentiable: no.
     """
+    if directions.shape[1] % PACKET:
+        raise ValueError(f"directions: got {directions.shape[1]} samples, expected a multiple of {PACKET}")
     transmittance = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
     launch(
         _make_trace(),
