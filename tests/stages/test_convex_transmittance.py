@@ -91,6 +91,13 @@ def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     np.testing.assert_allclose(got, expected, rtol=0, atol=RAYS)
 
 
+def test_parts_so_far_away_that_they_have_no_size_block_nothing(device):
+    """Some or all edges are under 1e-6 rad, the least that counts."""
+    distances = np.repeat(10.0 ** np.arange(4, 9, 0.25), len(DIRECTIONS))
+    points = distances[:, None] * np.tile(DIRECTIONS, (20, 1))
+    assert of_kernel(points, device).min() > 1 - 1e-4
+
+
 def test_bodies_that_cast_no_shadow_block_nothing(device):
     vertices = wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device)
     some = blockers(device, blocks=(True, False))

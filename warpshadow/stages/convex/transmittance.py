@@ -66,7 +66,7 @@ def _find_silhouette(
     part: int,
     silhouette: wp.array(dtype=wp.vec3),
 ):
-    """Store a part's silhouette; return how many edges it has, −1 for a receiver inside the part."""
+    """Store a part's silhouette; return how many edges it has, 0 for a tiny one, −1 for a receiver inside the part."""
     first_face = parts.first_face[part]
     facing = wp.uint64(0)
     for face in range(first_face, parts.first_face[part + 1]):
@@ -95,7 +95,7 @@ def _find_silhouette(
                 silhouette[_ROWS * count + 3] = wp.vec3(float(begin), float(end), length)
                 silhouette[_ROWS * count + 4] = wp.vec3()
                 count += 1
-    return count
+    return wp.where(count < 3, 0, count)  # fewer enclose nothing
 
 
 @wp.struct
@@ -141,6 +141,8 @@ def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, dire
 @wp.func
 def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float):
     """Share of a cell that a silhouette takes."""
+    if count == 0:
+        return 0.0
     limit = radius / wp.sqrt(1.0 + radius * radius)
     nearest = limit
     for e in range(count):
