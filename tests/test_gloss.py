@@ -74,6 +74,20 @@ def test_an_explanation_changes_no_later_call(bounces):
     np.testing.assert_array_equal(renderer.render(other), ws.Renderer(scene_of(bounces=bounces)).render(other))
 
 
+def test_explanations_and_photographs_take_gloss():
+    """In a photograph the ball is as rough as in a scene that says so; a call that gives it samples its lobes again."""
+    caught = dataclasses.replace(GROUND, shadow_catcher=True)
+    given = {name: {"ball": torch.tensor(value)} for name, value in (("roughness", 0.7), ("metallic", 0.1))}
+    photograph = torch.full((32, 32, 3), 0.5)
+    renderer = TorchRenderer(scene_of(BALL, caught), progress=False)
+    image, plain = renderer.insert(photograph, **given), renderer.insert(photograph)
+    rough = TorchRenderer(scene_of(dataclasses.replace(BALL, roughness=0.7, metallic=0.1), caught), progress=False)
+    torch.testing.assert_close(image, rough.insert(photograph))
+    assert (image - plain).abs().max() > 0.01
+    renderer()
+    assert not renderer.explain()["lobes"].forward and renderer.explain(**given)["lobes"].forward
+
+
 def test_a_rough_dielectric_without_specular_is_diffuse():
     """All that differs is that its receivers are pixels."""
     plain = dataclasses.replace(BALL, roughness=None, metallic=None, receivers="pixel")

@@ -548,6 +548,10 @@ class SceneRenderer:
     ) -> tuple[list[wp.array | None], list[wp.array | None]]:
         return self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
 
+    def _gloss(self, gloss: Mapping[str, PerBody[wp.array]] | None) -> dict[str, list[wp.array | None]]:
+        check.known_keys("gloss", gloss or {}, GLOSS)
+        return {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
+
     # ------------------------------------------------------------------------------------------ image
 
     @_said
@@ -575,9 +579,7 @@ class SceneRenderer:
         Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._own(view)
-        check.known_keys("gloss", gloss or {}, GLOSS)
-        shiny = {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
-        return view.image(light, *self._per_body(albedo, textures), shiny).value(self._call(view))
+        return view.image(light, *self._per_body(albedo, textures), self._gloss(gloss)).value(self._call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -600,6 +602,7 @@ class SceneRenderer:
         *,
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
+        gloss: Mapping[str, PerBody[wp.array]] | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> wp.array:
@@ -609,7 +612,7 @@ class SceneRenderer:
             photograph: Linear RGB, of radiance in the units of the light, vec3 of shape [batch, height, width].
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`; a catcher's matters where light bounces.
-            textures: As for :meth:`draw`.
+            textures, gloss: As for :meth:`draw`.
             geometry: As for :meth:`view`; but bodies that do not move have no kept rows.
             clip_matrices: As for :meth:`view`. Batches of 1 serve every instance of the others.
         Returns:
@@ -624,7 +627,7 @@ class SceneRenderer:
             )
         check.shape("photograph", photograph.shape, ("batch", *self._size))
         check.finite_arrays({"photograph": photograph})
-        return self._in_photograph(photograph, light, albedo, textures, geometry, clip_matrices)
+        return self._in_photograph(photograph, light, albedo, textures, gloss, geometry, clip_matrices)
 
     @one_at_a_time
     def _in_photograph(
@@ -633,6 +636,7 @@ class SceneRenderer:
         light: Light | None = None,
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
+        gloss: Mapping[str, PerBody[wp.array]] | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
     ) -> wp.array:
@@ -654,7 +658,9 @@ class SceneRenderer:
         received = seen.white(light, *reflecting).value(without._call(seen))
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, Input("light without the others", received)
-        return view.in_photograph(*arguments, self._catches, light, colors, images).value(self._call(view))
+        return view.in_photograph(*arguments, self._catches, light, colors, images, self._gloss(gloss)).value(
+            self._call(view)
+        )
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -738,6 +744,7 @@ class SceneRenderer:
         *,
         albedo: PerBody[wp.array] | None = None,
         textures: PerBody[wp.array] | None = None,
+        gloss: Mapping[str, PerBody[wp.array]] | None = None,
         view: View | None = None,
         geometry: Geometry[wp.array] | None = None,
         clip_matrices: wp.array | None = None,
@@ -747,7 +754,7 @@ class SceneRenderer:
         Args:
             light: As for :meth:`draw`.
             albedo: As for :meth:`draw`.
-            textures: As for :meth:`draw`.
+            textures, gloss: As for :meth:`draw`.
             view: As for :meth:`draw`: then only the stages after it are explained.
             geometry: As for :meth:`view`, which is explained with it.
             clip_matrices: As for :meth:`view`.
@@ -761,7 +768,7 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, *self._per_body(albedo, textures))
+        image = view.preview().image(light, *self._per_body(albedo, textures), self._gloss(gloss))
         is_host = self.device.is_cpu or self.clock.waits
         notes = receiver_notes(self._given_scene, self._choices)
         if self.scene.bounces:

@@ -227,6 +227,7 @@ class View(LitPoints):
         light: Light | None = None,
         albedo: Given = None,
         textures: Given = None,
+        gloss: Mapping[str, Given] | None = None,
     ) -> Node:
         """The image in a photograph that the catchers model: linear RGB, vec3 of shape [batch, height, width].
 
@@ -234,9 +235,9 @@ class View(LitPoints):
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
             unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
-            light, albedo, textures: As for :meth:`image`.
+            light, albedo, textures, gloss: As for :meth:`image`.
         """
-        materials = self.materials.replaced(albedo, textures)
+        materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
 
         def divide(fragments: Fragments, *arguments: wp.array) -> RatioImage:

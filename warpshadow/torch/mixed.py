@@ -86,7 +86,7 @@ class MixedRenderer(torch.nn.Module):
         geometry: Sequence[Geometry[torch.Tensor] | None] | None = None,
         clip_matrices: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Render a batch of images.
+        """Render a batch of images, in which bodies shine as their scenes say.
 
         Args:
             which: Scene of each image, from 0, whole numbers of shape [batch]. The host reads them: best on a CPU.

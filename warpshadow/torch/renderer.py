@@ -15,7 +15,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.merged_scene import GEOMETRY_DTYPES, Geometry
-from warpshadow.scene.scene import BodyLike, PerBody, Scene
+from warpshadow.scene.scene import GLOSS, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
@@ -169,16 +169,12 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        stored = self._given(light, albedo, textures, geometry, clip_matrices)
-        gloss = {"roughness": roughness, "metallic": metallic, "specular": specular}
-        self._add_gloss(stored, gloss)
-        bodies = range(len(self.scene.bodies))
+        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
 
         def draw(arrays: Mapping[str, wp.array]) -> wp.array:
             inputs = self._inputs(stored, arrays, light)
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
-            shiny = {name: [arrays.get(f"{name}[{body}]") for body in bodies] for name in gloss}
-            return self.warp.draw(**inputs, gloss=shiny, view=self.warp.view(*seen))
+            return self.warp.draw(**inputs, view=self.warp.view(*seen))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
         return stored.apply(draw, affine=[name for name in stored.names if is_affine.get(name.partition("[")[0])])
@@ -218,20 +214,23 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
+        roughness: PerBody[torch.Tensor] | None = None,
+        metallic: PerBody[torch.Tensor] | None = None,
+        specular: PerBody[torch.Tensor] | None = None,
     ) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
         Args:
             photograph: Linear RGB, of radiance in the units of the light, of the size of the cameras' images,
                 [height, width, 3] or [batch, height, width, 3].
-            light, albedo, textures, geometry, clip_matrices: As for :meth:`forward`.
+            light, albedo, textures, geometry, clip_matrices, roughness, metallic, specular: As for :meth:`forward`.
         Returns:
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.photograph`.
         Raises:
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        stored = self._given(light, albedo, textures, geometry, clip_matrices)
+        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
         camera = self.cameras[0]
         stored.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
         return stored.apply(
@@ -248,9 +247,12 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None = None,
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
+        roughness: PerBody[torch.Tensor] | None = None,
+        metallic: PerBody[torch.Tensor] | None = None,
+        specular: PerBody[torch.Tensor] | None = None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        stored = self._given(light, albedo, textures, geometry, clip_matrices)
+        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
         return self.warp.explain(**self._inputs(stored, stored.arrays(), light))
 
     def _given(
@@ -260,6 +262,7 @@ class TorchRenderer(torch.nn.Module):
         textures: PerBody[torch.Tensor] | None,
         geometry: Geometry[torch.Tensor] | None,
         clip_matrices: torch.Tensor | None,
+        gloss: tuple[PerBody[torch.Tensor] | None, ...] = (),
     ) -> Arguments:
         """The tensors among the arguments of a call, checked."""
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
@@ -283,6 +286,7 @@ class TorchRenderer(torch.nn.Module):
                 remedy = check.channels_last(np.shape(tensor))
                 messages = self._said("textures", textures, number)
                 stored.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, messages=messages)
+        self._add_gloss(stored, dict(zip(GLOSS, gloss, strict=False)))
         return stored
 
     def _add_gloss(self, stored: Arguments, gloss: Mapping[str, PerBody[torch.Tensor] | None]) -> None:
@@ -313,6 +317,7 @@ class TorchRenderer(torch.nn.Module):
             "light": arrays.get("light", light),
             "albedo": [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors],
             "textures": [arrays.get(f"textures[{number}]") for number in bodies],
+            "gloss": {name: [arrays.get(f"{name}[{number}]") for number in bodies] for name in GLOSS},
             "geometry": stored.geometry("geometry", arrays),
             "clip_matrices": arrays.get("clip_matrices"),
         }
