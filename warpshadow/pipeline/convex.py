@@ -23,7 +23,7 @@ class PartsOfGroup(NamedTuple):
 
     blockers: ConvexBlockers
     placed: PlacedParts
-    skip: int | None = None  # the body that the receivers are part of
+    skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
 
     def transmittance(
         self, points: wp.array, facing: wp.array | None, directions: np.ndarray, radius: float | None = None

@@ -151,7 +151,7 @@ class Directional(SphereMethod):
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
-        """Cells of the scene."""
+        """Bodies of the scene that block light as planes."""
         return blocking_planes(self.merged_scene.scene)
 
     def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:

@@ -197,13 +197,13 @@ class Grouping:
         frames: wp.array | None,
         placed: PlacedParts | None,
     ) -> Group:
-        """Points of a flat body, and their blockers."""
+        """The group of points of a flat body, with its blockers."""
         blocking = self._merged_scene.spheres_of(self._solid(range(len(self._merged_scene.scene.bodies))), spheres)
         planes, parts_around = self._planes_around(frames, but=body), self._parts_around(placed)
         return Group(points, normals, *blocking, planes=planes, parts_around=parts_around)
 
     def _solid(self, bodies: Iterable[int]) -> list[int]:
-        """The spheres of some blockers."""
+        """Bodies among some that block light by their spheres."""
         blocking = self._points.blocking
         return [body for body in bodies if body not in blocking.planes and body not in blocking.convex]
 
