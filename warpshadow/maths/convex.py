@@ -124,8 +124,8 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
 
 def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
     """Largest distance of points from a line."""
-    along = (end - begin) / np.linalg.norm(end - begin)
-    return float(np.linalg.norm(np.cross(points - begin, along), axis=1).max())
+    direction = (end - begin) / np.linalg.norm(end - begin)
+    return float(np.linalg.norm(np.cross(points - begin, direction), axis=1).max())
 
 
 def _renumbered(edges: np.ndarray, used: np.ndarray) -> np.ndarray:
