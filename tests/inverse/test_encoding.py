@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from PIL import Image, PngImagePlugin
+from PIL import Image, ImageCms, PngImagePlugin
 
 import warpshadow as ws
 from warpshadow.assets.lens import distorted, undistorted
@@ -21,13 +21,14 @@ CODES = np.linspace(0, 255, 24).reshape(2, 4, 3).astype(np.uint8)
 LENS = np.array([-0.21, 0.08, 0.004, -0.003, 0.01])
 
 
-def write_png(path, gamma=None, is_srgb=False):
+def write_png(path, gamma=None, is_srgb=False, has_profile=False):
     chunks = PngImagePlugin.PngInfo()
     if is_srgb:
         chunks.add(b"sRGB", b"\0")
     if gamma is not None:
         chunks.add(b"gAMA", round(1e5 * gamma).to_bytes(4, "big"))
-    Image.fromarray(CODES).save(path, pnginfo=chunks)
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes() if has_profile else None
+    Image.fromarray(CODES).save(path, pnginfo=chunks, icc_profile=profile)
     return path
 
 
@@ -39,6 +40,8 @@ def write_png(path, gamma=None, is_srgb=False):
         ({"gamma": 1.0}, "linear"),
         ({"gamma": 1 / 1.8}, 1.8),
         ({"gamma": 1.0, "is_srgb": True}, "srgb"),
+        ({"gamma": 1.0, "has_profile": True}, "srgb"),
+        ({"gamma": 1 / 1.8, "has_profile": True}, "srgb"),
     ],
 )
 def test_a_png_says_how_it_is_encoded(tmp_path, chunks, encoding):

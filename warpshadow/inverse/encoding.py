@@ -30,8 +30,9 @@ def checked_encoding(value: object) -> str | float:
 def guess_encoding(path: AnyPath) -> str | float:
     """The encoding that a file's metadata tell of; says so where that is not the usual one of its format.
 
-    OpenEXR and Radiance are linear. PNG: sRGB with an sRGB chunk; as its gAMA chunk says; linear with 16 bits and
-    neither, as raw converters write it. All others are sRGB.
+    OpenEXR and Radiance are linear. PNG, the first that it has, as its specification ranks them: sRGB with an ICC
+    profile, whatever that is, or an sRGB chunk; as its gAMA chunk says; linear with 16 bits and none of these, as raw
+    converters write it. All others are sRGB.
     """
     path = Path(path)
     if path.suffix.lower() not in _INTEGER_FILES:
@@ -39,13 +40,13 @@ def guess_encoding(path: AnyPath) -> str | float:
     info, is_16_bit = _metadata(path)
     guess: str | float = "linear" if is_16_bit else "srgb"
     reason = "it has 16 bits"
-    if "gamma" in info and "srgb" not in info and info["gamma"] > 0:
+    if "srgb" in info or "icc_profile" in info:
+        guess = "srgb"
+    elif info.get("gamma", 0) > 0:
         gamma = 1 / info["gamma"]
         is_srgb = abs(gamma / 2.2 - 1) < _SRGB_GAMMA
         guess = "srgb" if is_srgb else "linear" if abs(gamma - 1) < _SRGB_GAMMA else round(gamma, 4)
         reason = f"its gAMA chunk says {info['gamma']:g}"
-    elif "srgb" in info or "icc_profile" in info:
-        guess = "srgb"
     if guess != "srgb":
         check.warn(f'{path}: taken for encoding = "{guess}", since {reason}; give encoding if that is wrong')
     return guess
