@@ -20,16 +20,16 @@ FALLING = 0.01
 """Part of its loss that a fit may still gain over a window of iterations without a warning."""
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
-_SIDE = 96  # shorter side of the images in which pixels are counted
+_SIDE = 96  # shorter side of small images [pixels]
 
 
 class DiagnosticWarning(UserWarning):
     """A fit that ended, and a reason to doubt it."""
 
 
-def small_stage(problem: Problem, side: int = _SIDE) -> Stage:
+def small_stage(problem: Problem) -> Stage:
     """A stage of the least cost: small images, one sample a pixel."""
-    return Stage(scale=min(1.0, side / min(problem.targets[0].image.shape[:2])), supersampling=1)
+    return Stage(scale=min(1.0, _SIDE / min(problem.targets[0].image.shape[:2])), supersampling=1)
 
 
 def unseen_share(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> float:

@@ -22,10 +22,10 @@ from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.world import Setting
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
@@ -37,7 +37,6 @@ images disturbs it twenty times as much as on average.
 """
 
 _CELLS = 512  # that directions are told apart by
-_SIDE = 96  # shorter side of the images that influences are summed over [pixels]
 _ENLARGED, _STRIPE = 4, 6  # of its picture: pixels across one of the map; width of a stripe [pixels]
 
 
@@ -105,8 +104,7 @@ def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, 
     cells = Light(None, directions=_CELLS)
     free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)
-    height, width, _ = problem.targets[0].image.shape
-    model = Model(by_cells, setting, Stage(scale=min(1.0, _SIDE / min(height, width)), supersampling=1))
+    model = Model(by_cells, setting, small_stage(problem))
     logs = torch.zeros(_CELLS, 3, device=setting.device, requires_grad=True)  # the derivative by them is that by light
     images = model.images({**values, cells.name: {"log_radiance": logs}})
     (model.weights[..., None] * images[..., :3]).sum().backward()

@@ -77,7 +77,7 @@ class OutlineOffset(Free):
         check.positive("deviation", self.deviation)
 
     def start(self, setting: Setting) -> Values:
-        """None."""
+        """Offsets of 0."""
         return {"offset": setting.tensor(np.zeros(len(setting.cameras)))}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
