@@ -12,6 +12,7 @@ from warpshadow.inverse import (
     DiagnosticWarning,
     Exposure,
     Light,
+    Loss,
     OutlineOffset,
     Pose,
     Problem,
@@ -19,9 +20,12 @@ from warpshadow.inverse import (
     Target,
     write_result,
 )
+from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.model import Model
 from warpshadow.inverse.uncertainty import SPREAD, NormalMatrix, along_flat
 
 NOISE = 0.05
+DIFFERENCE = 0.03  # central differences of a loss that bends where edges pass the centers of pixels
 KNOWN_TURN = Pose("egg", covariance=[0.02] * 3 + [10.0] * 3)  # the outline of an egg hardly tells it
 
 
@@ -111,6 +115,31 @@ def test_the_summary_has_it_and_a_flat_direction_is_warned_of(tmp_path, outline)
 
     table = toml_tables.read(tmp_path / "summary.toml", "summary")["uncertainty"]
     np.testing.assert_allclose(table["egg"]["shift"], result.uncertainty.poses["egg"].shift)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize("kind", ["l2", "huber", "geman-mcclure"])
+def test_its_residuals_have_the_gradient_of_the_loss(kind, reduction):
+    """So priors and light weigh against the images as in the fit."""
+    where = scene()
+    where = dataclasses.replace(where, bodies=where.bodies[:1])
+    target = Target(ws.render(where) * np.array([0.8, 0.9, 1.1, 0.9], np.float32))
+    loss = Loss(kind, delta=0.3, coverage=0.5, reduction=reduction)
+    problem = Problem(where, target, [Exposure(), Pose(0, scale=True)], loss, still=None)
+    setting = problem.setting(torch.device("cpu"))
+    values = problem.start(setting)
+    values["pose[0]"]["log_scale"] += 0.1
+    normal, model = NormalMatrix(problem, setting, values), Model(problem, setting, small_stage(problem))
+    slopes = []
+    for name, key, number in normal.places:
+        ends = []
+        for step in (0.01, -0.01):
+            values[name][key].view(-1)[number] += step
+            ends.append(float(model.loss(values)[0]))
+            values[name][key].view(-1)[number] -= step
+        slopes.append((ends[0] - ends[1]) / 0.02)
+    gradient = 2 * np.tensordot(normal.residuals, normal.columns, 4)
+    np.testing.assert_allclose(gradient, slopes, atol=DIFFERENCE * np.abs(slopes).max())
 
 
 def test_textures_alone_have_none():

@@ -58,6 +58,10 @@ class Loss:
         total = (weights * costs).sum()
         return total / weights.sum() if self.reduction == "mean" else total
 
+    def pixel_shares(self, weights: torch.Tensor) -> torch.Tensor:
+        """Factors of the pixels' costs in the loss, of their weights: parts of all with the reduction "mean"."""
+        return weights / weights.sum() if self.reduction == "mean" else weights
+
     def _costs(self, x: torch.Tensor) -> torch.Tensor:
         """Cost of each pixel, of its differences, [..., channel] to [...]."""
         if self.kind in _BY_PIXEL:

@@ -91,7 +91,7 @@ class LightModel(Model):
     """The same where light alone is free and differences are squared: a quadratic form, computed without images.
 
     Images are linear in the light, I_c = J_c L_c for each color c, so the loss is Σ_c L_cᵀ G_c L_c − 2 g_c·L_c + const
-    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the weights of the pixels over their sum. Sums are float64: near the
+    with G_c = J_cᵀ W J_c and g_c = J_cᵀ W t_c, W the pixels' shares in the loss. Sums are float64: near the
     end they are small differences of large numbers.
     """
 
@@ -100,8 +100,7 @@ class LightModel(Model):
         (light,) = problem.free
         assert isinstance(light, Light)
         self.light = light
-        share = 1.0 if problem.loss.reduction == "sum" else 1.0 / float(self.weights.sum())
-        roots = (self.weights * share).sqrt()[..., None] / setting.unit
+        roots = problem.loss.pixel_shares(self.weights).sqrt()[..., None] / setting.unit
         with torch.no_grad():
             columns = torch.cat([(image[..., :3] * roots).reshape(1, -1, 3) for image in self._images_of_units()])
             target = (self.targets[..., :3] * roots).reshape(-1, 3)

@@ -112,6 +112,7 @@ class NormalMatrix:
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
         self.places = _places(self.values)
+        self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
         with torch.no_grad():
             if isinstance(self.model, ProjectedModel):
                 self.model.solve(self.values)
@@ -126,17 +127,21 @@ class NormalMatrix:
         self.middle = scores.T @ scores + PRIOR**2 * curvature
 
     def _residuals(self) -> np.ndarray:
-        """Weighted differences whose squares sum to the loss, float64 [view, height, width, channel]."""
+        """Differences, weighted so that their squares have the loss's gradient, [view, height, width, channel].
+
+        The weights of reweighted least squares are those at the first call: at the result.
+        """
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
         compared = bounded(world.images(), model.targets, model.saturated)
-        x = (compared[..., :3] - model.targets[..., :3]) / self.setting.unit
-        if not hasattr(self, "roots"):  # weights of the reweighted squares stay
-            self.roots = (model.weights[..., None] / model.weights.sum() * loss.pixel_weights(x)).sqrt()
-        parts = [self.roots * x]
+        kinds = [(compared[..., :3] - model.targets[..., :3]) / self.setting.unit]
         if model.targets.shape[-1] == 4:
-            share = (loss.coverage * model.weights / model.weights.sum()).sqrt()[..., None]
-            parts.append(share * (compared[..., 3:] - model.targets[..., 3:]))
+            kinds.append(compared[..., 3:] - model.targets[..., 3:])
+        if not self.roots:
+            share = loss.pixel_shares(model.weights)[..., None]
+            factors = (1.0, loss.coverage)
+            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, kinds, strict=False)]
+        parts = [roots * x for roots, x in zip(self.roots, kinds, strict=True)]
         if model.outlines is not None:
             gaps = model.outlines.differences(world.masks(), world.outline_offsets)
             pixels = gaps.new_zeros(len(model.cameras), *gaps.shape[1:], len(gaps))
@@ -158,7 +163,7 @@ class NormalMatrix:
     def _project_light(self) -> float:
         """Take the best change of the light out of the columns; the relative deviation of its total."""
         assert isinstance(self.model, ProjectedModel)
-        design = (self.model.design(self.values) * self.roots).double().cpu().numpy()
+        design = (self.model.design(self.values) * self.roots[0]).double().cpu().numpy()
         design = np.tensordot(self.model.atoms, design, axes=1)  # [atom, view, height, width, 3]
         radiance = self.model.solution
         prior, total, variance = self.model.prior(), 0.0, 0.0

@@ -65,7 +65,7 @@ class ProjectedModel(Model):
         design = self.design(values).permute(4, 0, 1, 2, 3).flatten(2)  # [color, coefficient, pixel]
         design = torch.einsum("ak,ckp->cap", torch.from_numpy(self.atoms).to(design), design)
         target = (self.targets[..., :3] / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
-        share = self.weights.flatten() / (self.weights.sum() if self.problem.loss.reduction == "mean" else 1.0)
+        share = self.problem.loss.pixel_shares(self.weights).flatten()
         prior = self.prior()
         weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))
         for _ in range(1 if self.problem.loss.kind == "l2" and self.saturated is None else _REWEIGHTINGS):
