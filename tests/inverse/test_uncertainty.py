@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
 from warpshadow.inverse import (
@@ -97,12 +98,30 @@ def test_a_free_light_leaves_less_curvature_to_a_pose():
     assert 0 < result_of([Pose(0), Light(2)]).uncertainty.light < 0.2
 
 
-def test_starts_lie_along_the_direction_that_is_known_least(outline):
-    result = result_of([KNOWN_TURN, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
+@pytest.mark.parametrize("rotation", ["axis-angle", "quaternion", "6d"])
+@pytest.mark.parametrize("pose", [KNOWN_TURN, Pose("egg", covariance=[10.0] * 3 + [0.001] * 3)], ids=["shift", "turn"])
+def test_starts_lie_along_the_direction_that_is_known_least(outline, pose, rotation):
+    pose = dataclasses.replace(pose, rotation=rotation)
+    result = result_of([pose, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
     starts = along_flat(result.problem, result.setting, result.values, 4)
-    shifts = [np.concatenate([s["pose[0]"]["turn"].numpy(), s["pose[0]"]["shift"].numpy()]) for s in starts]
-    np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-5)
-    np.testing.assert_allclose(shifts[0], -shifts[1], atol=1e-7)
+    (free, _), setting, moves = result.problem.free, result.setting, []
+    first, origin, _ = free.moved(result.values[free.name], setting)
+    for start in starts:
+        turned, middle, _ = free.moved(start[free.name], setting)
+        turn = Rotation.from_matrix((turned @ first.T).numpy()).as_rotvec()
+        moves.append(np.concatenate([turn, (middle - origin).numpy() / setting.extent(0)]))
+    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-2)  # turns by more than a little
+    np.testing.assert_allclose(moves[0], -moves[1], atol=1e-2 * SPREAD)
+
+
+@pytest.mark.parametrize("rotation", ["quaternion", "6d"])
+def test_what_is_known_of_a_pose_does_not_depend_on_its_parameters(rotation):
+    known, same = (result_of([Pose("egg", rotation=kind)]).uncertainty for kind in ("axis-angle", rotation))
+    (pose,), (other,) = known.poses.values(), same.poses.values()
+    np.testing.assert_allclose(other.shift, pose.shift, rtol=0.02)
+    np.testing.assert_allclose(other.turn, pose.turn, rtol=0.02)
+    np.testing.assert_allclose(other.least, pose.least * np.sign(pose.least @ other.least), rtol=0.02, atol=1e-5)
+    assert max(same.deviations.values()) < 2 * max(known.deviations.values())
 
 
 def test_the_summary_has_it_and_a_flat_direction_is_warned_of(tmp_path, outline):
@@ -139,6 +158,7 @@ def test_its_residuals_have_the_gradient_of_the_loss(kind, reduction):
             values[name][key].view(-1)[number] -= step
         slopes.append((ends[0] - ends[1]) / 0.02)
     gradient = 2 * np.tensordot(normal.residuals, normal.columns, 4)
+    slopes = normal.directions.T @ slopes
     np.testing.assert_allclose(gradient, slopes, atol=DIFFERENCE * np.abs(slopes).max())
 
 

@@ -12,7 +12,7 @@ count as measurements with their own standard deviations. J is of central differ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -112,19 +112,57 @@ class NormalMatrix:
         has_light = any(isinstance(free, Light) for free in problem.free)
         self.model = (ProjectedModel if has_light else Model)(problem, setting, stage)
         self.places = _places(self.values)
+        self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
         with torch.no_grad():
             if isinstance(self.model, ProjectedModel):
                 self.model.solve(self.values)
             self.residuals = self._residuals()
-            self.columns = np.stack([self._difference(*place) for place in self.places], axis=-1)
+            self.columns = np.stack([self._difference(direction) for direction in self.directions.T], axis=-1)
             self.light = self._project_light() if isinstance(self.model, ProjectedModel) else None
-        curvature = self._prior()
-        flat = self.columns.reshape(-1, len(self.places))
+        curvature = self.directions.T @ self._prior() @ self.directions
+        flat = self.columns.reshape(-1, self.columns.shape[-1])
         self.form = flat.T @ flat + PRIOR * curvature
         self.form += _RIDGE * np.abs(self.form).max() * np.eye(len(self.form))
         scores = _by_tiles(self.columns * self.residuals[..., None])
         self.middle = scores.T @ scores + PRIOR**2 * curvature
+
+    def _directions(self) -> np.ndarray:
+        """Directions in which the numbers may move, [number, direction].
+
+        Of the numbers of a quaternion or of two columns those that turn the body by a radian about each axis, and none
+        along which they change and it does not, such as a quaternion's length.
+        """
+        directions = np.eye(len(self.places))
+        for free in self.problem.free:
+            if isinstance(free, Pose) and free.rotation != "axis-angle":
+                rows = [index for index, place in enumerate(self.places) if place[:2] == (free.name, "turn")]
+                turns = np.zeros((len(directions), 3))
+                turns[rows] = np.linalg.pinv(self.slopes(free, rows)[3:])
+                directions = np.concatenate([directions[:, ~directions[rows].any(axis=0)], turns], axis=1)
+        return directions
+
+    def moved(self, step: np.ndarray) -> dict[str, Values]:
+        """The values, their numbers moved by a step, [number]."""
+        values = {name: {key: t.clone() for key, t in own.items()} for name, own in self.values.items()}
+        for (name, key, number), part in zip(self.places, step.tolist(), strict=True):
+            values[name][key].view(-1)[number] += part
+        return values
+
+    def slopes(self, free: Pose, rows: Sequence[int]) -> np.ndarray:
+        """Derivatives of a body's middle [scene units] and turn [radians] by some of the numbers, [6, row]."""
+        own, slopes = self.values[free.name], np.zeros((6, len(rows)))
+        for column, index in enumerate(rows):
+            _, key, number = self.places[index]
+            ends = []
+            for step in (_STEP, -_STEP):
+                own[key].view(-1)[number] += step
+                rotation, middle, _ = free.moved(own, self.setting)
+                ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
+                own[key].view(-1)[number] -= step
+            turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
+            slopes[:, column] = [*(ends[0][1] - ends[1][1]), turn[2, 1], turn[0, 2], turn[1, 0]]
+        return slopes / (2 * _STEP)
 
     def _residuals(self) -> np.ndarray:
         """Differences, weighted so that their squares have the loss's gradient, [view, height, width, channel].
@@ -150,14 +188,13 @@ class NormalMatrix:
             parts.append(pixels * float(np.sqrt(loss.coverage / gaps[0].numel())))
         return torch.cat(parts, dim=-1).double().cpu().numpy()
 
-    def _difference(self, name: str, key: str, number: int) -> np.ndarray:
-        """Derivative of the residuals by a number."""
-        tensor = self.values[name][key].view(-1)
-        both = []
-        for step in (_STEP, -_STEP):
-            tensor[number] += step
+    def _difference(self, direction: np.ndarray) -> np.ndarray:
+        """Derivative of the residuals along a direction of the numbers."""
+        start, both = self.values, []
+        for values in (self.moved(_STEP * direction), self.moved(-_STEP * direction)):
+            self.values = values
             both.append(self._residuals())
-            tensor[number] -= step
+        self.values = start
         return (both[0] - both[1]) / (2 * _STEP)
 
     def _project_light(self) -> float:
@@ -234,8 +271,8 @@ def uncertainty(
     if not _places(values):
         return None
     normal = NormalMatrix(problem, setting, values)
-    inverse = np.linalg.inv(normal.form)
-    covariance = inverse @ normal.middle @ inverse
+    inverse = normal.directions @ np.linalg.inv(normal.form)
+    covariance = inverse @ normal.middle @ inverse.T
     poses = {
         free.called(fitted): _pose_uncertainty(free, normal, covariance)
         for free in problem.free
@@ -247,22 +284,11 @@ def uncertainty(
 
 def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) -> PoseUncertainty:
     """The uncertainty of a pose in scene units and degrees."""
-    setting, own = normal.setting, normal.values[free.name]
+    setting = normal.setting
     rows = [index for index, (name, _, _) in enumerate(normal.places) if name == free.name]
-    slopes = []
-    for index in rows:
-        _, key, number = normal.places[index]
-        ends = []
-        for step in (_STEP, -_STEP):
-            own[key].view(-1)[number] += step
-            rotation, middle, _ = free.moved(own, setting)
-            ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
-            own[key].view(-1)[number] -= step
-        turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
-        slopes.append(np.array([*(ends[0][1] - ends[1][1]), turn[2, 1], turn[0, 2], turn[1, 0]]) / (2 * _STEP))
-    _, middle, scale = free.moved(own, setting)
+    _, middle, scale = free.moved(normal.values[free.name], setting)
     half = setting.extent(free.number) * float(scale)
-    both = np.stack(slopes, axis=1)
+    both = normal.slopes(free, rows)
     cov = both @ covariance[np.ix_(rows, rows)] @ both.T
     units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
     sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
@@ -286,18 +312,12 @@ def along_flat(problem: Problem, setting: Setting, values: Mapping[str, Values],
     """
     normal = NormalMatrix(problem, setting, values)
     poses = [index for index, (name, _, _) in enumerate(normal.places) if name.startswith(f"{Pose.key}[")]
-    starts: list[dict[str, Values]] = []
+    weakest = np.zeros(len(normal.places))
     if poses:
-        spread = np.linalg.inv(normal.form)[np.ix_(poses, poses)]
-        direction = np.linalg.eigh(spread)[1][:, -1]
-    for number in range(count):
-        moved = {name: {key: t.detach().clone() for key, t in own.items()} for name, own in values.items()}
-        step = SPREAD * (number // 2 + 1) * (-1) ** number
-        for index, part in zip(poses, direction if poses else (), strict=True):
-            name, key, place = normal.places[index]
-            moved[name][key].view(-1)[place] += step * float(part)
-        starts.append(moved)
-    return starts
+        moving = normal.directions[poses].any(axis=0)
+        spread = np.linalg.inv(normal.form)[np.ix_(moving, moving)]
+        weakest = normal.directions[:, moving] @ np.linalg.eigh(spread)[1][:, -1]
+    return [normal.moved(SPREAD * (number // 2 + 1) * (-1) ** number * weakest) for number in range(count)]
 
 
 def _places(values: Mapping[str, Values]) -> list[tuple[str, str, int]]:
