@@ -71,6 +71,31 @@ def test_a_body_that_stands_touches_its_plane_at_any_values(resting, seed):
         np.testing.assert_allclose(up, where.bodies[0].rotation_matrix().T @ plane.normal, atol=10 * FLOAT32)
 
 
+@pytest.mark.parametrize(
+    ("ground_turn", "fixed"),
+    [((0, 0, 0), ["x", "z"]), ((0, 0, 0), ["x"]), ((10, 0, 5), ["y"]), ((10, 0, 5), ["x", "y"]), ((0, 0, 90), ["y"])],
+)
+@pytest.mark.parametrize("resting", ["stable", "free"])
+def test_what_is_fixed_stays_beside_a_plane(ground_turn, fixed, resting):
+    where = scene(box(TILT, (0.3, 2.0, -0.2)), ground_turn=ground_turn, height=0.4)
+    pose = Pose("box", stands_on="table", resting=resting, fixed=fixed)
+    free, setting, values = prepared(where, pose)
+    body, start = moved_body(free, setting, shaken(values, 4)), where.bodies[0]
+    plane = plane_below(where.bodies[1], np.array(start.translation))
+    lowest = (body.world_mesh().positions.astype(np.float64) @ plane.normal).min() - plane.offset
+    assert abs(lowest) < 10 * FLOAT32
+    stays = ["xyz".index(axis) for axis in fixed]  # the mesh's middle is its origin
+    np.testing.assert_allclose(np.array(body.translation)[stays], np.array(start.translation)[stays], atol=FLOAT32)
+
+
+@pytest.mark.parametrize(
+    ("ground_turn", "fixed"), [((0, 0, 0), ["y"]), ((0, 0, 90), ["x", "z"]), ((10, 0, 5), ["z", "y", "x"])]
+)
+def test_what_cannot_stay_beside_a_plane_is_refused(ground_turn, fixed):
+    with pytest.raises(ValueError, match=r"free\[0\].*fixed: got \[.*\] beside stands_on a plane of normal"):
+        prepared(scene(box(), ground_turn=ground_turn), Pose("box", stands_on="table", fixed=fixed))
+
+
 @pytest.mark.parametrize(("tilt", "down"), [(20.0, [0, -1, 0]), (70.0, [0, 0, -1])])
 def test_a_box_rests_on_the_face_that_needs_the_least_turn(tilt, down):
     start = Rotation.from_euler("YX", [40.0, -tilt], degrees=True).as_matrix()

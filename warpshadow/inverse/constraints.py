@@ -3,11 +3,12 @@
 A pose has six degrees of freedom: a turn, as an axis-angle vector, and a shift of the body's middle. A constraint
 leaves each of them a subspace, and the values of a fit are coordinates in it, so that no step can violate it. A body
 that stands on a plane keeps three: it turns about the plane's normal and slides, and its height follows from its lowest
-vertex.
+vertex; what is fixed of its middle stays, and so it moves onto the plane along the other coordinates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from warpshadow.scene.scene import Body
 AXES = {"x": 0, "y": 1, "z": 2}
 UP = (0.0, 1.0, 0.0)
 RESTING = ("stable", "given", "free")
+_LEAST_SLOPE = 0.01  # of a plane along the coordinates that are not fixed
 _INSIDE = 1e-6  # how far outside a triangle its centroid may project, in barycentric coordinates
 
 
@@ -46,6 +48,7 @@ class PoseConstraint:
         shifts: The same of the shifts of the body's middle, [0 to 3, 3].
         rotation: From which the body turns, shape [3, 3].
         plane: That the body touches, if any.
+        onto: Shift of the middle that moves the body by a unit along the plane's normal, and no fixed coordinate, [3].
         hull: Vertices of the mesh's convex hull, of which one is the lowest, [vertex, 3]; for a plane.
     """
 
@@ -53,6 +56,7 @@ class PoseConstraint:
     shifts: np.ndarray
     rotation: np.ndarray
     plane: PlaneConstraint | None = None
+    onto: np.ndarray | None = None
     hull: np.ndarray | None = None
 
     def turn(self, values: torch.Tensor) -> torch.Tensor:
@@ -66,7 +70,7 @@ class PoseConstraint:
     def touching(
         self, middle: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
     ) -> torch.Tensor:
-        """The body's middle in the world, moved along the normal until the lowest vertex touches the plane.
+        """The body's middle in the world, moved until the lowest vertex touches the plane.
 
         Args:
             middle: In the world, shape [3].
@@ -76,11 +80,11 @@ class PoseConstraint:
 
         Differentiable: middle, rotation, scale.
         """
-        if self.plane is None or self.hull is None:
+        if self.plane is None or self.onto is None or self.hull is None:
             return middle
-        normal, hull = (torch.as_tensor(part).to(middle) for part in (self.plane.normal, self.hull))
+        normal, onto, hull = (torch.as_tensor(part).to(middle) for part in (self.plane.normal, self.onto, self.hull))
         below = ((hull - center) @ (rotation.T @ normal)).amin() * scale
-        return middle + normal * (self.plane.offset - below - normal @ middle)
+        return middle + onto * (self.plane.offset - below - normal @ middle)
 
 
 def remaining(removed: list[np.ndarray]) -> np.ndarray:
@@ -89,6 +93,21 @@ def remaining(removed: list[np.ndarray]) -> np.ndarray:
         return np.eye(3)
     _, sizes, rows = np.linalg.svd(np.stack(removed))
     return rows[int((sizes > 1e-9).sum()) :]
+
+
+def onto_plane(normal: np.ndarray, fixed: Sequence[str]) -> np.ndarray:
+    """The least shift that moves by a unit along a plane's normal, and no fixed coordinate, shape [3].
+
+    Raises:
+        ValueError: for fixed coordinates beside which nothing, or hardly anything, of the normal is left.
+    """
+    onto = np.where([axis in fixed for axis in AXES], 0.0, normal)
+    if np.linalg.norm(onto) < _LEAST_SLOPE:
+        raise ValueError(
+            f"fixed: got {list(fixed)} beside stands_on a plane of normal {np.round(normal, 3).tolist()}, expected a "
+            "coordinate that is free to move the body onto the plane"
+        )
+    return onto / (onto @ normal)
 
 
 def plane_below(ground: Body, above: np.ndarray) -> PlaneConstraint:

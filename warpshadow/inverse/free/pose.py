@@ -44,7 +44,8 @@ class Pose(FreeOfBody):
             as the scene has it; "free", any way, so that five degrees of freedom stay. Its height always follows.
         upright: Whether it turns about the world's y alone.
         axis: Direction about which alone it turns, shape [3].
-        fixed: Coordinates of its middle that stay: "x", "y", "z".
+        fixed: Coordinates of its middle that stay: "x", "y", "z"; beside ``stands_on``, one that moves the body onto the
+            plane must not be among them, such as "y" of one that is horizontal.
         distance: Prior of the distance of its middle from the first view's eye, and its standard deviation [scene
             units].
         size: Prior of the diagonal of its bounding box, and its standard deviation [scene units], of a free scale.
@@ -111,13 +112,13 @@ class Pose(FreeOfBody):
         return replace(numbered, stands_on=scene.body_number(self.stands_on, "stands_on"))
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body that stands on itself, or on one that is not flat."""
+        """Raise ValueError for a body that stands on itself, or on one that is not flat, or cannot move onto it."""
         if self.stands_on is None:
             return
         ground = scene.body_number(self.stands_on, "stands_on")
         if ground == self.number:
             raise ValueError(f"stands_on: got {ground}, the body itself; expected another, such as the ground")
-        constraints.plane_below(scene.bodies[ground], np.zeros(3))
+        constraints.onto_plane(constraints.plane_below(scene.bodies[ground], np.zeros(3)).normal, self.fixed)
 
     def constraint(self, setting: Setting) -> PoseConstraint:
         """The poses that are possible."""
@@ -138,7 +139,8 @@ class Pose(FreeOfBody):
         if self.resting == "stable":
             rotation = constraints.stable_rotation(body.mesh, rotation, plane.normal)
         shifts = constraints.remaining([plane.normal, *stays])
-        return PoseConstraint(turns, shifts, rotation, plane, constraints.hull_points(body.mesh))
+        onto = constraints.onto_plane(plane.normal, self.fixed)
+        return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
 
     def start(self, setting: Setting) -> Values:
         """Where the body is."""
