@@ -110,7 +110,7 @@ def test_starts_lie_along_the_direction_that_is_known_least(outline, pose, rotat
         turned, middle, _ = free.moved(start[free.name], setting)
         turn = Rotation.from_matrix((turned @ first.T).numpy()).as_rotvec()
         moves.append(np.concatenate([turn, (middle - origin).numpy() / setting.extent(0)]))
-    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-2)  # turns by more than a little
+    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), SPREAD * np.array([1, 1, 2, 2]), rtol=1e-2)
     np.testing.assert_allclose(moves[0], -moves[1], atol=1e-2 * SPREAD)
 
 

@@ -21,8 +21,8 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
-from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem

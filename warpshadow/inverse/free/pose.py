@@ -44,8 +44,8 @@ class Pose(FreeOfBody):
             as the scene has it; "free", any way, so that five degrees of freedom stay. Its height always follows.
         upright: Whether it turns about the world's y alone.
         axis: Direction about which alone it turns, shape [3].
-        fixed: Coordinates of its middle that stay: "x", "y", "z"; beside ``stands_on``, one that moves the body onto the
-            plane must not be among them, such as "y" of one that is horizontal.
+        fixed: Coordinates of its middle that stay: "x", "y", "z". Beside ``stands_on`` the others must be able to move
+            it onto the plane: "y" is never fixed above one that is horizontal.
         distance: Prior of the distance of its middle from the first view's eye, and its standard deviation [scene
             units].
         size: Prior of the diagonal of its bounding box, and its standard deviation [scene units], of a free scale.
