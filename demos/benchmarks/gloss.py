@@ -1,6 +1,6 @@
 """Images of bodies that shine against Mitsuba's, by roughness, of metal and plastic.
 
-    python -m demos.benchmarks.gloss [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
+    python demos/benchmarks/gloss.py [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
 
 FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
 (demos/mitsuba_gloss.py), so that nothing is due to another one. Errors are of the whole image, and of the body that
@@ -10,11 +10,13 @@ shines alone, relative L2, noise of the reference taken off.
 import argparse
 import dataclasses
 import itertools
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh

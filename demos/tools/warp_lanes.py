@@ -7,6 +7,7 @@ warp go through the spheres together, so a *visit* costs them all as much, howev
 kind of warp that is compared is 32 threads: receivers in some order, and spans of 16 directions of each.
 """
 
+import argparse
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -81,6 +82,7 @@ def visits(reaches: np.ndarray, receivers_of_warp: int) -> Visits:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     ws.quiet()
     scene = bunny_scene()
     renderer = ws.Renderer(scene)

@@ -126,7 +126,7 @@ def test_what_seems_better_than_the_default_is_timed_again_until_none_is_left_in
     rounds = iter([{0: 30.0, 1: 20.0, 2: 28.0, 3: 41.0}])
     asked = []
 
-    def times(functions, runs):
+    def times(functions, runs, clock):
         asked.append(list(functions))
         answers = next(rounds)
         return [answers[function] for function in functions]

@@ -491,7 +491,7 @@ def test_light_is_found_to_the_last_coefficient_by_a_method_of_second_order(scen
     """The loss is a square of the light, badly conditioned as the camera sees few normals."""
     light = scene.light + np.random.default_rng(4).normal(size=scene.light.shape) * 0.3
     image = ws.Renderer(dataclasses.replace(scene, light=light)).render()
-    problem = Problem(scene, Target(image), Light(3), still=None)
+    problem = Problem(scene, Target(image), Light(3, nonnegativity=0.0), still=None)  # this light is below 0 in places
     result = fit(problem, [Stage(20, learning_rate=1.0)], optimizer=torch.optim.LBFGS)
     assert np.abs(result.scene.light - light).max() < 0.02
 

@@ -92,7 +92,8 @@ def _groups(renderer: SceneRenderer) -> list:
 
     view = renderer.view()
     spheres, frames = view.spheres.value(), renderer._method.planes.frames((1,), view.vertices.value())
-    return Grouping(view, renderer._method.planes).groups(view.call, view.receivers, spheres, None, {}, frames, None)
+    grouping = Grouping(view, renderer._method.planes, renderer._method.parts)
+    return grouping.groups(view.call, view.receivers, spheres, None, {}, frames, None, None)
 
 
 def test_where_shadows_are_kept_at_vertices_they_stay_there():
