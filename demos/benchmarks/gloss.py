@@ -81,7 +81,7 @@ def body_error(reference: Reference, shown: np.ndarray) -> float:
 
 def main() -> None:
     """Print the tables, and write a contact sheet."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with meshes/ and envmaps/")
     parser.add_argument("--size", type=int, default=96, help="pixels")
     parser.add_argument("--bodies", type=int, default=6, help="at most so many")
