@@ -32,7 +32,7 @@ from warpshadow.viewer.state import ViewerState
 
 _SECONDS = 1.0  # time between two notes of how far it is
 _PIXELS = 128**2  # of the images that the process renders, for all that they need
-_PATIENCE = 10.0  # time that the process has to write what it has, after this one ended [s]
+_PATIENCE = 40.0  # time that the process has to write what it has, after this one ended [s]
 
 
 def has_fitted_spheres(scene: Scene, *, device: wp.DeviceLike = "cpu") -> bool:
