@@ -1,5 +1,7 @@
-"""Warnings of fits that ended: pixels without a body, and light that has not converged."""
+"""Warnings of fits that ended: pixels without a body, wrong exposure, and light that has not converged."""
 
+import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.inverse import DiagnosticWarning, Light, Problem, Stage, Target, fit
+from warpshadow.inverse import DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, fit
 from warpshadow.inverse.diagnostics import gain_of_last
 
 
@@ -56,3 +58,16 @@ def test_light_is_kept_from_being_negative_by_default():
     assert float(Light(2).regularizer(values, setting)) == 0
     values["coefficients"][1] = 5.0
     assert float(Light(2).regularizer(values, setting)) > 0.01
+
+
+@pytest.mark.parametrize("stops", [-1.65, 0.0])
+def test_an_exposure_that_differs_from_the_light_is_told(stops):
+    ball = ws.Body(ws.icosphere(0.5, 2), albedo=(0.7, 0.3, 0.2), blockers=4, translation=(0.3, 0.5, 0))
+    problem_scene = dataclasses.replace(scene(), bodies=(ball, *scene().bodies))
+    target = Target(2**stops * ws.render(problem_scene)[..., :3])
+    told = messages(Problem(problem_scene, target, Pose(0)), Stage(20, 0.02))
+    assert len(told) == (stops != 0)
+    for text in told:
+        assert "targets[0] is" in text and "set exposure = true" in text
+        assert abs(float(re.search(r"exposure = (\S+) \[stops\]", text)[1]) - stops) < 0.1
+    assert not messages(Problem(problem_scene, target, [Pose(0), Exposure()]), Stage(20, 0.02))

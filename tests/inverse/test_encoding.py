@@ -168,3 +168,26 @@ def test_a_fit_file_has_the_same_keys(tmp_path):
     assert target.camera.intrinsics[0, 2] == 2.5 and problem.free == (Exposure(white_balance=True),)
     plain = CODES / 255 / np.array([2.0, 4.0, 2.0])
     np.testing.assert_allclose(target.image[1, 2], plain[1, 2], atol=0.02)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("tone", ["clip", "filmic"])
+def test_a_picture_of_our_own_is_the_linear_image_again(tmp_path, tone, suffix):
+    linear = np.geomspace(0.05, 50.0, 32 * 32).reshape(32, 32, 1).repeat(3, axis=2)
+    picture = ws.Picture(linear, exposure=-1.5, tone=tone)
+    path = tmp_path / f"x{suffix}"
+    picture.write(path)
+    target, codes = Target(path), picture.pixels
+    if suffix == ".png":
+        np.testing.assert_array_equal(target.saturated, codes == 255)
+    kept = (codes < 215) & (codes > 20)  # filmic is flat above, and a code a large step
+    np.testing.assert_allclose(target.image[kept], linear[kept], rtol=0.06 if suffix == ".jpg" else 0.04)
+    np.testing.assert_allclose(Target(path, exposure=0.0).image, 2**-1.5 * target.image, rtol=1e-5)
+    Image.open(path).save(path)  # by other programs, which may leave comments out
+    assert Target(path).saturated is None or suffix == ".jpg"
+
+
+def test_a_picture_on_nothing_is_premultiplied_again(tmp_path):
+    image = np.array([[[0.4, 0.2, 0.1, 0.5], [3.0, 1.5, 0.5, 1.0], [0, 0, 0, 0]]], np.float32)
+    ws.write_image(tmp_path / "x.png", ws.Picture(image, exposure=-2.0))
+    np.testing.assert_allclose(Target(tmp_path / "x.png").image, image, rtol=0.03)

@@ -24,6 +24,12 @@ def filmic(color: np.ndarray) -> np.ndarray:
     return np.clip(color * (2.51 * color + 0.03) / (color * (2.43 * color + 0.59) + 0.14), 0, 1)
 
 
+def unfilmic(bent: np.ndarray) -> np.ndarray:
+    """Undo :func:`filmic`; 1, which it gives all values from 7.2, becomes 7.2."""
+    a, b = 2.51 - 2.43 * bent, 0.03 - 0.59 * bent
+    return (np.sqrt(b**2 + 0.56 * a * bent) - b) / (2 * a)
+
+
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Decode sRGB values in [0, 1] (IEC 61966-2-1), in the precision of the argument."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

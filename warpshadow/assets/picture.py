@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,12 +39,14 @@ class Picture:
         pixels: uint8 of shape [height, width, 3], [height, width, 4] with straight alpha where it is transparent, or
             [height, width, 1] of gray; ``PIL.Image.fromarray`` takes them.
         exposure: In stops.
+        tone: Tone curve.
     Raises:
         ValueError: for NaN, and for a background behind an image that has no coverage.
     """
 
     pixels: np.ndarray
     exposure: float
+    tone: str
 
     def __init__(
         self,
@@ -60,6 +63,7 @@ class Picture:
                 f"exposure: got {check.described(exposure)}, expected {-MOST_STOPS} to {MOST_STOPS} stops, or None"
             )
         self.exposure = auto_exposure(linear) if exposure is None else float(exposure)
+        self.tone = tone
         has_alpha = linear.shape[2] == 4
         if background is not None and not has_alpha:
             raise ValueError(f"background: got one behind an image of shape {linear.shape}, which covers all of it")
@@ -94,6 +98,8 @@ class Picture:
     def write(self, path: AnyPath) -> None:
         """Write a .png file, or a .jpg or .jpeg file, on white where the picture is transparent.
 
+        A comment in the file says the exposure and the tone curve, by which fits undo them.
+
         Raises:
             OSError: where the file cannot be written.
         """
@@ -101,11 +107,12 @@ class Picture:
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
         with files.whole(path) as unfinished:
+            comment = f"warpshadow: exposure {self.exposure:+.6f} stops, tone {self.tone}"
             if path.suffix.lower() == ".png":
-                _pillow(self.pixels).save(unfinished)
+                _pillow(self.pixels).save(unfinished, pnginfo=_chunk(comment))
             else:
                 shown = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
-                _pillow(shown).save(unfinished, quality=95, subsampling=0)
+                _pillow(shown).save(unfinished, quality=95, subsampling=0, comment=comment)
 
 
 def png_bytes(codes: np.ndarray) -> bytes:
@@ -113,6 +120,30 @@ def png_bytes(codes: np.ndarray) -> bytes:
     file = io.BytesIO()
     _pillow(codes).save(file, format="PNG")
     return file.getvalue()
+
+
+class Development(NamedTuple):
+    """How linear values became a picture."""
+
+    exposure: float
+    """In stops."""
+
+    tone: str
+    """Tone curve."""
+
+
+def development(path: AnyPath) -> Development | None:
+    """The exposure and tone curve that :meth:`Picture.write` left in a file; None for other pictures."""
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=["PNG", "JPEG"]) as picture:
+            comment = picture.info.get("Comment", picture.info.get("comment", ""))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return None
+    comment = comment.decode(errors="replace") if isinstance(comment, bytes) else comment
+    found = re.fullmatch(rf"warpshadow: exposure ([+-]\d+\.\d+) stops, tone ({'|'.join(TONES)})", comment)
+    return None if found is None else Development(float(found[1]), found[2])
 
 
 def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:
@@ -151,6 +182,15 @@ def _pillow(pixels: np.ndarray) -> Any:
     from PIL import Image
 
     return Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
+
+
+def _chunk(comment: str) -> Any:
+    """A PNG file's comment."""
+    from PIL.PngImagePlugin import PngInfo
+
+    chunk = PngInfo()
+    chunk.add_text("Comment", comment)
+    return chunk
 
 
 def _codes(encoded: np.ndarray) -> np.ndarray:

@@ -1,13 +1,15 @@
-"""Diagnostics of a fit that has ended: pixels that see no body, and a loss that was still falling."""
+"""Diagnostics of a fit that has ended: pixels without a body, wrong exposure, a loss that was still falling."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
@@ -18,6 +20,12 @@ UNSEEN = 0.01
 
 FALLING = 0.01
 """Part of its loss that a fit may still gain over a window of iterations without a warning."""
+
+EXPLAINED = 0.5
+"""Part of the residual's squares that a factor of an image may explain without a warning."""
+
+STOPS = 0.2
+"""Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
 _SIDE = 96  # shorter side of small images [pixels]
@@ -32,17 +40,29 @@ def small_stage(problem: Problem) -> Stage:
     return Stage(scale=min(1.0, _SIDE / min(problem.targets[0].image.shape[:2])), supersampling=1)
 
 
-def unseen_share(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> float:
+def unseen_share(model: Model, images: torch.Tensor) -> float:
     """Share of the counted pixels that see no body; 0 for targets with coverage, which is compared.
 
     Such pixels are black in every image, so their residual stays, and light and reflectance cannot tell why.
     """
-    if problem.targets[0].image.shape[2] == 4:
+    if model.targets.shape[-1] == 4:
         return 0.0
-    model = Model(problem, setting, small_stage(problem))
-    with torch.no_grad():
-        coverage = model.images(values)[..., 3]
-    return float((model.weights * (coverage < 0.5)).sum() / model.weights.sum())
+    return float((model.weights * (images[..., 3] < 0.5)).sum() / model.weights.sum())
+
+
+def exposure_gaps(model: Model, images: torch.Tensor) -> dict[int, float]:
+    """Stops by which targets are brighter than images, for those views where that explains most of the residual."""
+    gaps = {}
+    for view, (image, target, weight) in enumerate(zip(images, model.targets, model.weights, strict=True)):
+        weight = weight[..., None].expand(*weight.shape, 3)
+        if model.saturated is not None:
+            weight = weight * ~model.saturated[view]
+        image, target = image[..., :3], target[..., :3]
+        factor = float((weight * image * target).sum() / (weight * image.square()).sum().clamp_min(1e-30))
+        residual, left = ((weight * (gain * image - target).square()).sum() for gain in (1.0, factor))
+        if factor > 0 and abs(math.log2(factor)) > STOPS and left < (1 - EXPLAINED) * residual:
+            gaps[view] = math.log2(factor)
+    return gaps
 
 
 def gain_of_last(losses: Sequence[float]) -> float:
@@ -64,11 +84,22 @@ def warn_of(
         losses: Of the last descent.
         end: Why it ended.
     """
-    share = unseen_share(problem, setting, values)
+    model = Model(problem, setting, small_stage(problem))
+    with torch.no_grad():
+        images = model.images(values)
+    share = unseen_share(model, images)
     if share > UNSEEN:
         check.warn(
             f"{share:.0%} of the counted pixels see no body, and are explained as black; mask them out, or make the "
             "ground larger",
+            DiagnosticWarning,
+        )
+    is_exposure_known = problem.basis is None and not any(isinstance(free, Exposure) for free in problem.free)
+    for view, stops in exposure_gaps(model, images).items() if is_exposure_known else ():
+        check.warn(
+            f"targets[{view}] is {2**stops:.3g} times as bright as what was found, which is most of the residual, and "
+            "may have led poses and colors astray: set exposure = true in [free], inverse.Exposure(), or the target's "
+            f"exposure = {stops:+.2f} [stops]",
             DiagnosticWarning,
         )
     gain = gain_of_last(losses)

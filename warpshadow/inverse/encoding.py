@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.color import linear_to_srgb, srgb_to_linear
+from warpshadow.assets.color import linear_to_srgb, srgb_to_linear, unfilmic
 from warpshadow.assets.image import read_image
 from warpshadow.check import AnyPath
 
@@ -63,8 +63,8 @@ def _metadata(path: Path) -> tuple[dict[str, Any], bool]:
         return {}, False  # which read_image refuses
 
 
-def read_linear(path: AnyPath, encoding: str | float) -> np.ndarray:
-    """Read a picture of an encoding as linear RGB, premultiplied with coverage where the file has alpha.
+def read_linear(path: AnyPath, encoding: str | float, tone: str = "clip") -> np.ndarray:
+    """Read a picture of an encoding and a tone curve as linear RGB, premultiplied with coverage if the file has alpha.
 
     Alpha is straight in PNG alone.
     """
@@ -73,19 +73,21 @@ def read_linear(path: AnyPath, encoding: str | float) -> np.ndarray:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
     is_integer = Path(path).suffix.lower() in _INTEGER_FILES
     stored = "srgb" if is_integer else "linear"  # as read_image takes them
-    if encoding != stored:
+    if encoding != stored or tone != "clip":
         codes = linear_to_srgb(pixels[..., :3]) if is_integer else pixels[..., :3]
-        pixels[..., :3] = decoded(codes, encoding)
+        pixels[..., :3] = decoded(codes, encoding, tone)
     if pixels.shape[2] == 4 and is_integer:
         pixels[..., :3] *= pixels[..., 3:]
     return pixels
 
 
-def decoded(codes: np.ndarray, encoding: str | float) -> np.ndarray:
+def decoded(codes: np.ndarray, encoding: str | float, tone: str = "clip") -> np.ndarray:
     """Linear radiance of codes from 0 to 1."""
     if encoding == "linear":
-        return codes
-    return srgb_to_linear(codes) if encoding == "srgb" else np.maximum(codes, 0) ** float(encoding)
+        bent = codes
+    else:
+        bent = srgb_to_linear(codes) if encoding == "srgb" else np.maximum(codes, 0) ** float(encoding)
+    return unfilmic(bent) if tone == "filmic" else bent
 
 
 def read_mask(path: AnyPath) -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
+from warpshadow.assets.picture import development
 from warpshadow.check import AnyPath
 from warpshadow.inverse.encoding import checked_encoding, decoded, guess_encoding, read_linear, read_mask
 from warpshadow.scene.scene import BodyLike
@@ -32,10 +33,12 @@ class Target:
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
         encoding: Of a file: "srgb", "linear", or a gamma, such as 2.2; by default as its metadata say, see
             :func:`~warpshadow.inverse.encoding.guess_encoding`.
-        exposure: At which the image was taken [stops]: its values are divided by 2^exposure.
+        exposure: At which the image was taken [stops]: its values are divided by 2^exposure. By default 0; and of a
+            picture that :class:`warpshadow.Picture` wrote, as ``warpshadow render -o x.png`` does, as the file says,
+            whose tone curve is undone, too.
         white_balance: Gains of red, green and blue with which it was developed: its values are divided by them.
         saturation: Value of the file, 0 to 1 as it is stored, from which a color is saturated: an image may be brighter
-            there. None: none is.
+            there. None: none is, but 1 in a picture as above.
         outlines: Where bodies are seen, by their numbers or names: masks as above, which the bodies' own are to cover.
             They tell a pose even where light and reflectance are unknown.
         distortion: OpenCV's coefficients k1, k2, p1, p2[, k3] of the camera's lens: the image is made that of a
@@ -56,7 +59,7 @@ class Target:
         camera: Camera | None = None,
         *,
         encoding: str | float | None = None,
-        exposure: float = 0.0,
+        exposure: float | None = None,
         white_balance: npt.ArrayLike | None = None,
         saturation: float | None = None,
         outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
@@ -65,11 +68,17 @@ class Target:
         if encoding is not None:
             encoding = checked_encoding(encoding)
         vars(self).update(image=image, mask=mask, camera=camera, encoding=encoding or "linear")
+        stops, tone = 0.0 if exposure is None else check.number("exposure", exposure), "clip"
         if check.is_path(image):
             path = check.file("image", image)
+            developed = development(path)
+            if developed is not None:
+                tone = developed.tone
+                stops = developed.exposure if exposure is None else stops
+                saturation = 1.0 if saturation is None else saturation
             with check.located("image"):
                 object.__setattr__(self, "encoding", encoding or guess_encoding(path))
-                object.__setattr__(self, "image", read_linear(path, self.encoding))
+                object.__setattr__(self, "image", read_linear(path, self.encoding, tone))
         elif encoding not in (None, "linear"):
             raise ValueError(f"encoding: got {encoding!r} for an array, expected a file, or linear values")
         if check.is_path(mask):
@@ -105,9 +114,9 @@ class Target:
                 f"image: got {size[0]} × {size[1]} pixels, expected the camera's "
                 f"{self.camera.width} × {self.camera.height}"
             )
-        saturated = None if saturation is None else image[..., :3] >= decoded(_share(saturation), self.encoding)
+        saturated = None if saturation is None else image[..., :3] >= decoded(_share(saturation), self.encoding, tone)
         object.__setattr__(self, "saturated", saturated if saturated is not None and saturated.any() else None)
-        gains = 2.0 ** check.number("exposure", exposure) * _gains(white_balance)
+        gains = 2.0**stops * _gains(white_balance)
         image[..., :3] = image[..., :3] / gains.astype(np.float32)
         if distortion is not None:
             image = self._undistorted(image, distortion)
