@@ -1,12 +1,14 @@
 """Argument checks: one clear error that names the argument, its value and the accepted values; and warnings."""
 
 import contextlib
+import dataclasses
 import difflib
 import functools
 import importlib
 import inspect
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -58,14 +60,16 @@ def known_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
 
 
 def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Make the TypeError of a function for an unknown keyword name the argument that is meant.
+    """Make the TypeError of a function for an unknown, missing or superfluous argument say what to write.
 
     Args:
-        instead: Replacements to suggest for likely mistakes; other keywords are compared with the arguments' names.
+        instead: What to write in place of keywords that are likely mistakes, other keywords are compared with the
+            arguments' names; and for arguments that are missing.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        known = list(inspect.signature(function).parameters)
+        signature = inspect.signature(function)
+        known = [name for name in signature.parameters if name not in ("self", "cls")]
         name = function.__qualname__.removesuffix(".__init__")
 
         @functools.wraps(function)
@@ -74,11 +78,45 @@ def keywords(**instead: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
                 if key not in known:
                     hint = f" (write {instead[key]})" if key in instead else _suggestion(key, known)
                     raise TypeError(f"{name}: unknown argument {key!r}{hint}")
+            try:
+                signature.bind(*args, **arguments)
+            except TypeError as error:
+                key = _unbound(signature, args, error)
+                hint = f" (write {instead[key]})" if key in instead else ""
+                raise TypeError(f"{name}: {error}{hint}; its arguments are {_listed(signature)}") from None
             return function(*args, **arguments)
 
         return checked
 
     return decorate
+
+
+def _unbound(signature: inspect.Signature, args: tuple[object, ...], error: TypeError) -> str:
+    """Name of the argument that is missing; or of the class of the first value that is superfluous."""
+    names = re.findall(r"missing a required argument: '(\w+)'", str(error))
+    by_position = [one for one in signature.parameters.values() if one.kind is one.POSITIONAL_OR_KEYWORD]
+    superfluous = [type(value).__name__.lower() for value in args[len(by_position) :]]
+    return next(iter([*names, *superfluous]), "")
+
+
+def _listed(signature: inspect.Signature) -> str:
+    """Arguments of a function, as it is called."""
+    by_name = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
+    return ", ".join(f"{one.name}=…" if one.kind is one.KEYWORD_ONLY else one.name for one in by_name)
+
+
+def frozen(kind: type[T]) -> type[T]:
+    """Make a frozen dataclass say how to make a changed one, where something is assigned to a field."""
+
+    def refuse(self: T, name: str, value: object) -> None:
+        own = kind.__name__
+        remedy = f"a {own} has no such field, and does not change"
+        if name in getattr(kind, "__dataclass_fields__", ()):
+            remedy = f"that of a {own} does not change; dataclasses.replace({own.lower()}, {name}=…) makes another"
+        raise dataclasses.FrozenInstanceError(f"{name}: {remedy}")
+
+    setattr(kind, "__setattr__", refuse)  # noqa: B010  (to types, it is no method)
+    return kind
 
 
 @contextlib.contextmanager

@@ -50,9 +50,22 @@ Up = Annotated[
     typer.Option(help="Of a mesh: the axis that points up; without it, it is guessed by how the mesh stands."),
 ]
 
+
+def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
+    """Refuse a size that is not two numbers, such as one number and the next option."""
+    if size is not None and not all(text.isdecimal() for text in size):
+        square = f", such as {size[0]} {size[0]}" if size[0].isdecimal() else ", such as 512 512"
+        raise typer.BadParameter(f"got {' '.join(size)}, expected width and height{square}")
+    return size
+
+
 Size = Annotated[
-    Optional[tuple[int, int]],
-    typer.Option(help="Of a mesh: width and height of the image, in pixels; without it 512 512."),
+    Optional[tuple[str, str]],
+    typer.Option(
+        help="Of a mesh: width and height of the image, in pixels; without it 512 512.",
+        metavar="WIDTH HEIGHT",
+        callback=_two_numbers,
+    ),
 ]
 
 Light = Annotated[
@@ -289,7 +302,7 @@ def render(
 
 
 def _load(
-    file: Path, up: str | None, size: tuple[int, int] | None, light: Path | None, is_quiet: bool, **settings: Any
+    file: Path, up: str | None, size: tuple[str, str] | None, light: Path | None, is_quiet: bool, **settings: Any
 ) -> Scene:
     """The scene of a file, or the default one of a mesh's file; of that a note says which way is up."""
     from warpshadow.assets.mesh_files import MESH_SUFFIXES
@@ -304,14 +317,16 @@ def _load(
         of_mesh = {"--up": (up, "[[body]] rotation"), "--size": (size, "[camera] size"), "--light": (light, "[light]")}
         for option, (value, key) in of_mesh.items():
             if value is not None:
-                raise ValueError(f"{option}: got {value} with {file}, expected a mesh; scene files have {key}")
+                shown = " ".join(value) if isinstance(value, tuple) else value
+                raise ValueError(f"{option}: got {shown} with {file}, expected a mesh; scene files have {key}")
         return load_scene(file, **settings)
     body = Body(file)
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
         up = guess.axis
         _note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
-    scene = default_scene(body, up=up, size=size or (512, 512), light=light)
+    width, height = map(int, size or ("512", "512"))
+    scene = default_scene(body, up=up, size=(width, height), light=light)
     bounces = settings.pop("bounces", scene.bounces)
     return replace(scene, visibility=Visibility.of(settings), bounces=bounces)
 

@@ -378,10 +378,9 @@ def test_a_missing_scene_file_is_named(tmp_path):
         ({"albedo": np.ones((12, 3), np.uint8)}, "albedo: got values of uint8"),
         ({"blockers": -1}, "blockers: got -1"),
         ({"rotation": (1, 2)}, r"rotation: got \(1, 2\), expected 3 finite numbers: an axis-angle"),
-        (
-            {"rotation": np.eye(3)},
-            r"rotation: got ndarray .* shape \(3, 3\), expected 3 .*: an axis-angle vector in degrees",
-        ),
+        ({"rotation": np.eye(4)}, r"rotation: got ndarray .* shape \(4, 4\), expected 3 .*: .* or a rotation matrix"),
+        ({"rotation": 2 * np.eye(3)}, r"rotation: got .*, expected a rotation \(orthonormal, determinant \+1\)"),
+        ({"rotation": [[1, 0], [0]]}, r"rotation: got \[\[1, 0\], \[0\]\], expected 3 finite numbers"),
         ({"translation": (np.inf, 0, 0)}, "translation: got 1 NaN or Inf"),
         ({"translation": None}, "translation: got None, expected 3 finite numbers"),
         ({"scale": 0.0}, "scale: got 0.0, expected a positive number"),
@@ -585,3 +584,10 @@ def test_arguments_in_each_others_places_are_named():
     ):
         with pytest.raises(ValueError, match=rf"^Scene: got {message}.*, expected Scene\(bodies, light, camera"):
             ws.Scene(*arguments)
+
+
+def test_a_matrix_is_a_rotation():
+    matrix = ws.Body(ws.icosphere(1.0, 0), rotation=(10, -130, 25)).rotation_matrix()
+    body = ws.Body(ws.icosphere(1.0, 0), rotation=matrix)
+    np.testing.assert_allclose(body.rotation, (10, -130, 25), atol=1e-9)
+    np.testing.assert_allclose(body.rotation_matrix(), matrix, atol=1e-12)

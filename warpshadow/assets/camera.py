@@ -53,6 +53,7 @@ class HasBodies(Protocol):
         """The bodies."""
 
 
+@check.frozen
 @dataclass(frozen=True, eq=False, init=False)
 class Camera:
     """A pinhole camera, of any focal lengths, skew and principal point.
@@ -105,7 +106,7 @@ class Camera:
         focal = self.intrinsics[:2, :2]
         if abs(np.linalg.det(focal)) <= 1e-12 * np.abs(focal).max() ** 2:
             raise ValueError(f"intrinsics: got a singular matrix {self.intrinsics.tolist()}, expected focal lengths")
-        _check_rotation("rotation", self.rotation)
+        check_rotation("rotation", self.rotation)
 
     def __repr__(self) -> str:
         x, y, z = self.eye
@@ -316,7 +317,7 @@ class Camera:
                 near = projection[2, 3] / (projection[2, 2] - 1.0)
         if not np.array_equal(view[3], (0.0, 0.0, 0.0, 1.0)):
             raise ValueError(f"view: got last row {view[3].tolist()}, expected [0, 0, 0, 1]")
-        _check_rotation("view", view[:3, :3])
+        check_rotation("view", view[:3, :3])
         rotation, translation = Y_DOWN @ view[:3, :3], Y_DOWN @ view[:3, 3]
         return cls(intrinsics, rotation, translation, width, height, near)
 
@@ -466,7 +467,8 @@ def _is_perspective(matrix: np.ndarray) -> bool:
     return np.array_equal(matrix[3], (0.0, 0.0, -1.0, 0.0))
 
 
-def _check_rotation(name: str, matrix: np.ndarray) -> None:
+def check_rotation(name: str, matrix: np.ndarray) -> None:
+    """Raise ValueError unless a matrix [3, 3] is a rotation."""
     orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() <= _ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(matrix) < 0.0:
         raise ValueError(f"{name}: got {matrix.tolist()}, expected a rotation (orthonormal, determinant +1)")

@@ -278,11 +278,22 @@ class BaseColor(NamedTuple):
     factor: tuple[float, ...] = (1.0, 1.0, 1.0)
 
 
+class Gloss(NamedTuple):
+    """glTF's roughness and metallic of a surface; and what a message says of them."""
+
+    roughness: float
+    metallic: float
+    remark: str = ""
+
+
+DIFFUSE = Gloss(1.0, 0.0)  # a surface that does not shine
+
+
 class MeshPart(NamedTuple):
     """One piece of a file; ``welded`` vertices lost their faces to the first of their duplicates.
 
     ``colors`` are linear, [vertex, 3]; ``colorless`` says why colors that it has are not. ``pictures`` has one for each
-    material, None for a material without one.
+    material, None for a material without one. ``gloss`` is None where the file says none.
     """
 
     positions: np.ndarray
@@ -294,6 +305,7 @@ class MeshPart(NamedTuple):
     colors: np.ndarray | None = None
     colorless: str = ""
     pictures: tuple[BaseColor | None, ...] = (None,)
+    gloss: Gloss | None = None
 
 
 def moved_part(part: MeshPart, linear: np.ndarray, translation: np.ndarray) -> MeshPart:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -12,8 +11,27 @@ import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.color import GRAY, srgb_to_linear
+from warpshadow.assets.gltf import (
+    NO_FACTORS,
+    Factors,
+    base_color_factor,
+    base_color_factors,
+    cuts_colors,
+    gloss_of,
+    gltf_tree,
+)
 from warpshadow.assets.image import read_rgb
-from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
+from warpshadow.assets.mesh import (
+    DIFFUSE,
+    BaseColor,
+    Mesh,
+    MeshError,
+    MeshPart,
+    checked_indices,
+    moved_part,
+    turned_over,
+)
+from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
 from warpshadow.assets.topology import CREASE, is_listed_first, join_faces, part_at_creases, rounds_edges
 from warpshadow.check import AnyPath
 
@@ -29,10 +47,6 @@ class OfTrimesh(Protocol):
         """Metadata that trimesh has of it, such as the file."""
 
 
-Factors = Mapping[tuple[int, ...], tuple[float, ...]]
-"""Linear factors of materials, by the codes that trimesh rounds them to."""
-
-NO_FACTORS: Factors = {}  # of meshes whose file is not known
 MeshSource = AnyPath | OfTrimesh  # accepted sources of a mesh
 
 
@@ -43,12 +57,30 @@ def is_of_trimesh(value: object) -> TypeGuard[trimesh.Trimesh | trimesh.Scene]:
 
 
 class _LoadedMesh(NamedTuple):
-    """A mesh, the picture that all its faces share, and remarks on surprises: on its shape, and on colors."""
+    """A mesh, the picture that all its faces share, its gloss, and remarks on surprises: on shape, colors and gloss.
+
+    ``gloss`` has roughness and metallic of the body, [1] each, or of each vertex, [vertex].
+    """
 
     mesh: Mesh
     picture: BaseColor | None
+    gloss: tuple[np.ndarray, np.ndarray] | None
     remarks: list[str]
     of_colors: list[str]
+    of_gloss: list[str]
+
+
+class Material(NamedTuple):
+    """The surface of a file's mesh, None for all that the file does not say.
+
+    Attributes:
+        texture: Linear RGB, shape [height, width, 3].
+        roughness, metallic: glTF's, one number [1], or one for each vertex [vertex].
+    """
+
+    texture: np.ndarray | None = None
+    roughness: np.ndarray | None = None
+    metallic: np.ndarray | None = None
 
 
 def load_mesh(path: MeshSource) -> Mesh:
@@ -87,31 +119,37 @@ def load_mesh(path: MeshSource) -> Mesh:
     return result.mesh
 
 
-def load_textured_mesh(path: MeshSource, *, reads_texture: bool = True) -> tuple[Mesh, np.ndarray | None]:
-    """Read a mesh as :func:`load_mesh` does, and the texture that the file names or holds.
+def load_material(path: MeshSource) -> tuple[Mesh, Material]:
+    """Read a mesh as :func:`load_mesh` does, and the surface that the file describes.
 
     A texture is the base color of glTF (times its factor), the ``map_Kd`` of OBJ, or the image of PLY, where all faces
-    have the same one, and uvs. USD colors are not read.
+    have the same one, and uvs. USD colors are not read. glTF's materials have roughness and metallic,
+    :func:`warpshadow.assets.gltf.gloss_of`.
 
     Args:
         path: As there.
-        reads_texture: Whether to read the texture, and to warn of dropped textures and colors.
-    Returns:
-        The mesh; and its texture, linear RGB of shape [height, width, 3], or None.
     Warns:
-        As there; and of a texture that cannot be read, or that counts in place of colors.
+        As there; of a texture that cannot be read, or that counts in place of colors; and of a texture of roughness,
+        of which the mean counts.
     """
-    mesh, picture, remarks, of_colors = _read(path)
+    mesh, picture, gloss, remarks, of_colors, of_gloss = _read(path)
     texture = None
-    if reads_texture and picture is not None:
+    if picture is not None:
         try:
             texture = _texels(picture)
             if mesh.colors is not None:
                 of_colors.append("colors of vertices do not count beside its texture")
         except (OSError, ValueError) as error:
             of_colors.append(f"its texture dropped ({error})")
-    _remark(path, remarks + of_colors if reads_texture else remarks)
-    return mesh, texture
+    _remark(path, remarks + of_colors + of_gloss)
+    return mesh, Material(texture, *(gloss or ()))
+
+
+def load_shape(path: MeshSource) -> Mesh:
+    """Read a mesh as :func:`load_mesh` does, without a word of the colors and textures that are not read."""
+    result = _read(path)
+    _remark(path, result.remarks)
+    return result.mesh
 
 
 def _remark(path: MeshSource, remarks: list[str]) -> None:
@@ -175,7 +213,19 @@ def _concatenate(parts: list[MeshPart], name: str) -> _LoadedMesh:
     if any(pictures) and not is_one:
         why = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_colors.append(f"textures dropped, {why}")
-    return _LoadedMesh(mesh, pictures[0] if is_one else None, remarks, of_colors)
+    of_gloss = sorted({part.gloss.remark for part in parts if part.gloss is not None and part.gloss.remark})
+    return _LoadedMesh(mesh, pictures[0] if is_one else None, _joined_gloss(parts), remarks, of_colors, of_gloss)
+
+
+def _joined_gloss(parts: list[MeshPart]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Roughness and metallic of all parts, of each vertex where they differ; None if all parts are diffuse."""
+    glosses = [part.gloss or DIFFUSE for part in parts]
+    if all(gloss.roughness == 1 and gloss.metallic == 0 for gloss in glosses):
+        return None
+    counts = [1] if len({gloss[:2] for gloss in glosses}) == 1 else [len(part.positions) for part in parts]
+    of_parts = [(gloss.roughness, gloss.metallic) for gloss in glosses[: len(counts)]]
+    roughness, metallic = np.repeat(np.array(of_parts, np.float32), counts, axis=0).T
+    return roughness, metallic
 
 
 def _joined_colors(parts: list[MeshPart]) -> np.ndarray | None:
@@ -351,16 +401,16 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
     """Read PLY, STL, GLB or glTF through trimesh, with its merging, cleaning and reordering switched off."""
     import trimesh
 
-    if path.suffix.lower() == ".ply" and (fault := _ply_fault(path.read_bytes())):
+    if path.suffix.lower() == ".ply" and (fault := ply_fault(path.read_bytes())):
         raise MeshError(f"the file is cut off: {fault}")
-    tree = _gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
+    tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    parts = _trimesh_parts(loaded, of_file=True, factors=_base_color_factors(tree))
+    parts = _trimesh_parts(loaded, of_file=True, factors=base_color_factors(tree))
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
         return [_merged(part) for part in parts]
-    if _cuts_colors(tree):
+    if cuts_colors(tree):
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
 
@@ -377,36 +427,6 @@ def _stl_fault(content: bytes) -> str:
     return f"; the file is cut off: got {len(content)} bytes" + (
         f", and its header says {count} triangles, which are {size}" if has_header else ", fewer than its header has"
     )
-
-
-def _ply_fault(content: bytes) -> str:
-    """Where a PLY file is cut off, for messages; "" if its items may all be there."""
-    header, mark, body = content.partition(b"end_header")
-    if not mark:
-        return "its header has no end" if header.startswith(b"ply") else ""
-    count, needed, elements = 0, 0, []
-    is_ascii = b"format ascii" in header
-    for words in map(bytes.split, header.splitlines()):
-        if words[:1] == [b"element"]:
-            count = int(words[2])
-            elements.append(f"{count} of {words[1].decode(errors='replace')}")
-            needed += is_ascii * count
-        elif words[:1] == [b"property"] and not is_ascii:
-            has_list = words[1] == b"list"
-            entries = 3 if has_list and words[-1] in (b"vertex_indices", b"vertex_index") else 0
-            sizes = [_PLY_BYTES.get(word, 0) for word in words[2:4]] if has_list else [0, 0]
-            needed += count * (sizes[0] + entries * sizes[1] if has_list else _PLY_BYTES.get(words[1], 0))
-    lines = [line for line in body.splitlines() if line.strip()] if is_ascii else []
-    got, unit = (len(lines), "lines") if is_ascii else (len(body.split(b"\n", 1)[-1]), "bytes")
-    if got >= needed:
-        return ""
-    return f"got {got} {unit} after its header, which says {', '.join(elements)}, at entries {needed} {unit}"
-
-
-_PLY_BYTES = {b"char": 1, b"uchar": 1, b"short": 2, b"ushort": 2, b"int": 4, b"uint": 4, b"float": 4, b"double": 8} | {
-    f"{kind}{bits}".encode(): bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)
-}
-"""Sizes of the numbers of PLY files."""
 
 
 def _merged(part: MeshPart) -> MeshPart:
@@ -428,40 +448,6 @@ def _merged(part: MeshPart) -> MeshPart:
     return part._replace(positions=positions, faces=faces, colors=colors, remark=remark)
 
 
-def _gltf_tree(path: Path) -> dict:
-    """The JSON of a glTF file; on bad JSON trimesh would even read a model.gltf beside the file instead."""
-    content = path.read_bytes()
-    if content[:4] == b"glTF":
-        content = content[20:][: int.from_bytes(content[12:16], "little")]
-    return json.loads(content)
-
-
-def _cuts_colors(tree: dict) -> bool:
-    """Whether trimesh would take the lower half of 16-bit colors: in a glTF file without a material for them."""
-    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
-    colors = [item["attributes"].get("COLOR_0") for item in primitives if "material" not in item]
-    return any(color is not None and tree["accessors"][color]["componentType"] == 5123 for color in colors)
-
-
-def _base_color_factors(tree: dict) -> Factors:
-    """Factors of a glTF file's materials by the codes that trimesh rounds them to; the mean where several have one."""
-    result: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for material in tree.get("materials", []):
-        factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1.0, 1.0, 1.0))
-        exact = np.clip(np.array(factor[:3], np.float64), 0.0, 1.0)
-        result.setdefault(tuple((255 * exact).round().astype(int).tolist()), []).append(exact)
-    return {codes: tuple(np.mean(factors, axis=0).tolist()) for codes, factors in result.items()}
-
-
-def _base_color_factor(material, factors: Factors) -> tuple[float, ...] | None:
-    """The linear factor of a material of trimesh, in steps of 1/255 where its file is not known; None where none is."""
-    factor = getattr(material, "baseColorFactor", None)
-    if factor is None:
-        return None
-    codes = tuple(factor[:3].tolist())
-    return factors.get(codes, tuple(code / 255 for code in codes))
-
-
 def _trimesh_parts(
     source: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: Factors = NO_FACTORS
 ) -> list[MeshPart]:
@@ -481,10 +467,11 @@ def _trimesh_parts(
 
 def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
-    pictures = (_trimesh_picture(getattr(shape.visual, "material", None), factors),)
+    material = getattr(shape.visual, "material", None)
+    pictures = (_trimesh_picture(material, factors),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
-    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures), shape, factors)
-    corner_uvs = _ply_corner_uvs(shape)
+    part = _trimesh_colored(MeshPart(positions, faces, pictures=pictures, gloss=gloss_of(material)), shape, factors)
+    corner_uvs = ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
         return part._replace(uvs=corner_uvs, uv_faces=np.arange(len(corner_uvs)).reshape(-1, 3))
     uvs = getattr(shape.visual, "uv", None)
@@ -507,7 +494,7 @@ def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
     visual, linear = shape.visual, shape.source.file_type in ("glb", "gltf")
     if visual.kind == "face":
         return _colored(part, visual.face_colors[:, None].repeat(3, axis=1), linear=linear)
-    of_ply = _ply_colors(shape)
+    of_ply = ply_colors(shape)
     if visual.kind == "vertex":
         colors = visual.vertex_colors
         if of_ply is not None and np.array_equal(to_rgba(of_ply)[:, :3], colors[:, :3]):
@@ -518,7 +505,7 @@ def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
     colors = visual.vertex_attributes.get("color", of_ply)
     if colors is not None:
         part = _colored(part, colors, linear=linear)
-    factor = _base_color_factor(visual.material, factors)
+    factor = base_color_factor(visual.material, factors)
     if factor is None or any(part.pictures) or factor == (1.0, 1.0, 1.0):  # white, glTF's default, says nothing
         return part
     white = np.ones((len(part.positions), 3), np.float32)
@@ -532,37 +519,8 @@ def _trimesh_picture(material, factors: Factors) -> BaseColor | None:
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or image == empty_material().image:  # which trimesh puts where there is none
         return None
-    factor = _base_color_factor(material, factors)
+    factor = base_color_factor(material, factors)
     return BaseColor(image) if factor is None else BaseColor(image, factor)
-
-
-def _ply_corner_uvs(shape) -> np.ndarray | None:
-    """The uvs [corner, 2] of a PLY file that stores them with faces; trimesh gives each vertex only one."""
-    raw = shape.metadata.get("_ply_raw", {})
-    data = raw.get("face", {}).get("data", {})
-    names = data.dtype.names or () if isinstance(data, np.ndarray) else data
-    if "texcoord" not in names:
-        return None
-    corners = next((data[name] for name in ("vertex_indices", "vertex_index") if name in names), None)
-    axes = [np.ravel(raw["vertex"]["data"][axis]) for axis in "xyz"]
-    points = np.stack(axes, axis=-1).astype(np.float32)
-    if corners is None or not np.array_equal(points[_ply_values(corners)], shape.triangles.astype(np.float32)):
-        return None  # the faces no longer match the file's
-    return _ply_values(data["texcoord"]).reshape(-1, 2)
-
-
-def _ply_colors(shape) -> np.ndarray | None:
-    """The colors [vertex, 3] of a PLY file, which trimesh leaves where vertices have uvs, too."""
-    data = shape.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
-    names = data.dtype.names or () if isinstance(data, np.ndarray) else data
-    channels = [np.ravel(data[name]) for name in ("red", "green", "blue") if name in names]
-    is_whole = len(channels) == 3 and len(channels[0]) == len(shape.vertices)
-    return np.stack(channels, axis=1) if is_whole else None
-
-
-def _ply_values(lists) -> np.ndarray:
-    """The values of lists: binary files hold [count, values], ASCII files the values alone."""
-    return np.asarray(lists["f1"] if getattr(lists.dtype, "names", None) else lists)
 
 
 def _read_usd(path: Path) -> list[MeshPart]:

@@ -142,8 +142,8 @@ def development(path: AnyPath) -> Development | None:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None
     comment = comment.decode(errors="replace") if isinstance(comment, bytes) else comment
-    found = re.fullmatch(rf"warpshadow: exposure ([+-]\d+\.\d+) stops, tone ({'|'.join(TONES)})", comment)
-    return None if found is None else Development(float(found[1]), found[2])
+    match = re.fullmatch(rf"warpshadow: exposure ([+-]\d+\.\d+) stops, tone ({'|'.join(TONES)})", comment)
+    return None if match is None else Development(float(match[1]), match[2])
 
 
 def _checked(name: str, image: npt.ArrayLike) -> np.ndarray:

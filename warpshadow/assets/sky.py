@@ -13,6 +13,11 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths import sh
 
 
+@check.keywords(
+    **dict.fromkeys(("sun", "direction"), "sun_direction=(x, y, z), towards the sun"),
+    strength="sun_strength",
+    **dict.fromkeys(("radius", "sun_size"), "sun_radius, in degrees"),
+)
 def synthetic_sky(
     sun_direction: npt.ArrayLike = (0.5, 0.7, 0.2),
     *,

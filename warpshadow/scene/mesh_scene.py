@@ -85,6 +85,7 @@ def default_scene(
     Args:
         body: A body, or a source of one: a mesh, or any source that :func:`warpshadow.load_mesh` reads. It becomes 2
             units large. Where it has many sharp edges that its normals round, they are parted, :meth:`Body.creased`.
+            Where it is a metal, light bounces once, so that it reflects the ground.
         up: Axis of the mesh that points up, "y" or "z", or "guess", which :func:`guess_up` finds by its shape.
         size: Width and height of the image [pixels].
         light: In place of the sky: an environment map, or the file of one.
@@ -96,7 +97,8 @@ def default_scene(
     body = body.creased() if body.mesh.rounds_edges else body
     body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
     ground = Body(infinite_ground(6.0), albedo=(0.4, 0.4, 0.4))
-    return Scene([body, ground], synthetic_sky() if light is None else light, Camera.framing(body, size=size))
+    camera, sky = Camera.framing(body, size=size), synthetic_sky() if light is None else light
+    return Scene([body, ground], sky, camera, bounces=int(body.metallic is not None and body.metallic.any()))
 
 
 def _footing(points: np.ndarray, middle: np.ndarray, axis: int) -> float:

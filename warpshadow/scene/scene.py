@@ -16,11 +16,12 @@ from warpshadow.assets.color import GRAY, srgb_to_linear
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.assets.mesh import Mesh, MeshError
-from warpshadow.assets.mesh_files import MeshSource, is_of_trimesh, load_textured_mesh
+from warpshadow.assets.mesh_files import Material, MeshSource, is_of_trimesh, load_material, load_shape
 from warpshadow.assets.topology import CREASE
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.maths.directions import check_count, falloff_width
+from warpshadow.scene.rotation import rotation_matrix, rotation_vector
 from warpshadow.spheres import Spheres
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.exponential import THRESHOLDS
@@ -90,6 +91,7 @@ PerBody = Sequence[Item | None] | Mapping[int, Item | None] | Mapping[str, Item 
 """Something for each body of a scene, a list of them all; or for some, by their numbers or names."""
 
 
+@check.frozen
 @dataclass(frozen=True, eq=False)
 class Visibility:
     """How visibility is computed. A setting that the method does not read is refused unless it is the default.
@@ -191,6 +193,7 @@ class Visibility:
         return Visibility.of(vars(self) | {"method": method})
 
 
+@check.frozen
 @dataclass(frozen=True, eq=False, init=False)
 class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
@@ -217,8 +220,8 @@ class Body:
             light in place of the light it blocks.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
-            stand, and :meth:`Renderer.placed` can turn it about its middle. (In :mod:`warpshadow.torch` and
-            :mod:`warpshadow.stages` axis-angle vectors are in radians.)
+            stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
+            vector. (In :mod:`warpshadow.torch` and :mod:`warpshadow.stages` axis-angle vectors are in radians.)
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
@@ -231,14 +234,16 @@ class Body:
             :func:`warpshadow.render`, show flat bodies by pixel, and under a sun all.
         self_shadows: How it casts shadows on itself, "traced", by "rays" or by its "spheres", as for
             :class:`Visibility`; None for the scene's setting.
-        name: Its name for lookups; by default the name of its mesh, so of the mesh's file.
+        name: Its name for lookups; None for that of its mesh, so of the mesh's file. :attr:`called` is the one that
+            counts.
         shadow_catcher: Whether it models a surface in the photograph: :func:`warpshadow.insert` does not draw it, and
             has it darken the photograph, or with bounces tint it, by the ratio of the light that it receives with the
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number or one for each vertex [vertex], or an .npy file of them: the surface
-            shines by a GGX lobe of width α = roughness². None, the default, is a diffuse surface. Below 0.1 it is shown
-            as 0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
+            shines by a GGX lobe of width α = roughness². None, the default, is what the mesh's file says, if that is
+            glTF and neither ``albedo`` nor ``texture`` is given, and else a diffuse surface. Below 0.1 it is shown as
+            0.1. Such a body has receivers at pixels; all methods but "log-sh" show it. It reflects other bodies
             where light bounces; with ``bounces=0`` they are black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of what is not metal, of which 1, the default, is 4% straight on.
@@ -295,9 +300,8 @@ class Body:
                     "'auto', or Spheres, such as fit_spheres(mesh).spheres, or an .npz file of them"
                 )
             object.__setattr__(self, "blockers", int(self.blockers))
-        remedies = {"rotation": "an axis-angle vector in degrees; scipy's Rotation.as_rotvec(degrees=True) makes one"}
-        for name in ("rotation", "translation"):
-            object.__setattr__(self, name, check.array(name, getattr(self, name), (3,), remedies.get(name, "")))
+        object.__setattr__(self, "rotation", rotation_vector(self.rotation))
+        object.__setattr__(self, "translation", check.array("translation", self.translation, (3,)))
         if not (check.is_number(self.scale) and 0 < self.scale <= check.LARGEST):
             raise ValueError(
                 f"scale: got {check.described(self.scale)}, expected a positive number up to {check.LARGEST:g} for all "
@@ -327,17 +331,23 @@ class Body:
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
     def _read_mesh(self) -> None:
-        """Load the mesh from its file or from trimesh, and its reflectance where none is given."""
-        mesh, texture = self.mesh, None
+        """Load the mesh from its file or from trimesh, and its surface where none is given."""
+        mesh, material = self.mesh, Material()
         source = check.file("mesh", mesh) if check.is_path(mesh) else mesh
         if check.is_path(source) or is_of_trimesh(source):
             with check.located("mesh", MeshError):
-                mesh, texture = load_textured_mesh(source, reads_texture=self.albedo is None and self.texture is None)
+                if self.albedo is None and self.texture is None:
+                    mesh, material = load_material(source)
+                else:
+                    mesh = load_shape(source)
         vars(self).update(
             mesh=mesh,
             albedo=_colors(mesh) if self.albedo is None else self.albedo,
-            texture=texture if self.texture is None else self.texture,
+            texture=material.texture if self.texture is None else self.texture,
         )
+        is_diffuse = self.shadow_catcher or self.receivers in ("vertex", "adaptive")
+        if all(getattr(self, name) is None for name in GLOSS) and not is_diffuse:
+            vars(self).update(roughness=material.roughness, metallic=material.metallic)
 
     def _read_files(self) -> None:
         """Replace paths by the content of their files."""
@@ -410,13 +420,8 @@ class Body:
         return self.roughness is not None
 
     def rotation_matrix(self) -> np.ndarray:
-        """The rotation as a matrix, float64 of shape [3, 3] (Rodrigues' formula)."""
-        angle = np.radians(np.linalg.norm(self.rotation))
-        if angle == 0:
-            return np.eye(3)
-        x, y, z = np.array(self.rotation) / np.linalg.norm(self.rotation)
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        """The rotation as a matrix, float64 of shape [3, 3]."""
+        return rotation_matrix(self.rotation)
 
     def creased(self, angle: float = CREASE) -> Body:
         """Part the vertices of its mesh along sharp edges, :meth:`warpshadow.Mesh.creased`; their colors go along.
@@ -527,6 +532,7 @@ def _role(value: object, name: str) -> str:
     return next((role for kind, role in roles.items() if isinstance(value, kind)), name)
 
 
+@check.frozen
 @dataclass(frozen=True, eq=False, init=False)
 class Scene:
     """Bodies, their light and a camera, in a right-handed world with y up, in units of length of your choice.
@@ -555,7 +561,9 @@ class Scene:
     bounces: Bounces = 0
 
     @check.keywords(
-        cameras="camera; several go to Renderer(scene, cameras=[…])", method="visibility=Visibility(method)"
+        cameras="camera; several go to Renderer(scene, cameras=[…])",
+        method="visibility=Visibility(method)",
+        light="Scene(bodies, synthetic_sky()), or the path of a map",
     )
     def __init__(
         self,

@@ -24,6 +24,7 @@ class Renderer(renderer.SceneRenderer):
         cameras, device, basis, progress: As there.
     """
 
+    @check.keywords(camera="cameras=[camera], or Scene(…, camera=…)", size="Scene(…, camera=Camera.framing(…, size=…))")
     def __init__(
         self,
         scene: Scene,

@@ -216,11 +216,8 @@ class Pose(FreeOfBody):
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
         """Move the body."""
-        from scipy.spatial.transform import Rotation
-
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
-        vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
-        fitted.change_body(self.number, rotation=vector, translation=translation, scale=float(scale))
+        fitted.change_body(self.number, rotation=rotation, translation=translation, scale=float(scale))
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """The pose."""

@@ -1,0 +1,46 @@
+"""The first mistakes of everybody get an answer that says what to write."""
+
+import dataclasses
+
+import pytest
+
+import warpshadow as ws
+
+BALL = ws.Body(ws.icosphere(1.0, 0))
+SKY = ws.EnvironmentMap.constant(1.0)
+SCENE = ws.Scene([BALL], SKY)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ws.Scene([BALL]), r"Scene: missing a required argument: 'light' \(write .*synthetic_sky\(\)"),
+        (lambda: ws.Scene(), "Scene: missing a required argument: 'bodies'; its arguments are bodies, light, camera"),
+        (lambda: ws.render(SCENE, SCENE.camera), r"render: too many positional arguments \(write Scene\(…, camera="),
+        (lambda: ws.render(SCENE, camera=SCENE.camera), r"render: unknown argument 'camera' \(write Scene\(…, camera="),
+        (lambda: ws.Renderer(SCENE, camera=SCENE.camera), r"unknown argument 'camera' \(write cameras=\[camera\]"),
+        (lambda: ws.synthetic_sky(sun=(0, 1, 0)), r"synthetic_sky: unknown argument 'sun' \(write sun_direction="),
+        (
+            lambda: ws.synthetic_sky((0, 1, 0), 3.0),
+            "too many positional arguments; .* are sun_direction, sun_strength",
+        ),
+        (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_told_with_those_that_do(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("value", "field", "message"),
+    [
+        (BALL, "rotation", r"rotation: that of a Body does not change; dataclasses.replace\(body, rotation=…\)"),
+        (SCENE, "camera", r"dataclasses.replace\(scene, camera=…\) makes another"),
+        (SCENE.camera, "fov_y", "fov_y: a Camera has no such field, and does not change"),
+        (SCENE.visibility, "method", r"dataclasses.replace\(visibility, method=…\)"),
+    ],
+)
+def test_fields_do_not_change_and_the_error_says_how_to_make_another(value, field, message):
+    with pytest.raises(dataclasses.FrozenInstanceError, match=message):
+        setattr(value, field, None)

@@ -1,0 +1,38 @@
+"""Rotations of bodies: axis-angle vectors in degrees, and matrices."""
+
+import numpy as np
+import numpy.typing as npt
+
+from warpshadow import check
+from warpshadow.assets.camera import check_rotation
+
+
+def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
+    """The axis-angle vector [degrees] of a rotation, float64 of shape [3].
+
+    Args:
+        value: Such a vector, [3], or a matrix, [3, 3].
+    Raises:
+        ValueError: for other shapes, and for a matrix that is no rotation.
+    """
+    meaning = "an axis-angle vector in degrees, or a rotation matrix [3, 3]"
+    matrix = check.numbers("rotation", value, expected=f"3 finite numbers: {meaning}", dtype=np.float64)
+    if matrix.shape != (3, 3):
+        return check.array("rotation", value, (3,), meaning)
+    from scipy.spatial.transform import Rotation
+
+    check.finite("rotation", matrix)
+    check_rotation("rotation", matrix)
+    vector: np.ndarray = Rotation.from_matrix(matrix).as_rotvec(degrees=True)
+    vector.setflags(write=False)
+    return vector
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """The matrix of an axis-angle vector [degrees], float64 of shape [3, 3] (Rodrigues' formula)."""
+    degrees = np.linalg.norm(vector)
+    if degrees == 0:
+        return np.eye(3)
+    x, y, z = np.array(vector) / degrees
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(np.radians(degrees)) * cross + (1 - np.cos(np.radians(degrees))) * cross @ cross
