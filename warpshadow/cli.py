@@ -357,6 +357,32 @@ def _frames(
 
 
 @app.command()
+def scene(
+    mesh: Annotated[
+        Optional[Path], typer.Argument(help="Mesh: .obj, .ply, .stl, .glb, .usd; without one, Warp's bunny.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write, .toml.")] = Path("scene.toml"),
+    up: Up = None,
+    size: Size = None,
+    light: Light = None,
+    is_quiet: Quiet = False,
+) -> None:
+    """Write a scene file of a mesh on a ground under a sky, to be edited, rendered and viewed.
+
+    Without a mesh it is of Warp's bunny, which is written beside it, bunny.obj.
+    """
+    from warpshadow.scene.starter import write_bunny, write_starter
+
+    with _clear_errors():
+        _check_output(output, ".toml")
+        if mesh is None:
+            mesh = write_bunny(output.parent)
+            _note(f"{mesh}: Warp's bunny", is_quiet)
+        write_starter(output, mesh, _load(mesh, up, size, light, is_quiet), light=light)
+        _note(f"{output}: warpshadow view {output} shows it", is_quiet)
+
+
+@app.command()
 def insert(
     scene: Annotated[
         Path,

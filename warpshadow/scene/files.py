@@ -19,6 +19,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MESH_SUFFIXES
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
+from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
@@ -44,7 +45,7 @@ _FRAMING_KEYS = ("framing", "direction", "margin")
 _PINHOLE_KEYS = ("intrinsics", "rotation", "translation")
 _CAMERA_KEYS = (*_VIEW_KEYS, *_PINHOLE_KEYS, "pixel_centers", "size", "near")
 _PIXEL_CENTERS = {"half": np.zeros((3, 3)), "whole": HALF_PIXEL}
-_LIGHT_KEYS = ("envmap", "sh", "rotation", "scale", "bounces")
+_LIGHT_KEYS = ("envmap", "sky", "sh", "rotation", "scale", "bounces")
 _PLACE_KEYS = (*(field.name for field in fields(Body) if field.name != "mesh"), "spheres", "on_ground", "creased")
 _PRIMITIVES: dict[str, Callable[..., Mesh]] = {
     "plane": plane,
@@ -167,12 +168,15 @@ def parse_camera(table: Table) -> Camera:
 def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
     toml_tables.check_table(table)
     _check_keys("[light]", table)
-    if ("envmap" in table) == ("sh" in table):
-        raise ValueError('expected either envmap = "FILE" or sh = [[r, g, b], …]')
+    if sum(key in table for key in ("envmap", "sky", "sh")) != 1:
+        raise ValueError('expected one of envmap = "FILE", sky = {} and sh = [[r, g, b], …]')
     rotation = check.number("rotation", table.get("rotation", 0.0))
     scale = check.nonnegative("scale", table.get("scale", 1.0))
     if "envmap" in table:
         return turned_light(EnvironmentMap.read(toml_tables.file(table, "envmap", folder)), rotation, scale)
+    if "sky" in table:
+        with check.located("sky"):
+            return turned_light(toml_tables.make(synthetic_sky, table["sky"]), rotation, scale)
     coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
     check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
     check.finite("sh", coefficients)

@@ -18,6 +18,8 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.scene.scene import Body, Scene
 
+GROUND_SIZE = 6.0  # within which the ground's faces are small, as infinite_ground has it [scene units]
+
 GUESS = "guess"  # ways to point up: the one that :func:`guess_up` finds
 
 _AXES = {"y": 1, "z": 2}
@@ -96,7 +98,7 @@ def default_scene(
     axis = guess_up(body.mesh, suffix).axis if up == GUESS else up
     body = body.creased() if body.mesh.rounds_edges else body
     body = replace(body, rotation=np.array([-90.0 if axis == "z" else 0.0, 0.0, 0.0])).on_ground(size=2)
-    ground = Body(infinite_ground(6.0), albedo=(0.4, 0.4, 0.4))
+    ground = Body(infinite_ground(GROUND_SIZE), albedo=(0.4, 0.4, 0.4))
     camera, sky = Camera.framing(body, size=size), synthetic_sky() if light is None else light
     return Scene([body, ground], sky, camera, bounces=int(body.metallic is not None and body.metallic.any()))
 

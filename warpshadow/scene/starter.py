@@ -1,0 +1,92 @@
+"""A scene file to begin with, of a mesh as :func:`warpshadow.default_scene` shows it, to be edited by hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from warpshadow.assets import files
+from warpshadow.assets.mesh_files import load_mesh
+from warpshadow.assets.topology import CREASE
+from warpshadow.scene.mesh_scene import GROUND_SIZE
+from warpshadow.scene.scene import Scene
+
+_SCENE = """\
+# warpshadow render {name} -o picture.png, or warpshadow view {name}
+
+[camera]
+framing = "auto"             # as near as the bodies are in view
+size = [{width}, {height}]            # width, height
+
+[light]
+{light}
+bounces = {bounces}                  # how often light bounces between bodies, or "all"
+
+[[body]]
+mesh = "{mesh}"
+on_ground = {{size = 2.0}}     # 2 units large, standing
+{options}
+[[body]]
+primitive = "infinite_ground"
+size = {ground_size}
+albedo = {albedo}
+"""
+
+
+_SKY = "sky = {}                     # clear, with a sun"
+
+
+def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = None) -> None:
+    """Write the default scene of a mesh; its file names the mesh's, and is short.
+
+    Args:
+        path: The scene file.
+        mesh: File of the mesh.
+        scene: Its :func:`warpshadow.default_scene`.
+        light: File of the environment map that lights it, if not the sky.
+    """
+    body, ground = scene.bodies
+    options = []
+    if body.rotation.any():
+        options.append(f"rotation = {body.rotation.tolist()}  # axis-angle vector, degrees: z is up")
+    if body.mesh.origins is not None:
+        options.append(f"creased = {CREASE:g}                 # edges stay sharp where faces bend by more degrees")
+    lines = _SCENE.format(
+        name=path.name,
+        width=scene.camera.width,
+        height=scene.camera.height,
+        light="sky = {}                     # clear, with a sun"
+        if light is None
+        else f'envmap = "{_from(path, light)}"',
+        bounces=scene.bounces,
+        mesh=_from(path, mesh),
+        options="".join(f"{option}\n" for option in options),
+        ground_size=GROUND_SIZE,
+        albedo=[round(float(value), 4) for value in ground.albedo],
+    )
+    with files.whole(path) as unfinished:
+        unfinished.write_text(lines, encoding="utf-8")
+
+
+def write_bunny(folder: Path) -> Path:
+    """Write Warp's bunny as bunny.obj, and return its path.
+
+    Raises:
+        FileExistsError: where another file has its name.
+        ImportError: without the package usd-core.
+    """
+    import warp.examples
+
+    path = folder / "bunny.obj"
+    mesh = load_mesh(Path(warp.examples.get_asset_directory(), "bunny.usd"))
+    if path.exists() and not np.array_equal(load_mesh(path).positions, mesh.positions):
+        raise FileExistsError(f"{path}: got another file than Warp's bunny, expected none; give it as MESH")
+    mesh.write(path)
+    return path
+
+
+def _from(path: Path, file: Path) -> str:
+    """A file as a scene file names it: from its folder."""
+    return Path(os.path.relpath(file, path.parent)).as_posix()
