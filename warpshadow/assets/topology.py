@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow import check
+from warpshadow.maths.components import connected_components
 
 _NOT_MANIFOLD = -2
 
@@ -92,7 +93,7 @@ def part_at_creases(
         links.append((3 * face + corner, 3 * neighbor + other))
     ends, other_ends = np.concatenate(links, axis=1)
     count = 3 * len(faces)
-    fan = _connected(ends, other_ends, count).reshape(-1, 3)
+    fan = connected_components(ends, other_ends, count).reshape(-1, 3)
     is_turned = (surface.faces != faces).any(axis=1)
     keys = faces.astype(np.int64) * count + np.where(is_turned[:, None], fan[:, ::-1], fan)
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
@@ -118,8 +119,11 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     normals = face_normals(corners)
     cosines = np.einsum("ij,ij->i", normals[face], normals[neighbor])
     lengths = np.linalg.norm(np.subtract(*corners[face, (edge + [[1], [2]]) % 3]), axis=1)
+    diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
+    if lengths[cosines < np.cos(np.radians(50))].sum() <= diagonal:
+        return False
     linked_face, edge = np.nonzero(surface.neighbors >= 0)
-    pieces = _connected(linked_face, surface.neighbors[linked_face, edge], len(surface.faces))
+    pieces = connected_components(linked_face, surface.neighbors[linked_face, edge], len(surface.faces))
     count = int(pieces.max()) + 1
     sharp, bent = (
         np.bincount(pieces[face], lengths * (cosines < np.cos(np.radians(angle))), count) for angle in (50, 20)
@@ -129,7 +133,6 @@ def rounds_edges(surface: MeshTopology, positions: np.ndarray) -> bool:
     np.maximum.at(high, pieces, corners.max(axis=1))
     diagonals = np.linalg.norm(high - low, axis=1)
     is_many = (diagonals < sharp) & (sharp < 25 * diagonals) & (bent - sharp < 0.1 * sharp)
-    diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
     return bool(sharp[is_many].sum() > max(diagonal, sharp.sum() / 2))
 
 
@@ -206,7 +209,8 @@ def is_listed_first(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
     """Join faces of which none is listed twice."""
-    neighbors, places = edge_neighbors(faces, positions), _places(positions)[faces]
+    places = _places(positions)[faces]
+    neighbors = edge_neighbors(places)
     first, last = np.roll(places, -1, axis=1), np.roll(places, -2, axis=1)  # of the edges opposite to corners
     neighbor = np.maximum(neighbors, 0)
     runs_back = (first[neighbor] == last[:, :, None]) & (last[neighbor] == first[:, :, None])
@@ -215,17 +219,17 @@ def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | 
         is_turned = _turned(neighbors, winds_alike)
         winds_alike ^= is_turned[:, None] ^ is_turned[neighbor]
         winds_alike |= neighbors < 0
-        faces, neighbors = (_with_turned(values, is_turned) for values in (faces, neighbors))
+        faces, places, neighbors = (_with_turned(values, is_turned) for values in (faces, places, neighbors))
         uv_faces = None if uv_faces is None else _with_turned(uv_faces, is_turned)
-    return MeshTopology(faces, uv_faces, neighbors, bool(winds_alike.all()) and _is_closed(positions, faces))
+    return MeshTopology(faces, uv_faces, neighbors, bool(winds_alike.all()) and _is_closed(positions, faces, places))
 
 
-def _is_closed(positions: np.ndarray, faces: np.ndarray) -> bool:
+def _is_closed(positions: np.ndarray, faces: np.ndarray, places: np.ndarray) -> bool:
     """Whether as many faces run along each edge one way as the other, and each piece encloses a positive volume.
 
-    So boxes that share an edge, at which four faces meet, are closed as each of them is.
+    So boxes that share an edge, at which four faces meet, are closed as each of them is. ``places`` of the faces'
+    corners are the same where positions are.
     """
-    places = _places(positions)[faces]
     is_proper = (places != np.roll(places, 1, axis=1)).all(axis=1)
     places, corners = places[is_proper], (positions - positions[0].astype(np.float64))[faces[is_proper]]
     starts, ends = places.ravel(), np.roll(places, -1, axis=1).ravel()
@@ -234,19 +238,9 @@ def _is_closed(positions: np.ndarray, faces: np.ndarray) -> bool:
     if np.bincount(edge, np.where(starts < ends, 1, -1)).any():
         return False
     count = len(places)
-    piece = _connected(np.repeat(np.arange(count), 3), count + edge, count + len(edge))[:count]
-    _, piece = np.unique(piece, return_inverse=True)
+    piece = connected_components(np.repeat(np.arange(count), 3), count + edge, count + len(edge))[:count]
     a, b, c = np.moveaxis(corners, 1, 0)
     return bool((np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c))) > 0).all())
-
-
-def _connected(ends: np.ndarray, other_ends: np.ndarray, count: int) -> np.ndarray:
-    """Number of the part of a graph that each of its nodes is in."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(ends)), (ends, other_ends)), shape=(count, count))
-    return connected_components(links, directed=False)[1]
 
 
 def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
@@ -259,7 +253,7 @@ def _turned(neighbors: np.ndarray, winds_alike: np.ndarray) -> np.ndarray:
     face, edge = np.nonzero(neighbors >= 0)
     other = neighbors[face, edge] + np.where(winds_alike[face, edge], 0, count)
     ends = np.concatenate([face, face + count]), np.concatenate([other, (other + count) % (2 * count)])
-    part = _connected(*ends, 2 * count)
+    part = connected_components(*ends, 2 * count)
     as_it_is, over = part[:count], part[count:]
     unturned_count = np.bincount(as_it_is, minlength=len(part))
     return (unturned_count[as_it_is] < unturned_count[over]) | (

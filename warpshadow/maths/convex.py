@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpshadow.maths.components import connected_components
+
 MOST_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
 
@@ -58,14 +60,11 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:
     """Number of the piece of each triangle; where pieces share an edge, triangles next to each other go together."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     edges, count = np.sort(_edges(triangles), axis=1), len(triangles)
     _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     order = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
     pairs = order[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
-    return connected_components(coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)), directed=False)[1]
+    return connected_components(*pairs.T, count)
 
 
 def _edges(triangles: np.ndarray) -> np.ndarray:
@@ -75,9 +74,6 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
 
 def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     """The convex part of some triangles; None where they are none."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     edges, count = _edges(triangles), len(triangles)
     triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
     if len(triangle_at) != len(edges) or not all((b, a) in triangle_at for a, b in triangle_at):
@@ -99,7 +95,8 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     left = np.tile(np.arange(count), 3)
     is_flat = (units[left] * units[right]).sum(axis=1) > 1 - _FLATNESS
     pairs = np.stack([left, right])[:, is_flat]
-    face_count, face = connected_components(coo_array((np.ones(pairs.shape[1]), pairs), shape=(count, count)), False)
+    face = connected_components(*pairs, count)
+    face_count = face.max() + 1
     if face_count > MOST_FACES:
         return None
     largest = [np.flatnonzero(face == number)[lengths[face == number].argmax()] for number in range(face_count)]
