@@ -1,5 +1,6 @@
 """Preparing in another process: what it leaves in the caches, what it says, and how it ends."""
 
+import dataclasses
 import time
 
 import pytest
@@ -11,7 +12,8 @@ pytest.importorskip("viser", reason="viser is not installed")
 from pages import PATIENCE, WirePage
 
 from warpshadow.viewer.app import ViewerApp
-from warpshadow.viewer.preparing import Preparation, has_fitted_spheres
+from warpshadow.viewer.painter import Painter
+from warpshadow.viewer.preparing import Preparation, is_prepared
 
 pytestmark = [
     pytest.mark.slow,
@@ -41,10 +43,10 @@ def eventually(condition):
 
 def test_another_process_fills_the_caches_and_says_how_far_it_is():
     notes = []
-    assert not has_fitted_spheres(scene())
+    assert not is_prepared(Painter(scene()))
     Preparation(scene(), notes.append)
     eventually(lambda: "" in notes)
-    assert has_fitted_spheres(scene()) and len(cached_files("spheres")) == 1
+    assert is_prepared(Painter(scene())) and len(cached_files("spheres")) == 1
     assert len(cached_files("own_shadows")) == 2  # as it moves, and at rest
     assert any(note.startswith("rendering: ") for note in notes) and notes[-1] == ""
 
@@ -73,8 +75,12 @@ def test_pages_see_rays_until_spheres_are_there():
         site.close()
 
 
-def test_what_is_cached_is_used_at_once():
+def test_spheres_and_tables_that_are_cached_are_used_at_once_and_both_are_needed():
     ws.spheres.fit_spheres(scene().bodies[0].mesh, 2, progress=False)
+    assert not is_prepared(Painter(scene()))  # its shadow on itself is not traced yet
+    for receivers in ("vertex", "pixel"):  # as bodies that move have it, and those at rest
+        ball = dataclasses.replace(scene().bodies[0], receivers=receivers)
+        ws.Renderer(dataclasses.replace(scene(), bodies=(ball,)), progress=False).render()
     site = ViewerApp(scene(), host="127.0.0.1", port=0)
     assert site._preparation is None
     site.close()

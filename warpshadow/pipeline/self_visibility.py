@@ -265,6 +265,12 @@ class SelfVisibility:
         """Number of bodies, of some, of which nothing is in memory yet."""
         return sum(not (self._merged_scene.is_flat[body] or body in self._rows) for body in bodies)
 
+    @property
+    def is_cached(self) -> bool:
+        """Whether the disk has the rows of all bodies that cast shadows on themselves, where the scene has them."""
+        bodies = (body for body in self.blocking(None, None).traced if not self._merged_scene.is_flat[body])
+        return all(self._rows_path(body).exists() for body in bodies)
+
     def _row_count(self, body: int) -> int:
         return len(self.probes(body).positions) * (1 + bool(self._merged_scene.is_two_sided[body]))
 

@@ -19,6 +19,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.choice_of_receivers import for_picture
 from warpshadow.pipeline.merged_scene import Geometry
+from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.view import View
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.poses import Poses
@@ -124,6 +125,12 @@ class Painter:
         rest, first = renderer.rest(), renderer.merged_scene.first_sphere
         centers, radii = rest.centers.numpy()[0], rest.radii.numpy()[0]
         return [(centers[a:b], radii[a:b]) for a, b in zip(first[:-1], first[1:], strict=True)]
+
+    def has_tables(self, viewer_state: ViewerState, quality: Quality) -> bool:
+        """Whether the disk has the shadows of all bodies on themselves that images of a quality look up."""
+        _, renderer = self._renderer(viewer_state, quality)
+        samples_receive = np.array([body.receivers != "vertex" for body in renderer.scene.bodies])
+        return SelfVisibility(renderer.merged_scene, samples_receive).is_cached
 
     def natural_stops(self, viewer_state: ViewerState | None = None) -> float:
         """Exposure [stops] of the picture of a look, by default the scene's own, of few pixels."""

@@ -35,12 +35,20 @@ _PIXELS = 128**2  # of the images that the process renders, for all that they ne
 _PATIENCE = 40.0  # time that the process has to write what it has, after this one ended [s]
 
 
-def has_fitted_spheres(scene: Scene, *, device: wp.DeviceLike = "cpu") -> bool:
-    """Whether all spheres that a scene needs are in the cache."""
-    if scene.visibility.with_method().method not in SPHERE_METHODS:
+_QUALITIES = (
+    replace(FrameRate().moving(), pixels=_PIXELS),
+    Quality(_PIXELS, cells=1 << 16, rays=1 << 16, supersampling=16, is_moving=False),
+)
+
+
+def is_prepared(painter: Painter, *, device: wp.DeviceLike = "cpu") -> bool:
+    """Whether the disk has all spheres and tables that the pages of a scene need."""
+    scene = painter.scene
+    if scene.visibility.method not in SPHERE_METHODS:
         return True
     counts = fitted_counts(scene).items()
-    return all(is_fitted(scene.bodies[body].mesh, count, device=device) for body, count in counts)
+    has_spheres = all(is_fitted(scene.bodies[body].mesh, count, device=device) for body, count in counts)
+    return has_spheres and all(painter.has_tables(ViewerState.of(scene), quality) for quality in _QUALITIES)
 
 
 class Preparation:
@@ -99,8 +107,8 @@ def prepare() -> None:
     with contextlib.suppress(KeyboardInterrupt):
         painter, viewer_state = Painter(scene, device=device, progress=True), ViewerState.of(scene)
         page = own_page(scene, painter.page_scale)
-        for quality in (FrameRate().moving(), Quality(_PIXELS, 1 << 16, 1 << 16, 16, is_moving=False)):
-            painter.image(viewer_state, page, replace(quality, pixels=_PIXELS))
+        for quality in _QUALITIES:
+            painter.image(viewer_state, page, quality)
 
 
 def _end_with_viewer() -> None:
