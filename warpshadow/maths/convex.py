@@ -64,7 +64,7 @@ def _pieces(triangles: np.ndarray) -> np.ndarray:
     _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     order = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
     pairs = order[np.repeat(counts % 2 == 0, counts)].reshape(-1, 2) % count
-    return connected_components(*pairs.T, count)
+    return connected_components(pairs[:, 0], pairs[:, 1], count)
 
 
 def _edges(triangles: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     left = np.tile(np.arange(count), 3)
     is_flat = (units[left] * units[right]).sum(axis=1) > 1 - _FLATNESS
     pairs = np.stack([left, right])[:, is_flat]
-    face = connected_components(*pairs, count)
+    face = connected_components(pairs[0], pairs[1], count)
     face_count = face.max() + 1
     if face_count > MOST_FACES:
         return None
