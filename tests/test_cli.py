@@ -27,7 +27,7 @@ EIGHT_BITS = 0.006
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
 """What the command that is installed runs."""
 
-COMMANDS = ("render", "insert", "view", "tune", "fit", "dataset", "spheres", "envmap", "cache", "warmup")
+COMMANDS = ("render", "scene", "insert", "view", "tune", "fit", "dataset", "spheres", "envmap", "cache", "warmup")
 
 SCENE = """
 [camera]
