@@ -38,7 +38,7 @@ def test_kernels_of_files_compile_for_cuda(tmp_path):
     modules = file_modules()
     assert {
         "warpshadow.stages.shading",
-        "warpshadow.stages.rasterize",
+        "warpshadow.stages.rasterization",
         "warpshadow.stages.normals",
         "warpshadow.stages.project",
     } <= set(modules)

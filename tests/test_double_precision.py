@@ -77,7 +77,9 @@ def test_the_build_rasterizes_what_the_package_rasterizes(double, device, monkey
     clip_positions = random(0, 1, 60, 4).astype(np.float32) + np.float32([0, 0, 1, 2])
     faces = put(np.arange(60).reshape(20, 3), wp.vec3i, device)
     expected = rasterize(put(clip_positions, wp.vec4, device), faces, 40, 30).face_ids.numpy()
-    got = double("stages.rasterize").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
+    got = (
+        double("stages.rasterization").rasterize(put(clip_positions, wp.vec4d, device), faces, 40, 30).face_ids.numpy()
+    )
     assert len(np.unique(expected)) > 10
     np.testing.assert_array_equal(got, expected)
 
@@ -416,13 +418,13 @@ def test_cameras(double, check):
 
 def test_interpolation(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
-    face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
     assert len(np.unique(face_ids.numpy())) == 3  # two sides and the background
 
     def draw(clip_positions, attributes):
         weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
-        return double("stages.interpolate").interpolate(
-            double("stages.rasterize").Fragments(face_ids, weights), faces, attributes
+        return double("stages.interpolation").interpolate(
+            double("stages.rasterization").Fragments(face_ids, weights), faces, attributes
         )
 
     check(draw, clip, (wp.vec2d, random(0, 1, 4, 2)))
@@ -435,7 +437,7 @@ def test_textures(double, device, check, clip):
     texture_of_face = put([0, -1, -1, 0], wp.int32, device)
 
     def reflect(clip_positions, uvs, vertex_albedo, image):
-        fragments = double("stages.rasterize").rasterize(clip_positions, faces, *SIZE)
+        fragments = double("stages.rasterization").rasterize(clip_positions, faces, *SIZE)
         textures = double("stages.textures.pyramid").mip_pyramids([image])
         footprints = double("stages.textures.footprint").find_footprints(
             fragments, faces, clip_positions, uvs, faces, texture_of_face, textures
@@ -457,7 +459,7 @@ def test_upright_silhouettes(double, device, check):
     neighbors = put(double("assets.topology").edge_neighbors(sides), wp.vec3i, device)
 
     def smooth(image, clip_positions):
-        fragments = double("stages.rasterize").rasterize(clip_positions, faces, *SIZE)
+        fragments = double("stages.rasterization").rasterize(clip_positions, faces, *SIZE)
         silhouettes = double("stages.silhouettes.find").find_silhouettes(fragments, faces, neighbors, clip_positions)
         return double("stages.silhouettes.smooth").smooth_silhouettes(image, silhouettes, clip_positions)
 
@@ -466,13 +468,13 @@ def test_upright_silhouettes(double, device, check):
 
 def test_exposure(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
-    face_ids = double("stages.rasterize").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
+    face_ids = double("stages.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 
     def sample_radiance(clip_positions, shading, albedo):
         weights = double("stages.barycentrics").find_barycentrics(face_ids, faces, clip_positions)
         return double("stages.film").average(
             double("stages.film").sample_radiance(
-                double("stages.rasterize").Fragments(face_ids, weights), faces, shading, albedo
+                double("stages.rasterization").Fragments(face_ids, weights), faces, shading, albedo
             ),
             2,
         )

@@ -93,7 +93,7 @@ def test_public_names_of_other_modules_have_types_and_no_any(module):
 @pytest.mark.parametrize("facade", FACADES)
 def test_public_fields_have_types_and_no_any(facade):
     module = importlib.import_module(facade)
-    classes = [value for value in map(module.__dict__.get, module.__all__) if dataclasses.is_dataclass(value)]
+    classes = [value for value in (getattr(module, name) for name in module.__all__) if dataclasses.is_dataclass(value)]
     for each in classes:
         hints = typing.get_type_hints(each)
         assert not [field.name for field in dataclasses.fields(each) if is_any(hints[field.name])], each

@@ -15,7 +15,7 @@ from warpshadow.spheres import refine
 from warpshadow.stages import shared_rays, traced_transfer, transfer
 from warpshadow.stages.bounces import sphere_light
 from warpshadow.stages.gloss import traced
-from warpshadow.stages.interpolate import _make_interpolate
+from warpshadow.stages.interpolation import _make_interpolate
 from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh

@@ -16,9 +16,9 @@ from warpshadow.device import parallel
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import Scratch, scratch_place
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.shading import shade
 from warpshadow.stages.silhouettes.find import find_silhouettes
 from warpshadow.stages.transfer import directional_transfer, sh_transfer

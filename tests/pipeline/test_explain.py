@@ -483,9 +483,9 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         if "_sample" in key:  # given the samples of white surfaces, it exposes them
             return "radiance" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
         return "footprints" if "footprints" in key else "mip pyramids"
-    if module == "stages.interpolate":
+    if module == "stages.interpolation":
         return "reflectance"
-    if module in ("stages.rasterize", "stages.barycentrics"):
+    if module in ("stages.rasterization", "stages.barycentrics"):
         return "rasterization"
     if module in ("stages.transfer", "stages.cached_cells"):
         return "shading" if "_light_cells" in key else "transfer"

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from warpshadow.stages.film import average, sample_radiance
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 
 # A handful of float32 products.
 FLOAT32 = 1e-6

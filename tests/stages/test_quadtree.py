@@ -5,11 +5,11 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.quadtree import find_quadtree, probe_grid
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.receivers import find_receivers, number_receivers
 
 # Interpolated float32 positions of size 1.

@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import Fragments, rasterize
+from warpshadow.stages.rasterization import Fragments, rasterize
 from warpshadow.stages.receivers import find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 

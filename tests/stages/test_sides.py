@@ -16,7 +16,7 @@ from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.sides import find_sides
 from warpshadow.torch import TorchRenderer, rotation_matrices
 from warpshadow.tuning.point_sample import PointSample

@@ -9,7 +9,7 @@ import warpshadow as ws
 from warpshadow.assets.topology import edge_neighbors
 from warpshadow.stages.film import sample_radiance
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import find_silhouettes
 from warpshadow.stages.slopes import LEAST_DISTANCE, moving_radiance

@@ -15,7 +15,7 @@ from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Grouping
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_seen
 from warpshadow.stages.sample_receivers import see_samples
 
@@ -53,7 +53,7 @@ def find_squares(
         bare = detached(spheres[0]), detached(spheres[1])
         frames = method.planes.frames(planes, detached(positions)) if planes else None
         placed = method.parts.placed(convex, detached(positions)) if convex else None
-        grouping = Grouping(points, method.planes, method.parts)
+        grouping = Grouping(points, method.planes, method.parts, method.self_visibility)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:

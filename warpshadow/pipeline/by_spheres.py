@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +14,9 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneParts
 from warpshadow.pipeline.groups import Group, Grouping, Transmittance
 from warpshadow.pipeline.lighting import (
+    BY_SPHERES,
     LARGEST_COEFFICIENT,
+    Blocking,
     KnownLight,
     LitPoints,
     Method,
@@ -26,25 +28,9 @@ from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.self_visibility import Blocking
+from warpshadow.pipeline.self_visibility import SelfVisibility
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.stages.shading import shade
-
-
-class Bouncing(Protocol):
-    """Bounced light for a method of spheres."""
-
-    def shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
-        """Shading of points, direct and bounced, given the projected light."""
-
-    def free_shading(self, points: LitPoints, projected_light: Node, light: Input, materials: Materials) -> Node:
-        """The same in free light."""
-
-    def cached_shading(self, points: LitPoints, projected_light: Any, light: Input, materials: Materials) -> Node:
-        """The same for static points; results that do not depend on light and materials are cached."""
-
-    def cached_free_shading(self, direct: Node, points: LitPoints, light: Input, materials: Materials) -> Node:
-        """The same in free light, given the direct shading."""
 
 
 class SphereMethod(Method):
@@ -53,16 +39,16 @@ class SphereMethod(Method):
     Attributes:
         free_projection: The basis in which the method projects any free light.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
-        bounces: How light bounces; None where it does not.
         joins_cached: Whether visibility combines cached rows with moving blockers.
+        traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
         shades_what_is_seen: Whether known light is shaded without transfer vectors, by :meth:`light_seen`.
     """
 
     free_projection: Any
     why_no_shadows = ""
     joins_cached = False
+    traces_self_visibility = False
     shades_what_is_seen = False
-    bounces: Bouncing | None = None
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -79,12 +65,29 @@ class SphereMethod(Method):
         """The bodies that consist of convex parts."""
         return SceneParts(self.merged_scene)
 
-    def planes_in(self, geometry: Geometry | None) -> tuple[int, ...]:
-        """Bodies that block as planes in a geometry, by default the scene's: where light does not bounce, no deformed
-        ones.
+    @functools.cached_property
+    def self_visibility(self) -> SelfVisibility:
+        """The bodies' shadows on themselves, from rays."""
+        return SelfVisibility(self.merged_scene, self.samples_receive, progress=self.progress)
+
+    def blocking(self, geometry: Geometry | None, rotations: Input | None) -> Blocking:
+        """How the bodies of a geometry, by default the scene's, block light.
+
+        Bodies block as planes and convex parts where the method knows such; where light does not bounce, no deformed
+        body is a plane.
         """
         deformed = () if geometry is None or self.merged_scene.scene.bounces else geometry.deformed
-        return tuple(body for body in self.plane_blockers if body not in deformed)
+        planes = tuple(body for body in self.plane_blockers if body not in deformed)
+        if rotations is None or not self.traces_self_visibility:
+            return BY_SPHERES._replace(planes=planes)
+        count = len(self.merged_scene.scene.bodies)
+        why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(count))
+        traced = tuple(body for body, reason in enumerate(why) if not reason)
+        return Blocking(traced, rotations, why, planes, self.convex_among(traced))
+
+    def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
+        """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
+        return ()
 
     def past_planes(self, group: Group, seen: Transmittance, projected_light: Any) -> Transmittance:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
@@ -207,7 +210,7 @@ class InParts(Node):
         is_shaded: bool = True,
         extra_inputs: tuple[Node, ...] = (),
     ):
-        self.method, self._grouping = method, Grouping(points, method.planes, method.parts)
+        self.method, self._grouping = method, Grouping(points, method.planes, method.parts, method.self_visibility)
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         self_visibility = _self_visibility(method, points, projected_light)

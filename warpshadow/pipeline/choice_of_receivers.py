@@ -48,7 +48,7 @@ from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.scene.scene import AUTO, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.visibility.sharp_cells import find_sharp_cells
 
 LARGE_FACE = 16.0
@@ -109,6 +109,8 @@ def choose_receivers(
         cameras: The cameras that see them.
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
     """
+    if merged_scene.scene.visibility.method == "ray-traced":  # every sample is a receiver, overriding the bodies
+        return [Choice(body.receivers, None) for body in merged_scene.scene.bodies]
     requested = ["pixel" if body.is_glossy else body.receivers for body in merged_scene.scene.bodies]
     if AUTO not in requested:
         return [Choice(receivers, None) for receivers in requested]

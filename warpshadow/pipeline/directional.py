@@ -18,6 +18,7 @@ from warpshadow.pipeline.convex import PartsOfGroup
 from warpshadow.pipeline.groups import Group, Transmittance
 from warpshadow.pipeline.lighting import (
     LARGEST_COEFFICIENT,
+    Blocking,
     KnownLight,
     LitPoints,
     converted,
@@ -27,7 +28,7 @@ from warpshadow.pipeline.lighting import (
 )
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
-from warpshadow.pipeline.self_visibility import Blocking, SelfVisibilityLookup
+from warpshadow.pipeline.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.scene.blockers import blocking_planes
 from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cells

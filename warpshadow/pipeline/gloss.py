@@ -22,8 +22,8 @@ from warpshadow.stages.gloss.lobes import sample_lobes
 from warpshadow.stages.gloss.prefilter import look_up as look_up_light
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.gloss.reflection import reflect, sum_lobes
-from warpshadow.stages.interpolate import interpolate
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.interpolation import interpolate
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.sample_receivers import Span
 

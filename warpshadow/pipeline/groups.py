@@ -15,7 +15,7 @@ from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.planes import PlanesOfGroup, ScenePlanes
-from warpshadow.pipeline.self_visibility import SelfVisibilityLobes, SelfVisibilityLookup
+from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.convex.prepared import PlacedParts
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts, lifted_points
@@ -104,10 +104,11 @@ class Grouping:
         points: The receivers.
         planes: The scene's bodies that lie in a plane.
         parts: And those that consist of convex parts.
+        self_visibility: Has the probes of bodies.
     """
 
-    def __init__(self, points: LitPoints, planes: ScenePlanes, parts: SceneParts):
-        self._points, self._planes, self._parts = points, planes, parts
+    def __init__(self, points: LitPoints, planes: ScenePlanes, parts: SceneParts, self_visibility: SelfVisibility):
+        self._points, self._planes, self._parts, self._self_visibility = points, planes, parts, self_visibility
         self._merged_scene, self._static = points.merged_scene, points.static
 
     def groups(
@@ -179,7 +180,7 @@ class Grouping:
                 clusters = clusters or find_clusters(*blocking, self._points.method.visibility.merging)
                 group = group._replace(skip=skip, clusters=clusters)
             if span.body >= 0:
-                places = self._points.method.self_visibility.places(receivers, span)
+                places = self._self_visibility.places(receivers, span)
                 group = group._replace(body=span.body, places=places, self_lookup=self_visibility.get(span.body))
                 if corners is not None:
                     bounds = self._planes.first_corner[span.body : span.body + 2].tolist()

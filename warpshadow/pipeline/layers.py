@@ -11,9 +11,9 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.view import View
-from warpshadow.stages import film
-from warpshadow.stages.interpolate import interpolate
-from warpshadow.stages.rasterize import rasterize
+from warpshadow.stages.film import average
+from warpshadow.stages.interpolation import interpolate
+from warpshadow.stages.rasterization import rasterize
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 
@@ -125,5 +125,5 @@ def _masks(merged_scene: MergedScene, view: View, supersampling: int) -> list[wp
     for first in range(0, len(merged_scene.scene.bodies), 4):
         shows = bodies[..., None] == np.arange(first, first + 4)
         samples = wp.array(shows.astype(np.float32), dtype=wp.vec4, device=clip.device)
-        masks.append(film.average(smooth_silhouettes(samples, silhouettes, clip), supersampling))
+        masks.append(average(smooth_silhouettes(samples, silhouettes, clip), supersampling))
     return masks

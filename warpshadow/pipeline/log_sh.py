@@ -12,10 +12,10 @@ from warpshadow.device.batch import expand_rows
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.groups import Group, Transmittance
-from warpshadow.pipeline.lighting import KnownLight
+from warpshadow.pipeline.lighting import Blocking, KnownLight
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.self_visibility import Blocking, SelfVisibilityLobes
+from warpshadow.pipeline.self_visibility import SelfVisibilityLobes
 from warpshadow.pipeline.static import StaticBodies, VertexRows
 from warpshadow.stages.cached_cells import add_rows
 from warpshadow.stages.self_visibility.lobes import self_visibility_lobes

@@ -12,7 +12,6 @@ from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, 
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.stages.gloss.lobes import TRACED_SAMPLES
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
 from warpshadow.stages.light_samples import cut_map, sample_map
@@ -33,7 +32,7 @@ class Rays(Method):
     """Visibility of the meshes."""
 
     lights_samples = True
-    lobe_samples = TRACED_SAMPLES
+    lobe_samples = 64  # each is blocked or not: with 32, reflected edges show as many edges
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)

@@ -16,7 +16,7 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.scene.scene import GLOSS
-from warpshadow.stages.interpolate import interpolate
+from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo

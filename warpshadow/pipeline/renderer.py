@@ -21,37 +21,30 @@ from warpshadow.device.memory import empty
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
-from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.choice_of_receivers import (
     COARSE_FACE,
-    Choice,
     choose_receivers,
     face_sizes,
     receiver_notes,
     with_receivers,
 )
-from warpshadow.pipeline.directional import Directional
 from warpshadow.pipeline.explain import Explanation, decide
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lighting import Light, LitPoints, joined
-from warpshadow.pipeline.log_sh import LogSH
+from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, joined
 from warpshadow.pipeline.merged_scene import PLACED, Geometry, MergedScene, Pivot, as_geometry
+from warpshadow.pipeline.methods import make_method
 from warpshadow.pipeline.node import Call, Clock, Input, Node
-from warpshadow.pipeline.rays import Rays
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.self_visibility import BY_SPHERES, Blocking
 from warpshadow.pipeline.static import StaticBodies
 from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
-from warpshadow.scene.scene import GLOSS, SCENE, BodyLike, PerBody, Scene
+from warpshadow.scene.scene import GLOSS, METHODS, SCENE, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import check_clip_space
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
-
-METHODS = {"directional": Directional, "log-sh": LogSH, "none": LogSH, "ray-traced": Rays}  # how light is blocked
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
 
@@ -109,7 +102,6 @@ class SceneRenderer:
         check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
-        make_method = METHODS[scene.visibility.method]
         self._arguments = {
             "scene": scene,
             "cameras": cameras,
@@ -123,14 +115,12 @@ class SceneRenderer:
         self.progress = progress
         with waiting("preparing", shows=progress):
             self.merged_scene = MergedScene(scene, device=self.device, progress=progress)
-            self._given_scene, self._choices = scene, self._choose_receivers()
+            with unrecorded():
+                choices = choose_receivers(self.merged_scene, self.cameras, is_light_free=basis is not None)
+            self._given_scene, self._choices = scene, choices
         self.merged_scene.scene = self.scene = with_receivers(scene, self._choices)
         self.clock = Clock()
         self._method = make_method(self.merged_scene, basis, progress=progress)
-        if scene.bounces and isinstance(self._method, SphereMethod):
-            from warpshadow.pipeline.bounces.by_spheres import SphereBounces
-
-            self._method.bounces = SphereBounces(self._method)
         self._materials = Materials.of_scene(self.merged_scene)
         self.basis = self._method.basis
         self._vertices = Input("vertices", lambda: self.geometry().positions)
@@ -146,12 +136,6 @@ class SceneRenderer:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scene!r}, {self.device.alias})"
-
-    def _choose_receivers(self) -> list[Choice]:
-        if METHODS[self.merged_scene.scene.visibility.method].lights_samples:  # overriding the bodies
-            return [Choice(body.receivers, None) for body in self.merged_scene.scene.bodies]
-        with unrecorded():
-            return choose_receivers(self.merged_scene, self.cameras, is_light_free=self._arguments["basis"] is not None)
 
     @one_at_a_time
     def with_cameras(self: RendererType, cameras: Sequence[Camera]) -> RendererType:
@@ -257,7 +241,7 @@ class SceneRenderer:
                 plane.
         Differentiable: positions, centers, radii, rest.
         """
-        if positions is not None and isinstance(self._method, SphereMethod) and self._method.bounces is not None:
+        if positions is not None and self._method.bounces is not None:
             number = self.scene.body_number(body)
             if self.merged_scene.is_flat[number]:
                 raise ValueError(
@@ -360,16 +344,11 @@ class SceneRenderer:
 
     def _blocking(self, geometry: Geometry | None, last: LitPoints | None = None) -> Blocking:
         """How the bodies of a geometry, by default the scene's, block light."""
-        if not self._method.traces_self_visibility:
-            return BY_SPHERES
         rotations = self._rotations
         if geometry is not None and geometry.rotations is not None:
             check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
             rotations = Input.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
-        blocking = self._method.self_visibility.blocking(geometry, rotations)
-        return blocking._replace(
-            planes=self._method.planes_in(geometry), convex=self._method.convex_among(blocking.traced)
-        )
+        return self._method.blocking(geometry, rotations)
 
     def _call(self, view: LitPoints | None = None) -> Call:
         """A call, with the cached values of a view."""
@@ -393,7 +372,7 @@ class SceneRenderer:
             vertices = Input("vertices", geometry.positions)
             spheres = Input("spheres", (geometry.centers, geometry.radii))
         node = Node("", lambda arguments: arguments, receivers)
-        blocking = BY_SPHERES._replace(planes=self._method.planes_in(geometry))
+        blocking = self._method.blocking(geometry, None)
         return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), blocking=blocking)
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:

@@ -23,10 +23,9 @@ from warpshadow.device.memory import from_numpy
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.merged_scene import Geometry, MergedScene
-from warpshadow.pipeline.node import Input
 from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers import Receivers, Span
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
@@ -54,19 +53,6 @@ Found = TypeVar("Found")
 
 _OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]] = weakref.WeakKeyDictionary()
 """Probes and rows of each mesh in memory, for all renderers, by their kind, whether samples receive, and device."""
-
-
-class Blocking(NamedTuple):
-    """How the bodies of a geometry block light: by their spheres, but for some."""
-
-    traced: tuple[int, ...] = ()  # bodies that block their own light as rays found, not by their spheres
-    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where none is traced
-    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for the traced
-    planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
-    convex: tuple[int, ...] = ()  # traced ones that block the light of others by the convex parts that they consist of
-
-
-BY_SPHERES = Blocking()  # all bodies block by their spheres
 
 
 class SelfVisibilityLookup(NamedTuple):
@@ -112,12 +98,7 @@ class SelfVisibility:
 
     # ------------------------------------------------------------------------------------------ which bodies
 
-    def blocking(self, geometry: Geometry | None, rotations: Input | None) -> Blocking:
-        """How the bodies of a geometry, by default the scene's, block light; none as planes."""
-        why = tuple(self._why_spheres(body, geometry) for body in range(len(self._samples_receive)))
-        return Blocking(tuple(body for body, reason in enumerate(why) if not reason), rotations, why)
-
-    def _why_spheres(self, body: int, geometry: Geometry | None) -> str:
+    def why_spheres(self, body: int, geometry: Geometry | None) -> str:
         """Why a body's own spheres block its light in a geometry, by default the scene's; empty if they do not."""
         scene = self._merged_scene.scene
         if not scene.bodies[body].casts_shadow:

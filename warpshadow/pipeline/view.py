@@ -1,34 +1,35 @@
 """Views: a geometry seen by cameras, wired from the vertices to the image."""
 
+from __future__ import annotations
+
 import copy
 import functools
 import operator
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.adaptive import find_squares
-from warpshadow.pipeline.gloss import GlossyPoints
-from warpshadow.pipeline.lighting import Light, LitPoints, Method, receiver_words
+from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Given, Materials, VisibleSurfaces
-from warpshadow.pipeline.self_visibility import Blocking
-from warpshadow.pipeline.static import StaticBodies
-from warpshadow.stages import film
+from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.photograph import RatioImage, compose, find_ratio_image, over_nothing
 from warpshadow.stages.project import to_clip
-from warpshadow.stages.rasterize import Fragments, rasterize
+from warpshadow.stages.rasterization import Fragments, rasterize
 from warpshadow.stages.receivers import Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.slopes import moving_radiance
 from warpshadow.stages.textures.sample import textured_radiance
+
+if TYPE_CHECKING:
+    from warpshadow.pipeline.static import StaticBodies
+    from warpshadow.stages.photograph import RatioImage
 
 AnyView = TypeVar("AnyView", bound="View")
 
@@ -143,6 +144,8 @@ class View(LitPoints):
                 merged_scene.faces, keeps_vertex, on_static_body, merged_scene.vertex_order, bodies
             )
             if spheres is not None and (is_adaptive := method.is_adaptive & ~by_rows).any():
+                from warpshadow.pipeline.adaptive import find_squares
+
                 seen = positions, normals, fragments, spheres
                 quadtree = find_squares(self, *seen, is_adaptive, self._supersampling)
         elif on_static_body is None:
@@ -204,10 +207,12 @@ class View(LitPoints):
 
     def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
+        from warpshadow.pipeline.gloss import GlossyPoints
+
         points = self.cached("gloss", None, lambda: GlossyPoints(self, self.cameras))
         colored, white = points.mixed(self, lit, light, materials)
         parts = self._radiance(colored, reflected), self._radiance(white, self._white_reflectance)
-        return Node("radiance", _sum_moving if self._is_moving else film.sum_radiance, *parts, caches=False)
+        return Node("radiance", _sum_moving if self._is_moving else sum_radiance, *parts, caches=False)
 
     @property
     def _is_moving(self) -> bool:
@@ -237,6 +242,8 @@ class View(LitPoints):
             unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
             light, albedo, textures, gloss: As for :meth:`image`.
         """
+        from warpshadow.stages.photograph import compose, find_ratio_image, over_nothing
+
         materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
 
@@ -265,7 +272,7 @@ class View(LitPoints):
         """The image if every surface were white, of light on the receivers; vec4 of shape [batch, height, width]."""
         return self._averaged(self._white_radiance_of(lit))
 
-    def at_receivers_of(self, other: "View") -> "View":
+    def at_receivers_of(self, other: View) -> View:
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
 
         def exchanged() -> View:
@@ -292,7 +299,7 @@ class View(LitPoints):
         smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
         if self._supersampling == 1:
             return Node("averaging", _same, smoothed, idle="a pixel has one sample", caches=False)
-        return samples_of("averaging", film.average, smoothed, self._supersampling)
+        return samples_of("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, lit: Node) -> Node:
         """Node of the samples if every surface were white; kept with the last shading."""
@@ -358,7 +365,7 @@ def _same(value: object) -> object:
 
 
 def _radiance(receivers: Receivers, lit: wp.array, reflected: wp.array) -> wp.array:
-    return film.sample_radiance(receivers.fragments, receivers.faces, lit, reflected)
+    return sample_radiance(receivers.fragments, receivers.faces, lit, reflected)
 
 
 def _moving_radiance(
@@ -371,7 +378,7 @@ def _moving_radiance(
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
     """Sums of samples and of the colors at edges."""
-    samples, edge_colors = (film.sum_radiance(*pair) for pair in zip(first, second, strict=True))
+    samples, edge_colors = (sum_radiance(*pair) for pair in zip(first, second, strict=True))
     return samples, edge_colors
 
 
@@ -383,4 +390,4 @@ def _smooth_moving(radiance: tuple[wp.array, wp.array], silhouettes: Silhouettes
 def _white_radiance(receivers: Receivers, lit: wp.array) -> wp.array:
     _, height, width = receivers.fragments.face_ids.shape
     white = wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=lit.device)
-    return film.sample_radiance(receivers.fragments, receivers.faces, lit, white)
+    return sample_radiance(receivers.fragments, receivers.faces, lit, white)

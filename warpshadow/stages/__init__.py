@@ -1,80 +1,15 @@
 """The paper's stages: functions of Warp's arrays, to be composed as :class:`warpshadow.Renderer` composes them.
 
-A module here is a stage, or code that stages share; README.md lists them in their order.
+A module here is a stage, or code that stages share; README.md lists them in their order, and ``facade.py`` the names
+that this package exports. All of them are imported when the first is asked for: a stage alone costs its own module.
 """
 
-from warpshadow.stages.barycentrics import find_barycentrics
-from warpshadow.stages.deform import DeformationGraph
-from warpshadow.stages.film import average, sample_radiance
-from warpshadow.stages.interpolate import interpolate
-from warpshadow.stages.light_samples import LightSamples, even_samples, sample_map
-from warpshadow.stages.nearest_rotation import nearest_rotations
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
-from warpshadow.stages.project import compose_clip_matrices, to_clip
-from warpshadow.stages.rasterize import Fragments, rasterize
-from warpshadow.stages.ray_tracing import trace_shading, trace_visibility
-from warpshadow.stages.receivers import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
-from warpshadow.stages.rotations import rotation_matrices
-from warpshadow.stages.shading import shade
-from warpshadow.stages.sides import find_sides
-from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
-from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
-from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
-from warpshadow.stages.slopes import moving_radiance
-from warpshadow.stages.textures.footprint import Footprints, find_footprints
-from warpshadow.stages.textures.pyramid import Textures, mip_pyramids
-from warpshadow.stages.textures.sample import sample_albedo, textured_radiance
-from warpshadow.stages.textures.seen import fill_unseen, seen_texels
-from warpshadow.stages.traced_transfer import trace_transfer
-from warpshadow.stages.transfer import directional_transfer, sh_transfer
-from warpshadow.stages.visibility.directional import transmittance
-from warpshadow.stages.visibility.exponential import exponentiate
-from warpshadow.stages.visibility.log_sh import accumulate
+import importlib
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "DeformationGraph",
-    "Footprints",
-    "Fragments",
-    "LightSamples",
-    "Numbering",
-    "Poses",
-    "Receivers",
-    "Silhouettes",
-    "Textures",
-    "accumulate",
-    "average",
-    "compose_clip_matrices",
-    "directional_transfer",
-    "even_samples",
-    "exponentiate",
-    "fill_unseen",
-    "find_barycentrics",
-    "find_edge_colors",
-    "find_footprints",
-    "find_receivers",
-    "find_sides",
-    "find_silhouettes",
-    "interpolate",
-    "mip_pyramids",
-    "moving_radiance",
-    "nearest_rotations",
-    "number_receivers",
-    "rasterize",
-    "rotation_matrices",
-    "sample_albedo",
-    "sample_map",
-    "sample_radiance",
-    "seen_texels",
-    "seen_vertices",
-    "sh_transfer",
-    "shade",
-    "smooth_silhouettes",
-    "textured_radiance",
-    "to_clip",
-    "trace_shading",
-    "trace_transfer",
-    "trace_visibility",
-    "transmittance",
-    "vertex_normals",
-]
+if TYPE_CHECKING:
+    from warpshadow.stages.facade import *  # noqa: F403
+else:
+
+    def __getattr__(name: str) -> object:
+        return getattr(importlib.import_module("warpshadow.stages.facade"), name)

@@ -7,8 +7,8 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
-from warpshadow.stages.interpolate import at_point
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.interpolation import at_point
+from warpshadow.stages.rasterization import Fragments
 
 _COST = 5.0  # nanoseconds that a sample takes
 

@@ -19,7 +19,7 @@ import warp as wp
 
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.interpolation import at_point
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_tracing import RAY_COST, escapes, mesh_id, nearest, parts
 from warpshadow.stages.textures.pyramid import Textures

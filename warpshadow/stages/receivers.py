@@ -14,9 +14,9 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy
-from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.interpolation import at_point
 from warpshadow.stages.quadtree import Quadtree
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sample_receivers import SeenSurface, Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes

@@ -17,7 +17,7 @@ from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.quadtree import Quadtree, sample_at
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 
 TILE = 16  # pixels of a side of the tiles whose receivers follow each other
 

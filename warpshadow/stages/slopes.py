@@ -21,8 +21,8 @@ from warpshadow.device.launch import detached, launch
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.film import sample_radiance
-from warpshadow.stages.interpolate import add_to_corners, adj_weights, interpolate
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.interpolation import add_to_corners, adj_weights, interpolate
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
     distance,
     ends_before,

@@ -5,8 +5,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.stages import rotations
 from warpshadow.stages.rotations import Vec6
+from warpshadow.stages.rotations import rotation_matrices as matrices_of_arrays
 from warpshadow.torch.autograd import apply, check_float32, uncompiled
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
@@ -31,5 +31,5 @@ def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     check.choice("parameters: last dimension", parameters.shape[-1] if parameters.ndim else 1, _ROTATION_PARAMETERS)
     dtype = _ROTATION_PARAMETERS[parameters.shape[-1]]
     rows = parameters.reshape(1, -1, *item_shape(dtype))
-    matrices = apply(rotations.rotation_matrices, rows, dtypes=[dtype], device=parameters.device, names=["parameters"])
+    matrices = apply(matrices_of_arrays, rows, dtypes=[dtype], device=parameters.device, names=["parameters"])
     return matrices.reshape(*parameters.shape[:-1], 3, 3)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.self_visibility.probes import ProbeTable, VisibilityProbes, find_probes, longest_edge
 
 # Interpolated float32 positions of size 1.

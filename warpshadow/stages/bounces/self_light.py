@@ -6,7 +6,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.interpolate import at_point
+from warpshadow.stages.interpolation import at_point
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 

@@ -24,12 +24,6 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 
-SAMPLES = 32
-"""Samples of a lobe. Light without shadows of an indoor map is 2.1% off with 32, 3.5% with 16 (roughness 0.35)."""
-
-TRACED_SAMPLES = 64
-"""Samples of a lobe by rays, each of which is blocked or not: with 32, reflected edges show as many edges."""
-
 LEAST_ROUGHNESS = 0.1
 """Roughness of the smoothest surface; maps of 128 rows have nothing sharper."""
 
@@ -143,7 +137,7 @@ def _sample_lobes(
 
 
 def sample_lobes(
-    points: wp.array, normals: wp.array, roughness: wp.array, clip_matrices: wp.array, sample_count: int = SAMPLES
+    points: wp.array, normals: wp.array, roughness: wp.array, clip_matrices: wp.array, sample_count: int
 ) -> tuple[wp.array, wp.array, wp.array]:
     """Sample the lobes of receivers.
 

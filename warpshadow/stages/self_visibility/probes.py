@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sides import split_side
 
 _SMALL_FACES = 10_000

@@ -16,7 +16,7 @@ from warpshadow import check
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy, zeros
 from warpshadow.device.parallel import run_length, strip_count
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
     ends_before,
     half_size,

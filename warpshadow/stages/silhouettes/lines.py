@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import neighbor, plane, relative, sample_center
 
 NOTHING = -1

@@ -21,7 +21,7 @@ from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import zeros
 from warpshadow.device.warp_internals import scalar_type
-from warpshadow.stages.interpolate import inner
+from warpshadow.stages.interpolation import inner
 from warpshadow.stages.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import add_to_vertices
 from warpshadow.stages.silhouettes.find import Silhouettes

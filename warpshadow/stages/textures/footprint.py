@@ -15,7 +15,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import center, relative, volumes
 from warpshadow.stages.textures.pyramid import Textures
 

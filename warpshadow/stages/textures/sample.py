@@ -15,8 +15,8 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import differentiable, launch, varies
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
-from warpshadow.stages.interpolate import add_to_corners, adj_weights, at_point
-from warpshadow.stages.rasterize import Fragments
+from warpshadow.stages.interpolation import add_to_corners, adj_weights, at_point
+from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.pyramid import Textures
 
