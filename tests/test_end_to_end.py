@@ -360,7 +360,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
     for _ in range(2):
         (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
         results.append((renderer(textures=[None, image]).detach(), gradient))
-    assert renderer.warp.view().surfaces.coarsest_level((None, (size, size))) == coarsest
+    assert renderer.warp.view().coarsest_level((None, (size, size))) == coarsest
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
 

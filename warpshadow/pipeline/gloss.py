@@ -66,7 +66,7 @@ class GlossyPoints(LitPoints):
 
         sampled = self.cached("lobes", key, lobes)
         directions, weights, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
-        source = self._light(light)
+        source = self.light_input(light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
         radiance = Node("prefiltered light", look_up_light, texels, directions, weights, items=words)
         through = self.method.lobe_transmittance(self, directions, source)
@@ -96,15 +96,6 @@ class GlossyPoints(LitPoints):
         rows = Fragments(*(array.reshape((len(array), 1, -1)) for array in (seen.face_ids, seen.barycentrics)))
         result = interpolate(rows, sides, values)
         return result.reshape((len(result), -1))
-
-    def _light(self, light: Light | None) -> Input:
-        """The light as an input; the same for the same light."""
-        if light is None or light is self.method.light.value():
-            return self.method.light
-        if isinstance(light, wp.array):
-            return Input("light", light, news="light is given")
-        self._known_light = Input.renewed("light", light, getattr(self, "_known_light", None))
-        return self._known_light
 
     def _prefiltered(self, light: Input) -> Node:
         """Node of the texels of light, vec3 of shape [batch, texel]."""

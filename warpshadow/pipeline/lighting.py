@@ -87,13 +87,11 @@ class LitPoints:
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static = call, static
         self.normals = Node("", vertex_normals, vertices, method.merged_scene.faces) if normals is None else normals
-        self._scene_shading: Node | None = None
-        self._known: tuple[Input, Node] | None = None
-        self._transfers: Node | None = None
+        self._last_light: Input | None = None  # that was known, but for the scene's
         self._cached: dict[str, tuple[Hashable, Any]] = {}
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
-        """A method's value for the points, cached under a name while its inputs stay the same."""
+        """A value for the points, such as a node, cached under a name while its inputs stay the same."""
         if name not in self._cached or self._cached[name][0] != key:
             self._cached[name] = key, make()
         return self._cached[name][1]
@@ -126,27 +124,27 @@ class LitPoints:
         check_light(light)
         if materials is None or not self.merged_scene.scene.bounces:
             materials = self.materials
+        source = self.light_input(light)
         if isinstance(light, wp.array):
-            return self.method.free_shading(self, Input("light", light, news="light is given"), materials)
+            return self.method.free_shading(self, source, materials)
+        shade = functools.partial(self.method.shading, self, source, materials)
+        if materials is not self.materials:
+            return shade()
+        return self.cached("shading of the scene" if source is self.method.light else "shading", source, shade)
+
+    def light_input(self, light: Light | None) -> Input:
+        """The light as an input; the same for the same known light."""
         if light is None or light is self.method.light.value():
-            if materials is not self.materials:
-                return self.method.shading(self, self.method.light, materials)
-            if self._scene_shading is None:
-                self._scene_shading = self.method.shading(self, self.method.light, materials)
-            return self._scene_shading
-        last, node = self._known or (None, None)
-        source = Input.renewed("light", light, last)
-        if node is None or source is not last:
-            node = self.method.shading(self, source, self.materials)
-            self._known = source, node
-        return node if materials is self.materials else self.method.shading(self, source, materials)
+            return self.method.light
+        if isinstance(light, wp.array):
+            return Input("light", light, news="light is given")
+        self._last_light = Input.renewed("light", light, self._last_light)
+        return self._last_light
 
     @property
     def transfers(self) -> Node:
         """Transfer vectors of the receivers to the renderer's basis, [batch, receiver, coefficient] for each group."""
-        if self._transfers is None:
-            self._transfers = self.method.transfers(self)
-        return self._transfers
+        return self.cached("transfers", None, lambda: self.method.transfers(self))
 
 
 class Bouncing(Protocol):

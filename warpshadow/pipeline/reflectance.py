@@ -1,7 +1,6 @@
 """Reflectance: the colors of the samples of a view, from albedo of bodies and vertices and from textures."""
 
 import copy
-import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -14,13 +13,12 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Call, Fixed, Input, Node
+from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.scene.scene import GLOSS
 from warpshadow.stages.interpolation import interpolate
-from warpshadow.stages.textures.footprint import Footprints, find_footprints
+from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo
-from warpshadow.stages.textures.seen import seen_texels
 
 Given = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
@@ -28,6 +26,15 @@ Given = Sequence[wp.array | None] | None
 
 GLOSS_DEFAULTS = {"roughness": 1.0, "metallic": 0.0, "specular": 1.0}
 """Of bodies that do not say; their roughness does not count where they do not shine."""
+
+
+class Reflection(NamedTuple):
+    """Nodes of the samples' reflectance."""
+
+    samples: Node  # vec3 of shape [batch, height, width]
+    vertex_albedo: Node
+    pyramids: Node
+    footprints: Node
 
 
 class Materials:
@@ -186,93 +193,30 @@ class Materials:
             idle=why_flat,
         )
 
+    def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: Callable[[], str]) -> Node:
+        """Node of the samples' footprints in the textures."""
+        merged_scene = self.merged_scene
+        maps = merged_scene.uvs, merged_scene.uv_faces, self.texture_of_face
+        sizes = Fixed(pyramids, is_constant=True)  # of which it takes these alone
+        arguments = fragments, merged_scene.faces, clip_positions, *maps, sizes
+        return Node("footprints", find_footprints, *arguments, items=items)
+
+    def reflection(self, fragments: Node, pyramids: Node, footprints: Node, items: Callable[[], str]) -> Reflection:
+        """Nodes of the samples' reflectance by albedo and textures."""
+        seen = fragments, self.merged_scene.faces, self.vertex_albedo
+        samples = Node("reflectance", sample_albedo, *seen, pyramids, footprints, items=items)
+        return Reflection(samples, self.vertex_albedo, pyramids, footprints)
+
+    def plain_reflection(self, fragments: Node, items: Callable[[], str]) -> Reflection:
+        """The same where no body has a texture."""
+        none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
+        seen = fragments, self.merged_scene.faces, self.vertex_albedo
+        samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))
+        return Reflection(samples, self.vertex_albedo, *none)
+
 
 def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array]:
     """Roughness or the like of each body, float32 of shape [1, 1] or [1, vertex]."""
     values = (getattr(body, name) for body in merged_scene.scene.bodies)
     rows = [GLOSS_DEFAULTS[name] if value is None else value for value in values]
     return [wp.array(np.atleast_2d(row), dtype=wp.float32, device=merged_scene.device) for row in rows]
-
-
-class Reflection(NamedTuple):
-    """Nodes of the samples' reflectance."""
-
-    samples: Node  # vec3 of shape [batch, height, width]
-    vertex_albedo: Node
-    pyramids: Node
-    footprints: Node
-
-
-class VisibleSurfaces:
-    """The visible surfaces of samples, and their reflectance.
-
-    Args:
-        materials: The scene's.
-        fragments: Node of the fragments.
-        clip_positions: Node of the vertices in clip space.
-        call: Holds values of the points that may not be cached.
-        items: Says how many samples there are.
-    """
-
-    def __init__(
-        self, materials: Materials, fragments: Node, clip_positions: Node, call: Call, items: Callable[[], str]
-    ):
-        self._materials, self._fragments, self._clip_positions = materials, fragments, clip_positions
-        self._call, self._items = call, items
-        self._reflection: Reflection | None = None  # of the scene's materials
-        self._footprints: tuple[tuple, Node, Node] = (), Node("", None), Node("", None)
-
-    def reflect(self, materials: Materials) -> Reflection:
-        """Wire the samples' reflectance; the scene's own is cached."""
-        own = self._materials
-        if materials is not own:
-            return self._reflect(materials)
-        if self._reflection is None:
-            self._reflection = self._reflect(own)
-        return self._reflection
-
-    def _reflect(self, materials: Materials) -> Reflection:
-        faces, items, vertex_albedo = materials.merged_scene.faces, self._items, materials.vertex_albedo
-        seen = self._fragments, faces, vertex_albedo
-        if not materials.images:
-            none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
-            samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))
-            return Reflection(samples, vertex_albedo, *none)
-        pyramids = materials.pyramids
-        if materials.textures is not self._materials.textures:
-            pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
-        if self._footprints[0] != materials.sizes:
-            merged_scene = materials.merged_scene
-            footprints = Node(
-                "footprints",
-                find_footprints,
-                self._fragments,
-                faces,
-                self._clip_positions,
-                merged_scene.uvs,
-                merged_scene.uv_faces,
-                materials.texture_of_face,
-                Fixed(pyramids, is_constant=True),  # of which it takes the sizes alone
-                items=items,
-            )
-            self._footprints = materials.sizes, footprints, Node("", Footprints.coarsest_level, footprints)
-        footprints = self._footprints[1]
-        samples = Node("reflectance", sample_albedo, *seen, pyramids, footprints, items=items)
-        return Reflection(samples, vertex_albedo, pyramids, footprints)
-
-    def coarsest_level(self, sizes: tuple) -> int | None:
-        """Coarsest level that kept footprints in textures of some sizes take; on a GPU it waits for that, once."""
-        known, footprints, coarsest = self._footprints
-        is_capturing = self._materials.merged_scene.device.is_capturing
-        if known != sizes or not footprints.is_cached or (is_capturing and not coarsest.is_cached):
-            return None
-        return coarsest.value(self._call)
-
-    def seen_texels(self, number: int) -> np.ndarray:
-        """Weight of each texel of a body's texture in the samples, float32 of shape [height, width]."""
-        has_texture = [size is not None for size in self._materials.sizes]
-        if not has_texture[number]:
-            raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
-        reflection = self.reflect(self._materials)
-        textures, footprints = (node.value(self._call) for node in (reflection.pyramids, reflection.footprints))
-        return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)

@@ -506,7 +506,7 @@ class SceneRenderer:
         """
         view = self._own(view)
         albedo, textures = self._per_body(albedo, textures)
-        return view.surfaces.reflect(view.materials.replaced(albedo, textures)).samples.value(self._call(view))
+        return view.reflection(view.materials.replaced(albedo, textures)).samples.value(self._call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:
@@ -520,7 +520,7 @@ class SceneRenderer:
         Raises:
             ValueError: for a body without a texture.
         """
-        return self._own_view.surfaces.seen_texels(self.scene.body_number(body))
+        return self._own_view.seen_texels(self.scene.body_number(body))
 
     def _per_body(
         self, albedo: PerBody[wp.array] | None, textures: PerBody[wp.array] | None

@@ -6,7 +6,7 @@ import copy
 import functools
 import operator
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -15,7 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
-from warpshadow.pipeline.reflectance import Given, Materials, VisibleSurfaces
+from warpshadow.pipeline.reflectance import Given, Materials, Reflection
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -25,13 +25,13 @@ from warpshadow.stages.sides import find_sides
 from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.slopes import moving_radiance
+from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.sample import textured_radiance
+from warpshadow.stages.textures.seen import seen_texels
 
 if TYPE_CHECKING:
     from warpshadow.pipeline.static import StaticBodies
     from warpshadow.stages.photograph import RatioImage
-
-AnyView = TypeVar("AnyView", bound="View")
 
 MOST_SHARED = 2
 """Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
@@ -81,8 +81,6 @@ class View(LitPoints):
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         normals, receivers = self._wire(method, vertices, spheres, cameras, static)
         super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, blocking, is_static)
-        self.surfaces = VisibleSurfaces(materials, self.fragments_node, self.clip_positions, call, self._samples)
-        self._white = receivers, receivers  # a node of shading, and one of white samples in it
 
     def _wire(
         self, method: Method, vertices: Input, spheres: Input, cameras: Input, static: StaticBodies | None
@@ -192,7 +190,7 @@ class View(LitPoints):
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         materials = self.materials.replaced(albedo, textures, gloss)
-        lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
+        lit, reflected = self.shading(light, materials), self.reflection(materials)
         if materials.gloss:
             samples = self._glossy(lit, light, materials, reflected.samples)
         elif reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
@@ -204,6 +202,38 @@ class View(LitPoints):
             samples = self._radiance(lit, reflected.samples)
         averaged = self._averaged(samples, is_moving=self._is_moving)
         return averaged
+
+    def reflection(self, materials: Materials) -> Reflection:
+        """Nodes of the samples' reflectance; the scene's own are cached."""
+        wire = functools.partial(self._reflect, materials)
+        return self.cached("reflection", None, wire) if materials is self.materials else wire()
+
+    def _reflect(self, materials: Materials) -> Reflection:
+        if not materials.images:
+            return materials.plain_reflection(self.fragments_node, self._samples)
+        pyramids = materials.pyramids
+        if materials.textures is not self.materials.textures:
+            pyramids = materials.pyramids_to(functools.partial(self.coarsest_level, materials.sizes))
+        arguments = self.fragments_node, self.clip_positions, pyramids, self._samples
+        footprints = self.cached("footprints", materials.sizes, functools.partial(materials.footprints, *arguments))
+        return materials.reflection(self.fragments_node, pyramids, footprints, self._samples)
+
+    def coarsest_level(self, sizes: tuple) -> int | None:
+        """Coarsest level that cached footprints in textures of some sizes take; on a GPU it waits for that, once."""
+        known, footprints = self._cached["footprints"]
+        if known != sizes or not footprints.is_cached:
+            return None
+        level = self.cached("coarsest", footprints, lambda: Node("", Footprints.coarsest_level, footprints))
+        return None if self.merged_scene.device.is_capturing and not level.is_cached else level.value(self.call)
+
+    def seen_texels(self, number: int) -> np.ndarray:
+        """Weight of each texel of a body's texture in the samples, float32 of shape [height, width]."""
+        has_texture = [size is not None for size in self.materials.sizes]
+        if not has_texture[number]:
+            raise ValueError(f"body: got {number}, a body without a texture, expected one that has one")
+        reflection = self.reflection(self.materials)
+        textures, footprints = (node.value(self.call) for node in (reflection.pyramids, reflection.footprints))
+        return seen_texels(textures, footprints)[sum(has_texture[:number])].sum(axis=0)
 
     def _glossy(self, lit: Node, light: Light | None, materials: Materials, reflected: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
@@ -245,7 +275,7 @@ class View(LitPoints):
         from warpshadow.stages.photograph import compose, find_ratio_image, over_nothing
 
         materials = self.materials.replaced(albedo, textures, gloss)
-        lit, reflected = self.shading(light, materials), self.surfaces.reflect(materials)
+        lit, reflected = self.shading(light, materials), self.reflection(materials)
 
         def divide(fragments: Fragments, *arguments: wp.array) -> RatioImage:
             return find_ratio_image(fragments.face_ids, catches, *arguments)
@@ -279,7 +309,6 @@ class View(LitPoints):
             arguments = self.vertices, self.spheres, other.receivers_node, self.call, None, self.normals, self.blocking
             view = copy.copy(self)
             LitPoints.__init__(view, self.method, self.materials, *arguments)
-            view._white = view.receivers_node, view.receivers_node
             return view
 
         return other.cached("in another scene", self, exchanged)
@@ -302,10 +331,8 @@ class View(LitPoints):
         return samples_of("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, lit: Node) -> Node:
-        """Node of the samples if every surface were white; kept with the last shading."""
-        if self._white[0] is not lit:
-            self._white = lit, Node("", _white_radiance, self.receivers_node, lit)
-        return self._white[1]
+        """Node of the samples if every surface were white; cached with the last shading."""
+        return self.cached("white", lit, lambda: Node("", _white_radiance, self.receivers_node, lit))
 
     # ------------------------------------------------------------------------------------------ in words
 
@@ -332,12 +359,6 @@ class View(LitPoints):
         if self.static is not None:
             static = int(self.static.has_vertex.sum())
         return f"{count - static:,} vertices, {static:,} kept" if static else f"{count:,} vertices"
-
-    def preview(self: AnyView) -> AnyView:
-        """A view for :meth:`explain`: neither does it store its inputs."""
-        view = super().preview()
-        view.surfaces = copy.copy(self.surfaces)
-        return view
 
     def emptiness(self) -> str | None:
         """Say of the first image that shows nothing of the scene why; None if there is none."""
