@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import warpshadow as ws
+from warpshadow.pipeline.groups import find_groups
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.torch import TorchRenderer
 
@@ -88,12 +89,9 @@ def test_several_cameras_and_poses_are_as_alone():
 
 
 def _groups(renderer: SceneRenderer) -> list:
-    from warpshadow.pipeline.groups import Grouping
-
     view = renderer.view()
-    spheres, frames = view.spheres.value(), renderer._method.planes.frames((1,), view.vertices.value())
-    grouping = Grouping(view, renderer._method.planes, renderer._method.parts)
-    return grouping.groups(view.call, view.receivers, spheres, None, {}, frames, None, None)
+    blockers = renderer._method.blockers(view.blocking, view.vertices.value(), view.spheres.value())
+    return find_groups(view, view.receivers, blockers, {}, None, None)
 
 
 def test_where_shadows_are_kept_at_vertices_they_stay_there():

@@ -12,7 +12,6 @@ import warp as wp
 from warpshadow.device.launch import detached
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.by_spheres import SphereMethod
-from warpshadow.pipeline.groups import Grouping
 from warpshadow.pipeline.lighting import LitPoints
 from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
 from warpshadow.stages.rasterization import Fragments
@@ -48,12 +47,9 @@ def find_squares(
     probe_keys = np.append(keys, -1)[sides.numpy().reshape(len(sides), -1)[:, probes]]
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
-    planes, convex = points.blocking.planes, points.blocking.convex
     with unrecorded():
         bare = detached(spheres[0]), detached(spheres[1])
-        frames = method.planes.frames(planes, detached(positions)) if planes else None
-        placed = method.parts.placed(convex, detached(positions)) if convex else None
-        grouping = Grouping(points, method.planes, method.parts, method.self_visibility)
+        blockers = method.blockers(points.blocking, detached(positions), bare)
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _ragged(body_of_probe == body)
             if not columns.shape[1]:
@@ -61,7 +57,7 @@ def find_squares(
             samples = np.where(columns < 0, -1, probes[columns])
             seen = see_samples(fragments, samples)
             facing = points_seen(detached(positions), detached(normals), merged_scene.faces, seen)
-            group = grouping.around(*facing, body, bare, frames, placed)
+            group = blockers.around_plane(*facing, body)
             parts = [method.sharp_share(part) for part in group.parts()]
             known = [part for part in parts if part is not None]
             if known:

@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneParts
-from warpshadow.pipeline.groups import Group, Grouping, Transmittance
+from warpshadow.pipeline.groups import Blockers, Group, Transmittance, find_groups
 from warpshadow.pipeline.lighting import (
     BY_SPHERES,
     LARGEST_COEFFICIENT,
@@ -88,6 +88,14 @@ class SphereMethod(Method):
     def convex_among(self, traced: tuple[int, ...]) -> tuple[int, ...]:
         """Bodies that block the light of others as convex parts, of some that block their own light as rays found."""
         return ()
+
+    def blockers(self, blocking: Blocking, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
+        """What blocks light among bodies, given how they do, their vertices and spheres. Differentiable: arrays."""
+        owners = self.planes, self.parts, self.self_visibility, self.visibility.merging
+        frames = self.planes.frames(blocking.planes, positions) if blocking.planes else None
+        corners = self.planes.corners(positions) if self.planes.numbers else None
+        placed = self.parts.placed(blocking.convex, positions) if blocking.convex else None
+        return Blockers(self.merged_scene, blocking, *owners, len(positions), spheres, frames, corners, placed)
 
     def past_planes(self, group: Group, seen: Transmittance, projected_light: Any) -> Transmittance:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""
@@ -210,7 +218,7 @@ class InParts(Node):
         is_shaded: bool = True,
         extra_inputs: tuple[Node, ...] = (),
     ):
-        self.method, self._grouping = method, Grouping(points, method.planes, method.parts, method.self_visibility)
+        self.method, self._points = method, points
         self._finish, self._progress = finish, method.progress and light is not None
         receivers, spheres, words = points.receivers_node, points.spheres, functools.partial(receiver_words, points)
         self_visibility = _self_visibility(method, points, projected_light)
@@ -226,18 +234,15 @@ class InParts(Node):
             caches=False,
         )
         planes = points.blocking.planes
-        place = functools.partial(method.planes.frames, planes) if planes else lambda _: None
-        frames = Node("", place, points.vertices)
-        convex = points.blocking.convex
-        parts = Node("", functools.partial(method.parts.placed, convex) if convex else lambda _: None, points.vertices)
-        corners = Node("", method.planes.corners if method.planes.numbers else lambda _: None, points.vertices)
+        place = functools.partial(method.blockers, points.blocking)
+        blockers = points.cached("blockers", None, lambda: Node("", place, points.vertices, spheres))
         self._passing = Node(
             f"planes{where}",
             method.past_planes,
             receivers,
             self._visibility,
             projected_light,
-            frames,
+            blockers,
             items=lambda: f"{words()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
             idle="" if planes else "spheres stand in for what casts shadows",
             caches=False,
@@ -261,7 +266,8 @@ class InParts(Node):
         shadows = _static_shadows(method, points, light)
         cached_rows = shadows if shadows.function else None
         looked_up: Node | dict = self_visibility if self_visibility.function else {}
-        before = receivers, spheres, projected_light, cached_rows, looked_up, frames, corners, parts
+        static_normals = None if points.static is None else points.static.normals
+        before = receivers, blockers, projected_light, looked_up, cached_rows, static_normals
         super().__init__(
             "", None, *before, extra_inputs=(self_visibility, shadows, result, *extra_inputs), caches=caches
         )
@@ -272,13 +278,13 @@ class InParts(Node):
 
     def parts(self, call: Call) -> Iterator[Any]:
         """Find it for one part after another."""
-        receivers, spheres, projected_light, cached_rows, looked_up, *others = self.values(call)
-        groups = self._grouping.groups(call, receivers, spheres, cached_rows, looked_up, *others)
+        receivers, blockers, projected_light, *cached = self.values(call)
+        groups = find_groups(self._points, receivers, blockers, *cached)
         total = len(receivers.on_static) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in groups:
                 for part in group.parts():
-                    yield self.find(call, part, projected_light, spheres)
+                    yield self.find(call, part, projected_light, blockers.spheres)
                     bar.update(part.points.shape[1])
 
     def find(self, call: Call, part: Group, projected_light: Any, spheres: tuple[wp.array, wp.array]) -> Any:

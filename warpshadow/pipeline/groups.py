@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.convex import PartsOfGroup, SceneParts
-from warpshadow.pipeline.lighting import LitPoints
+from warpshadow.pipeline.lighting import Blocking, LitPoints
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Call
 from warpshadow.pipeline.planes import PlanesOfGroup, ScenePlanes
 from warpshadow.pipeline.self_visibility import SelfVisibility, SelfVisibilityLobes, SelfVisibilityLookup
 from warpshadow.stages.cached_cells import CachedRows
@@ -97,141 +97,125 @@ class Transmittance(NamedTuple):
     transmittance_spheres: wp.array | None = None  # transmittance past all but planes; None where no planes block
 
 
-class Grouping:
-    """How receivers are put into groups.
+class Blockers(NamedTuple):
+    """What blocks light in a geometry, in the world."""
+
+    merged_scene: MergedScene
+    blocking: Blocking
+    planes: ScenePlanes
+    parts: SceneParts
+    self_visibility: SelfVisibility
+    merging: float
+    pose_count: int
+    spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, those that do not block among them
+    frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
+    corners: wp.array | None  # vertices of all bodies that are farthest out, vec3 [batch, corner]; None without planes
+    placed: PlacedParts | None  # where convex parts are; None without any
+
+    def solid(self, bodies: Iterable[int]) -> list[int]:
+        """Bodies among some that block light by their spheres."""
+        return [body for body in bodies if body not in self.blocking.planes and body not in self.blocking.convex]
+
+    def spheres_of(self, bodies: Iterable[int]) -> tuple[wp.array, wp.array]:
+        """Centers and radii of the spheres of bodies, of those that block by them."""
+        return self.merged_scene.spheres_of(self.solid(bodies), self.spheres)
+
+    @property
+    def bodies(self) -> range:
+        """All bodies."""
+        return range(len(self.merged_scene.scene.bodies))
+
+    def planes_around(self, body: int = -1, among: Iterable[int] | None = None) -> PlanesOfGroup | None:
+        """Flat bodies around receivers of one body: all that block, or some."""
+        planes = self.blocking.planes
+        named = planes if among is None else tuple(number for number in planes if number in among)
+        if self.frames is None or not set(named) - {body}:
+            return None
+        skip = planes.index(body) if body in planes else None
+        return PlanesOfGroup(self.planes.among(planes, named), self.frames, skip)
+
+    def parts_around(self, body: int = -1, among: Iterable[int] | None = None) -> PartsOfGroup | None:
+        """Convex parts of bodies around receivers of one body: all that block, or some."""
+        bodies = self.blocking.convex
+        named = bodies if among is None else tuple(number for number in bodies if number in among)
+        if self.placed is None or not set(named) - {body}:
+            return None
+        skip = bodies.index(body) if body in bodies else None
+        return PartsOfGroup(self.parts.among(bodies, named), self.placed, skip)
+
+    def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
+        """The group of points of a flat body."""
+        planes, parts = self.planes_around(body), self.parts_around()
+        return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, parts_around=parts)
+
+
+def find_groups(
+    points: LitPoints,
+    receivers: Receivers,
+    blockers: Blockers,
+    self_lookups: dict[int, Any],
+    cached_rows: CachedRows | None,
+    static_normals: wp.array | None,
+) -> list[Group]:
+    """Put receivers into groups.
 
     Args:
-        points: The receivers.
-        planes: The scene's bodies that lie in a plane.
-        parts: And those that consist of convex parts.
-        self_visibility: Has the probes of bodies.
+        points: Of which they are the receivers.
+        receivers: All of them.
+        blockers: What is around them.
+        self_lookups: Self-visibility of receivers, by body.
+        cached_rows: Cached transmittance past static bodies, for receivers on them.
+        static_normals: Normals of all vertices of static bodies; None where any may move.
     """
+    groups = list(_groups_that_move(receivers, blockers, self_lookups, points.blocker_of_point))
+    if points.static is None or not len(receivers.on_static):
+        return groups
+    assert static_normals is not None
+    moving, facing = points.static.moving, points.static.receivers(receivers.on_static, static_normals)
+    planes, parts = blockers.planes_around(among=moving), blockers.parts_around(among=moving)
+    group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, parts_around=parts)
+    return [group, *groups] if receivers.points.shape[1] else [group]
 
-    def __init__(self, points: LitPoints, planes: ScenePlanes, parts: SceneParts, self_visibility: SelfVisibility):
-        self._points, self._planes, self._parts, self._self_visibility = points, planes, parts, self_visibility
-        self._merged_scene, self._static = points.merged_scene, points.static
 
-    def groups(
-        self,
-        call: Call,
-        receivers: Receivers,
-        spheres: tuple[wp.array, wp.array],
-        cached_rows: CachedRows | None,
-        self_visibility: dict[int, Any],
-        frames: wp.array | None,
-        corners: wp.array | None,
-        placed: PlacedParts | None,
-    ) -> list[Group]:
-        """Put receivers into groups.
+def _groups_that_move(
+    receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], blocker_of_point: np.ndarray | None
+) -> Iterator[Group]:
+    """Groups of receivers that may move."""
+    solid = blockers.solid(blockers.bodies)
+    blocking, none = blockers.spheres_of(solid), blockers.spheres_of([])
+    clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
+    if not receivers.spans:
+        facing = receivers.points, receivers.normals
+        yield Group(*facing, *blocking, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
+    for span in receivers.spans:
+        facing = receivers.points, receivers.normals
+        assert receivers.vertices is not None
+        if span.first < receivers.vertices.size and blockers.pose_count == 1:  # all cameras see the same vertices
+            facing = receivers.points[:1], receivers.normals[:1]
+        is_traced = span.body in blockers.blocking.traced
+        skip = blockers.merged_scene.spheres_among(solid, span.body) if is_traced else (0, 0)
+        others = none if skip == (0, blocking[1].shape[1]) else blocking
+        points, normals = (cut(array, span.first, span.end) for array in facing)
+        planes, parts = blockers.planes_around(span.body), blockers.parts_around(span.body)
+        group = Group(points, normals, *others, planes=planes, parts_around=parts)
+        if others is blocking:
+            clusters = clusters or find_clusters(*blocking, blockers.merging)
+            group = group._replace(skip=skip, clusters=clusters)
+        if span.body >= 0:
+            places = blockers.self_visibility.places(receivers, span)
+            group = group._replace(body=span.body, places=places, self_lookup=self_lookups.get(span.body))
+            if blockers.corners is not None:
+                bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
+                group = group._replace(corners=cut(blockers.corners, *bounds))
+        if nearest_blockers is not None:
+            group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
+        yield group
 
-        Args:
-            call: Has the normals of static bodies.
-            receivers: All of them.
-            spheres: Centers and radii of all spheres.
-            cached_rows: Cached transmittance past static bodies, for receivers on them.
-            self_visibility: Self-visibility of receivers, by body.
-            frames: Where flat bodies are that block as planes, vec3 of shape [batch, 3 · plane]; None without any.
-            corners: Vertices of all bodies that are farthest out, vec3 of shape [batch, corner]; None without planes.
-            placed: Where convex parts are of bodies that block as such; None without any.
-        """
-        groups = list(self._that_move(call, receivers, spheres, self_visibility, frames, corners, placed))
-        if self._static is None or not len(receivers.on_static):
-            return groups
-        on_static = self._static.receivers(receivers.on_static, self._static.normals.value(call))
-        moving = self._merged_scene.spheres_of(self._solid(self._static.moving), spheres)
-        planes = self._planes_around(frames, self._static.moving)
-        parts_around = self._parts_around(placed, self._static.moving)
-        group = Group(*on_static, *moving, cached_rows, planes=planes, parts_around=parts_around)
-        return [group, *groups] if receivers.points.shape[1] else [group]
 
-    def _that_move(
-        self,
-        call: Call,
-        receivers: Receivers,
-        spheres: tuple[wp.array, wp.array],
-        self_visibility: dict[int, Any],
-        frames: wp.array | None,
-        corners: wp.array | None,
-        placed: PlacedParts | None,
-    ) -> Iterator[Group]:
-        """Receivers that may move."""
-        bodies = self._solid(range(len(self._merged_scene.scene.bodies)))
-        blocking, none = (self._merged_scene.spheres_of(some, spheres) for some in (bodies, []))
-        clusters = None
-        nearest_blockers = self._nearest_blockers(spheres)
-        if not receivers.spans:
-            planes = self._planes_around(frames)
-            yield Group(
-                receivers.points, receivers.normals, *blocking, planes=planes, nearest_blockers=nearest_blockers
-            )
-        pose_count = len(self._points.vertices.value(call))
-        for span in receivers.spans:
-            facing = receivers.points, receivers.normals
-            assert receivers.vertices is not None
-            if span.first < receivers.vertices.size and pose_count == 1:  # all cameras see the same vertices
-                facing = receivers.points[:1], receivers.normals[:1]
-            points, normals = (cut(array, span.first, span.end) for array in facing)
-            is_traced = span.body in self._points.blocking.traced
-            skip = self._merged_scene.spheres_among(bodies, span.body) if is_traced else (0, 0)
-            others = none if skip == (0, blocking[1].shape[1]) else blocking
-            group = Group(points, normals, *others, planes=self._planes_around(frames, but=span.body))
-            group = group._replace(parts_around=self._parts_around(placed, but=span.body))
-            if others is blocking:
-                clusters = clusters or find_clusters(*blocking, self._points.method.visibility.merging)
-                group = group._replace(skip=skip, clusters=clusters)
-            if span.body >= 0:
-                places = self._self_visibility.places(receivers, span)
-                group = group._replace(body=span.body, places=places, self_lookup=self_visibility.get(span.body))
-                if corners is not None:
-                    bounds = self._planes.first_corner[span.body : span.body + 2].tolist()
-                    group = group._replace(corners=cut(corners, *bounds))
-            if nearest_blockers is not None:
-                group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
-            yield group
-
-    def around(
-        self,
-        points: wp.array,
-        normals: wp.array,
-        body: int,
-        spheres: tuple[wp.array, wp.array],
-        frames: wp.array | None,
-        placed: PlacedParts | None,
-    ) -> Group:
-        """The group of points of a flat body, with its blockers."""
-        blocking = self._merged_scene.spheres_of(self._solid(range(len(self._merged_scene.scene.bodies))), spheres)
-        planes, parts_around = self._planes_around(frames, but=body), self._parts_around(placed)
-        return Group(points, normals, *blocking, planes=planes, parts_around=parts_around)
-
-    def _solid(self, bodies: Iterable[int]) -> list[int]:
-        """Bodies among some that block light by their spheres."""
-        blocking = self._points.blocking
-        return [body for body in bodies if body not in blocking.planes and body not in blocking.convex]
-
-    def _nearest_blockers(self, spheres: tuple[wp.array, wp.array]) -> NearestBlockers | None:
-        """The blockers nearest to the receivers; None where these are not sources."""
-        numbers, merged_scene = self._points.blocker_of_point, self._merged_scene
-        if numbers is None:
-            return None
-        own = merged_scene.spheres_of(solid_bodies(merged_scene), spheres)
-        return NearestBlockers(*own, constant(numbers, wp.int32, merged_scene.device))
-
-    def _parts_around(
-        self, placed: PlacedParts | None, blocking: tuple[int, ...] | None = None, *, but: int = -1
-    ) -> PartsOfGroup | None:
-        """Convex parts of bodies around receivers of one body: all that block, or some."""
-        bodies = self._points.blocking.convex
-        named = bodies if blocking is None else tuple(body for body in bodies if body in blocking)
-        if placed is None or not set(named) - {but}:
-            return None
-        return PartsOfGroup(self._parts.among(bodies, named), placed, bodies.index(but) if but in bodies else None)
-
-    def _planes_around(
-        self, frames: wp.array | None, blocking: tuple[int, ...] | None = None, *, but: int = -1
-    ) -> PlanesOfGroup | None:
-        """Flat bodies around receivers of one body: all that block, or some."""
-        planes = self._points.blocking.planes
-        named = planes if blocking is None else tuple(body for body in planes if body in blocking)
-        if frames is None or not set(named) - {but}:
-            return None
-        return PlanesOfGroup(self._planes.among(planes, named), frames, planes.index(but) if but in planes else None)
+def _nearest_blockers(numbers: np.ndarray | None, blockers: Blockers) -> NearestBlockers | None:
+    """The blockers nearest to the receivers; None where these are not sources."""
+    if numbers is None:
+        return None
+    merged_scene = blockers.merged_scene
+    own = merged_scene.spheres_of(solid_bodies(merged_scene), blockers.spheres)
+    return NearestBlockers(*own, constant(numbers, wp.int32, merged_scene.device))
