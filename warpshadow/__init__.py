@@ -22,8 +22,8 @@ from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
+from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.layers import Layers
-from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.mesh_scene import default_scene

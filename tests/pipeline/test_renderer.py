@@ -14,7 +14,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import directional, groups
 from warpshadow.pipeline.choice_of_receivers import for_picture
-from warpshadow.pipeline.merged_scene import Geometry
+from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning.point_sample import PointSample
 

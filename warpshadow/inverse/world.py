@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpshadow.assets.camera import Camera
-from warpshadow.pipeline.merged_scene import Geometry
+from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import GLOSS, SPHERE_METHODS, Scene, Visibility
 from warpshadow.spheres import Spheres

@@ -12,6 +12,7 @@ import warp as wp
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.convex import SceneParts
+from warpshadow.pipeline.geometry import Geometry
 from warpshadow.pipeline.groups import Blockers, Group, Transmittance, find_groups
 from warpshadow.pipeline.lighting import (
     BY_SPHERES,
@@ -24,7 +25,6 @@ from warpshadow.pipeline.lighting import (
     joined,
     receiver_words,
 )
-from warpshadow.pipeline.merged_scene import Geometry
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials

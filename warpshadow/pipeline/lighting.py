@@ -16,7 +16,8 @@ from warpshadow.assets.harmonic_light import as_light
 from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.merged_scene import Geometry, MergedScene
+from warpshadow.pipeline.geometry import Geometry
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.normals import vertex_normals

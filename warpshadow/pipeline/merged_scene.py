@@ -2,8 +2,6 @@
 
 import functools
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,82 +12,13 @@ from warpshadow.device.batch import common_batch, concatenate
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
+from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, exchanged
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import AUTO, SPHERE_METHODS, BodyLike, Scene
 from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.bound_spheres import SphereBinding
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
-
-Array = TypeVar("Array")  # element type of a geometry: Warp's arrays, or tensors
-
-Other = TypeVar("Other")
-
-
-@dataclass(frozen=True, eq=False)
-class Geometry(Generic[Array]):
-    """Movable geometry: the vertices of all bodies, and the spheres that represent them.
-
-    Args:
-        positions: Vertices [scene units], vec3 of shape [batch, vertex].
-        centers: Spheres' centers [scene units], vec3 of shape [batch, sphere].
-        radii: Spheres' radii [scene units], float32 of shape [batch, sphere].
-        moving: Bodies that differ from the scene's, from 0; None where any may. The others are the same in every
-            instance, and no gradient to them is asked for.
-        rotations: How each body is turned from its mesh, mat33 of shape [batch, body]; None where that is not known.
-            Whoever changes the shape of a body in another way than by :meth:`Renderer.deformed` leaves them out.
-        deformed: Bodies whose shape is not that of their mesh, from 0.
-    """
-
-    positions: Array
-    centers: Array
-    radii: Array
-    moving: tuple[int, ...] | None = field(default=None, kw_only=True)
-    rotations: Array | None = field(default=None, kw_only=True)
-    deformed: tuple[int, ...] = field(default=(), kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Hold the bodies in order."""
-        if self.moving is not None:
-            object.__setattr__(self, "moving", tuple(sorted(set(self.moving))))
-        object.__setattr__(self, "deformed", tuple(sorted(set(self.deformed))))
-
-    def arrays(self) -> dict[str, Array]:
-        """The arrays of the bodies, by name."""
-        return {"positions": self.positions, "centers": self.centers, "radii": self.radii}
-
-    def map(self, function: Callable[[Array], Other]) -> "Geometry[Other]":
-        """Apply a function to each array and return the geometry of the results."""
-        rotations = None if self.rotations is None else function(self.rotations)
-        arrays = map(function, self.arrays().values())
-        return Geometry(*arrays, moving=self.moving, rotations=rotations, deformed=self.deformed)
-
-
-PLACED = "placed(…) makes a geometry of poses"  # message for arrays that do not form a geometry
-CENTER = "center"  # of pivots: the middle of the bounds of a body's mesh
-
-Pivot = str | npt.ArrayLike | wp.array | None
-"""Pivots of the bodies, each in its own space: "center", a point, or one for each body; None: the origin."""
-
-GEOMETRY_DTYPES = {"positions": wp.vec3, "centers": wp.vec3, "radii": wp.float32}
-"""Dtypes of a geometry's arrays, by their names."""
-
-
-def as_geometry(name: str, arguments: object) -> Geometry:
-    """A geometry as it is, and a plain tuple of its arrays as one in which any body may move.
-
-    Raises:
-        ValueError: for anything else, by the name of the argument.
-    """
-    if isinstance(arguments, Geometry):
-        return arguments
-    if not isinstance(arguments, (tuple, list)) or len(arguments) != len(GEOMETRY_DTYPES):
-        count = f" of {len(arguments)}" if isinstance(arguments, (tuple, list)) else ""
-        raise ValueError(
-            f"{name}: got {type(arguments).__name__}{count}, expected a Geometry, as placed and deformed return, or a "
-            f"tuple of {', '.join(GEOMETRY_DTYPES)}"
-        )
-    return Geometry(*arguments)
 
 
 class MergedScene:
@@ -245,6 +174,14 @@ class MergedScene:
             check.finite("pivot", points)
         return self._array(np.broadcast_to(points, (len(self.scene.bodies), 3))[None], wp.vec3)
 
+    def scene_poses(self, *, pivot: Pivot = None) -> Poses:
+        """Where the scene has its bodies; the batch is 1. Not to be written to.
+
+        Args:
+            pivot: As for :meth:`placed`: translations are then where the pivots are.
+        """
+        return self.poses if pivot is None else self.poses.of_pivots(self.pivots(pivot))
+
     @functools.cached_property
     def scene_geometry(self) -> Geometry:
         """Where the scene has its bodies and their spheres; the batch is 1."""
@@ -259,7 +196,19 @@ class MergedScene:
         moving: Iterable[BodyLike] | None = None,
         pivot: Pivot = None,
     ) -> Geometry[wp.array]:
-        """Place the bodies in the world; see :meth:`Renderer.placed`. Differentiable: poses, rest, pivot."""
+        """Place the bodies in the world, in arrays of their own: x → s R (x − pivot) + t.
+
+        Args:
+            poses: Of each body, by default the scene's.
+            rest: The bodies in their own spaces, by default as their meshes are.
+                Either batch may be 1 and then serves every instance of the other.
+            moving: Bodies that ``poses`` move, by number or name; None for any. The others stand where the scene has
+                them, without a gradient, unless ``rest`` comes from :meth:`deformed`: deformed bodies count as moving.
+            pivot: Point of each body's own space that it is turned about and that translations put in its place:
+                "center", the middle of its mesh's bounds; a point [3] for all; one for each, [body, 3], or vec3 of
+                shape [batch, body]; None for the origin. ``scene_poses(pivot=…)`` are the poses to begin with.
+        Differentiable: poses, rest, pivot.
+        """
         rest = self.rest if rest is None else as_geometry("rest", rest)
         if poses is None:  # the scene's stand where they do, whatever they turn about
             poses, pivot = self.poses, None
@@ -360,7 +309,14 @@ class MergedScene:
 
     @one_at_a_time
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
-        """Bind the vertices of a body to its spheres; see :meth:`Renderer.deformation_graph`."""
+        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
+
+        Args:
+            body: The body, its number or name.
+            count: Nodes that carry a vertex.
+        Raises:
+            ValueError: for a body with too few spheres.
+        """
         number = self.scene.body_number(body)
         points = self.scene.bodies[number].mesh.positions
         return DeformationGraph.bind(points, self._spheres[number].centers, count=count, device=self.device)
@@ -375,8 +331,26 @@ class MergedScene:
         *,
         rest: Geometry[wp.array] | None = None,
     ) -> Geometry[wp.array]:
-        """Exchange the shape of one body at rest; see :meth:`Renderer.deformed`. Differentiable: all arrays."""
+        """Exchange the shape of one body at rest.
+
+        Args:
+            body: The body, its number or name.
+            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
+            centers: Its spheres' centers, vec3 of shape [batch, sphere].
+            radii: Its spheres' radii, float32 of shape [batch, sphere]. An item None stays as it is in ``rest``; but
+                its spheres follow its vertices, both centers and radii, unless ``centers`` are given
+                (:mod:`warpshadow.stages.bound_spheres`).
+            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
+        Returns:
+            All bodies at rest, for :meth:`placed`, in arrays of their own.
+        Raises:
+            ValueError: for other vertices of a flat body where light bounces by spheres, for which it stays in its
+                plane.
+        Differentiable: positions, centers, radii, rest.
+        """
         number = self.scene.body_number(body)
+        if positions is not None and self.is_flat[number] and self.scene.bounces:
+            self._refuse_other_vertices(number)
         rest = self.rest if rest is None else as_geometry("rest", rest)
         first_vertex, first_sphere = self.first_vertex[number : number + 2], self.first_sphere[number : number + 2]
         if positions is not None and centers is None and len(self._spheres[number]):
@@ -393,6 +367,15 @@ class MergedScene:
             rotations=None if rest.rotations is None else exchanged(rest.rotations, [], lambda *_: rest.rotations),
             deformed=(*rest.deformed, number),
         )
+
+    def _refuse_other_vertices(self, number: int) -> None:
+        """Raise ValueError for other vertices of a flat body where light bounces by spheres."""
+        if self.scene.visibility.method in SPHERE_METHODS:
+            raise ValueError(
+                f"positions: got some for body {number} ({self.scene.bodies[number].called!r}), which is flat; "
+                f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
+                'reflects and blocks as a part of a plane; set bounces = 0, or take method "ray-traced"'
+            )
 
     def _sphere_binding(self, number: int) -> SphereBinding:
         """The spheres of a body, bound to the vertices of its faces."""
@@ -472,23 +455,3 @@ def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarra
     check.shape(name, part.shape, ("batch", end - first))
     common_batch({"rest": whole, name: part})
     return exchanged(whole, [(first, end)], lambda *_: part)
-
-
-def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
-    """Exchange runs of items of a whole.
-
-    Args:
-        whole: Shape [batch, item].
-        runs: Where each begins and ends, rising.
-        part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
-    Returns:
-        Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
-    Differentiable: whole, where it is not exchanged, and parts.
-    """
-    pieces, last = [] if runs else [whole], 0
-    for first, end in runs:
-        pieces += [whole[:, last:first]] if first > last else []
-        pieces.append(part_of(first, end))
-        last = end
-    pieces += [whole[:, last:]] if runs and last < whole.shape[1] else []
-    return concatenate(pieces, [piece.shape[1] for piece in pieces])

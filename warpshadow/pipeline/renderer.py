@@ -4,7 +4,7 @@
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -29,9 +29,10 @@ from warpshadow.pipeline.choice_of_receivers import (
     with_receivers,
 )
 from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.geometry import PLACED, Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, joined
-from warpshadow.pipeline.merged_scene import PLACED, Geometry, MergedScene, Pivot, as_geometry
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods import make_method
 from warpshadow.pipeline.node import Call, Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
@@ -40,9 +41,7 @@ from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
 from warpshadow.scene.scene import GLOSS, METHODS, SCENE, BodyLike, PerBody, Scene
-from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import check_clip_space
 from warpshadow.stages.receivers import Receivers, receivers_on_faces
 
@@ -62,6 +61,18 @@ def _said(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Conca
             return function(self, *args, **kwargs)
 
     return announced
+
+
+def _of_bodies(
+    function: Callable[Concatenate[MergedScene, P], R],
+) -> Callable[Concatenate["SceneRenderer", P], R]:
+    """Make a method of the merged scene one of its renderer."""
+
+    @functools.wraps(function)
+    def called(self: "SceneRenderer", *args: P.args, **kwargs: P.kwargs) -> R:
+        return function(self.merged_scene, *args, **kwargs)
+
+    return called
 
 
 _OF_CAMERAS = ("_own_view", "_without_others")  # cached values of a renderer's cameras
@@ -183,84 +194,10 @@ class SceneRenderer:
         """The bodies and their spheres at rest, each body in its own space; the batch is 1. Not to be written to."""
         return self.merged_scene.rest
 
-    def scene_poses(self, *, pivot: Pivot = None) -> Poses:
-        """Where the scene has its bodies; the batch is 1. Not to be written to.
-
-        Args:
-            pivot: As for :meth:`placed`: translations are then where the pivots are.
-        """
-        poses = self.merged_scene.poses
-        return poses if pivot is None else poses.of_pivots(self.merged_scene.pivots(pivot))
-
-    def placed(
-        self,
-        poses: Poses | None = None,
-        rest: Geometry[wp.array] | None = None,
-        *,
-        moving: Iterable[BodyLike] | None = None,
-        pivot: Pivot = None,
-    ) -> Geometry[wp.array]:
-        """Place the bodies in the world, in arrays of their own: x → s R (x − pivot) + t.
-
-        Args:
-            poses: Of each body, by default the scene's.
-            rest: The bodies in their own spaces, by default as their meshes are.
-                Either batch may be 1 and then serves every instance of the other.
-            moving: Bodies that ``poses`` move, by number or name; None for any. The others stand where the scene has
-                them, without a gradient, unless ``rest`` comes from :meth:`deformed`: deformed bodies count as moving.
-            pivot: Point of each body's own space that it is turned about and that translations put in its place:
-                "center", the middle of its mesh's bounds; a point [3] for all; one for each, [body, 3], or vec3 of
-                shape [batch, body]; None for the origin. ``scene_poses(pivot=…)`` are the poses to begin with.
-        Differentiable: poses, rest, pivot.
-        """
-        return self.merged_scene.placed(poses, rest, moving=moving, pivot=pivot)
-
-    def deformed(
-        self,
-        body: BodyLike,
-        positions: wp.array | None = None,
-        centers: wp.array | None = None,
-        radii: wp.array | None = None,
-        *,
-        rest: Geometry[wp.array] | None = None,
-    ) -> Geometry[wp.array]:
-        """Exchange the shape of one body at rest.
-
-        Args:
-            body: The body, its number or name.
-            positions: Its vertices in its own space, vec3 of shape [batch, vertex].
-            centers: Its spheres' centers, vec3 of shape [batch, sphere].
-            radii: Its spheres' radii, float32 of shape [batch, sphere]. An item None stays as it is in ``rest``; but
-                its spheres follow its vertices, both centers and radii, unless ``centers`` are given
-                (:mod:`warpshadow.stages.bound_spheres`).
-            rest: All bodies at rest, by default as their meshes are; batches of 1 serve every instance.
-        Returns:
-            All bodies at rest, for :meth:`placed`, in arrays of their own.
-        Raises:
-            ValueError: for other vertices of a flat body where light bounces by spheres, for which it stays in its
-                plane.
-        Differentiable: positions, centers, radii, rest.
-        """
-        if positions is not None and self._method.bounces is not None:
-            number = self.scene.body_number(body)
-            if self.merged_scene.is_flat[number]:
-                raise ValueError(
-                    f"positions: got some for body {number} ({self.scene.bodies[number].called!r}), which is flat; "
-                    f"expected None where light bounces (scene.bounces is {self.scene.bounces}), since a flat body "
-                    'reflects and blocks as a part of a plane; set bounces = 0, or take method "ray-traced"'
-                )
-        return self.merged_scene.deformed(body, positions, centers, radii, rest=rest)
-
-    def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
-        """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
-
-        Args:
-            body: The body, its number or name.
-            count: Nodes that carry a vertex.
-        Raises:
-            ValueError: for a body with too few spheres.
-        """
-        return self.merged_scene.deformation_graph(body, count=count)
+    scene_poses = _of_bodies(MergedScene.scene_poses)
+    placed = _of_bodies(MergedScene.placed)
+    deformed = _of_bodies(MergedScene.deformed)
+    deformation_graph = _of_bodies(MergedScene.deformation_graph)
 
     @property
     def clip_matrices(self) -> wp.array:

@@ -16,7 +16,8 @@ import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
-from warpshadow.pipeline.merged_scene import Geometry, MergedScene, exchanged
+from warpshadow.pipeline.geometry import Geometry, exchanged
+from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.stages.cached_cells import CachedRows
 from warpshadow.stages.normals import vertex_normals

@@ -1,7 +1,5 @@
 """Views: a geometry seen by cameras, wired from the vertices to the image."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import operator
@@ -65,7 +63,7 @@ class View(LitPoints):
         vertices: Input,
         spheres: Input,
         cameras: Input,
-        static: StaticBodies | None,
+        static: "StaticBodies | None",
         blocking: Blocking,
         *,
         call: Call,
@@ -83,7 +81,7 @@ class View(LitPoints):
         super().__init__(method, materials, vertices, spheres, receivers, call, static, normals, blocking, is_static)
 
     def _wire(
-        self, method: Method, vertices: Input, spheres: Input, cameras: Input, static: StaticBodies | None
+        self, method: Method, vertices: Input, spheres: Input, cameras: Input, static: "StaticBodies | None"
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         merged_scene, samples, corners = method.merged_scene, self._samples, self._vertices
@@ -277,7 +275,7 @@ class View(LitPoints):
         materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.reflection(materials)
 
-        def divide(fragments: Fragments, *arguments: wp.array) -> RatioImage:
+        def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
             return find_ratio_image(fragments.face_ids, catches, *arguments)
 
         seen = Fixed(self.fragments_node), reflected.samples, unshadowed
@@ -302,7 +300,7 @@ class View(LitPoints):
         """The image if every surface were white, of light on the receivers; vec4 of shape [batch, height, width]."""
         return self._averaged(self._white_radiance_of(lit))
 
-    def at_receivers_of(self, other: View) -> View:
+    def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
 
         def exchanged() -> View:

@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.warp_internals import item_shape
-from warpshadow.pipeline.merged_scene import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
+from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 
 

@@ -23,7 +23,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.pipeline.merged_scene import Geometry, as_geometry
+from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, uncompiled
 from warpshadow.torch.renderer import TorchRenderer

@@ -14,7 +14,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.explain import Explanation
-from warpshadow.pipeline.merged_scene import GEOMETRY_DTYPES, Geometry
+from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.scene.scene import GLOSS, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
