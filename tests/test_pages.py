@@ -17,7 +17,7 @@ from warpshadow.cli import app
 from warpshadow.dataset import Recipe, load_recipe
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline import renderer as pipeline_renderer
+from warpshadow.pipeline import scene_views
 from warpshadow.scene import blockers
 
 if sys.version_info >= (3, 11):
@@ -274,7 +274,7 @@ def test_the_node_that_a_page_adds_is_one_of_the_image(tmp_path, monkeypatch):
     camera = ws.Camera.look_at((0, 2, 0.1), (0, 0, 0), size=(8, 8))
     scene = ws.Scene([ws.Body(ws.plane(9.0, 4), receivers="pixel")], ws.EnvironmentMap.constant(), camera)
     plain = ws.render(scene)
-    monkeypatch.setattr(pipeline_renderer, "View", importlib.import_module("darker_view").View)
+    monkeypatch.setattr(scene_views, "View", importlib.import_module("darker_view").View)
     renderer = ws.Renderer(scene)
     assert renderer.explain()["vignette"]
     darkened = renderer.render()

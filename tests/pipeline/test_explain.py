@@ -179,7 +179,7 @@ def test_tensors_that_are_not_written_to_are_known_again_without_a_look_at_them(
         if factor is not None:
             geometry.positions.mul_(factor)
         renderer(geometry=geometry)
-        seen.append(renderer.warp._last_view)
+        seen.append(renderer.warp._views.last[1])
     assert seen[0] is seen[1] and seen[1] is not seen[2]
 
 

@@ -15,7 +15,6 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.batch import common_batch
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty
 from warpshadow.device.progress import waiting
@@ -29,21 +28,19 @@ from warpshadow.pipeline.choice_of_receivers import (
     with_receivers,
 )
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.geometry import PLACED, Geometry, as_geometry
+from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
-from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, joined
+from warpshadow.pipeline.lighting import Light, LitPoints, joined
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods import make_method
-from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.static import StaticBodies
+from warpshadow.pipeline.scene_views import SceneViews
 from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
 from warpshadow.scene.scene import GLOSS, METHODS, SCENE, BodyLike, PerBody, Scene
-from warpshadow.stages.normals import vertex_normals
-from warpshadow.stages.project import check_clip_space
-from warpshadow.stages.receivers import Receivers, receivers_on_faces
+from warpshadow.stages.receivers import Receivers
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
 
@@ -63,14 +60,12 @@ def _said(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Conca
     return announced
 
 
-def _of_bodies(
-    function: Callable[Concatenate[MergedScene, P], R],
-) -> Callable[Concatenate["SceneRenderer", P], R]:
-    """Make a method of the merged scene one of its renderer."""
+def _delegated(part: str, function: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate["SceneRenderer", P], R]:
+    """Make a method of a part of a renderer one of the renderer."""
 
     @functools.wraps(function)
     def called(self: "SceneRenderer", *args: P.args, **kwargs: P.kwargs) -> R:
-        return function(self.merged_scene, *args, **kwargs)
+        return function(getattr(self, part), *args, **kwargs)
 
     return called
 
@@ -134,15 +129,7 @@ class SceneRenderer:
         self._method = make_method(self.merged_scene, basis, progress=progress)
         self._materials = Materials.of_scene(self.merged_scene)
         self.basis = self._method.basis
-        self._vertices = Input("vertices", lambda: self.geometry().positions)
-        self._spheres = Input("spheres", lambda: (self.geometry().centers, self.geometry().radii))
-        clip_matrices = [camera.clip_matrix() for camera in self.cameras]
-        self._rotations = Input("rotations", lambda: self.geometry().rotations)
-        self._cameras = Input("cameras", lambda: wp.array(clip_matrices, dtype=wp.mat44, device=where))
-        self._scene_view: View | None = None
-        self._last_view: View | None = None
-        self._last_cameras: Input | None = None
-        self._statics: dict[tuple[int, ...], StaticBodies] = {}  # by moving bodies
+        self._views = SceneViews(self._method, self._materials, self.cameras, self.clock)
         self._has_warned = False
 
     def __repr__(self) -> str:
@@ -159,12 +146,10 @@ class SceneRenderer:
             cameras: Any number of them, of one size and near plane, whose images are a batch.
         """
         other = object.__new__(type(self))
-        matrices = [camera.clip_matrix() for camera in _alike(cameras)]
         vars(other).update({name: value for name, value in vars(self).items() if name not in _OF_CAMERAS})
         other._arguments = self._arguments | {"cameras": cameras}
-        other.cameras, other.has_camera_batch = tuple(cameras), True
-        other._cameras = Input("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=other.device))
-        other._scene_view = other._last_view = other._last_cameras = None
+        other.cameras, other.has_camera_batch = _alike(cameras), True
+        other._views = self._views.with_cameras(other.cameras)
         other._has_warned = True
         if "_without_others" in vars(self):
             vars(other)["_without_others"] = self._without_others.with_cameras(cameras)
@@ -194,15 +179,15 @@ class SceneRenderer:
         """The bodies and their spheres at rest, each body in its own space; the batch is 1. Not to be written to."""
         return self.merged_scene.rest
 
-    scene_poses = _of_bodies(MergedScene.scene_poses)
-    placed = _of_bodies(MergedScene.placed)
-    deformed = _of_bodies(MergedScene.deformed)
-    deformation_graph = _of_bodies(MergedScene.deformation_graph)
+    scene_poses = _delegated("merged_scene", MergedScene.scene_poses)
+    placed = _delegated("merged_scene", MergedScene.placed)
+    deformed = _delegated("merged_scene", MergedScene.deformed)
+    deformation_graph = _delegated("merged_scene", MergedScene.deformation_graph)
 
     @property
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
-        return self._cameras.value()
+        return self._views.clip_matrices.value()
 
     @_said
     def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
@@ -219,129 +204,29 @@ class SceneRenderer:
                 :func:`warpshadow.stages.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        is_scenes = geometry is None and clip_matrices is None
-        view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        if view in (self._scene_view, self._last_view):
+        view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        if view in self._views.last:
             return view
         for node in (view.receivers_node, view.silhouettes):
             node.value(view.call)
-        if not self._has_warned and (is_readable(self.device) or (is_scenes and not self.device.is_capturing)):
-            remarks = [view.emptiness()]
-            if is_scenes:
-                remarks += enclosures(self.scene, self.cameras)
-                remarks += [*misplacements(self.scene), *rounded_edges(self.scene)]
-            if result := [remark for remark in remarks if remark]:
-                check.warn("; ".join(result))
-                self._has_warned = True
-        self._last_cameras = view.cameras
-        if view.static is not None:
-            self._statics[view.static.moving] = view.static
-        if view.receivers_node.is_cached and is_scenes:
-            self._scene_view = view
-        elif view.receivers_node.is_cached:
-            self._last_view = view
+        self._warn_of_nothing(view)
+        self._views.keep(view)
         return view
 
-    def _wired(self, geometry: Geometry | None, clip_matrices: wp.array | None) -> View:
-        """Build a lazy view, or reuse a cached one whose inputs match."""
-        vertices, spheres, cameras, static = self._vertices, self._spheres, self._cameras, None
-        last, poses, matrices = self._last_view, [None], self.cameras
-        if geometry is not None:
-            rest = self.merged_scene.rest.arrays()
-            for name, array in geometry.arrays().items():
-                check.shape(f"geometry.{name}", array.shape, ("batch", *rest[name].shape[1:]), PLACED)
-            poses = geometry.positions
-            vertices = Input.renewed("vertices", poses, last.vertices if last else None)
-            spheres = Input.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
-        if clip_matrices is not None:
-            matrices = clip_matrices
-            cameras = Input.renewed("cameras", matrices, self._last_cameras)
-        image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
-        # rays look at all moving bodies, and light bounces from moving bodies to static ones
-        caches_rows = not (self._method.lights_samples or self.scene.bounces)
-        if geometry is not None and geometry.moving is not None and caches_rows:
-            static = self._statics.get(geometry.moving)
-            if static is None or not static.are_those_of(geometry):
-                static = StaticBodies(self.merged_scene, geometry)
-        arguments = vertices, spheres, cameras, static, self._blocking(geometry, last)
-        for view in (self._scene_view, last):
-            if view is not None and view.given == arguments:
-                return view
-        if clip_matrices is not None:
-            check_clip_space(clip_matrices)
-        return View(
-            self._method,
-            self._materials,
-            *arguments,
-            call=self._call(),
-            camera=self.cameras[0],
-            counts=(len(poses), image_count),
-            is_static=geometry is None and clip_matrices is None and image_count == 1,
-        )
+    def _warn_of_nothing(self, view: View) -> None:
+        """Say once why an image shows nothing, and of the scene itself what is likely to be wrong."""
+        is_of_scene, device = self._views.is_of_scene(view), self.device
+        if self._has_warned or not (is_readable(device) or (is_of_scene and not device.is_capturing)):
+            return
+        remarks = [view.emptiness()]
+        if is_of_scene:
+            remarks += [*enclosures(self.scene, self.cameras), *misplacements(self.scene), *rounded_edges(self.scene)]
+        if result := [remark for remark in remarks if remark]:
+            check.warn("; ".join(result))
+            self._has_warned = True
 
-    def _blocking(self, geometry: Geometry | None, last: LitPoints | None = None) -> Blocking:
-        """How the bodies of a geometry, by default the scene's, block light."""
-        rotations = self._rotations
-        if geometry is not None and geometry.rotations is not None:
-            check.shape("geometry.rotations", geometry.rotations.shape, ("batch", len(self.scene.bodies)))
-            rotations = Input.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
-        return self._method.blocking(geometry, rotations)
-
-    def _call(self, view: LitPoints | None = None) -> Call:
-        """A call, with the cached values of a view."""
-        return Call(self.clock, view.call if view else None, caches=not self.device.is_capturing)
-
-    def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
-        """Points to be lit by :meth:`shade` that are given, not found in an image.
-
-        Nobody knows which body a point is on: all spheres block its light, and where light bounces, none comes from its
-        own body as such. For points of bodies take :meth:`on_faces`.
-
-        Args:
-            points: Positions [scene units], vec3 of shape [batch, receiver].
-            normals: Unit normals, vec3 of shape [batch, receiver].
-            geometry: Geometry of the blockers, by default the scene's bodies.
-        Differentiable: all.
-        """
-        receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
-        vertices, spheres = self._vertices, self._spheres
-        if geometry is not None:
-            vertices = Input("vertices", geometry.positions)
-            spheres = Input("spheres", (geometry.centers, geometry.radii))
-        node = Node("", lambda arguments: arguments, receivers)
-        blocking = self._method.blocking(geometry, None)
-        return LitPoints(self._method, self._materials, vertices, spheres, node, self._call(), blocking=blocking)
-
-    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
-        """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
-
-        Args:
-            sides: Face of each, backs numbered after the last face, int of shape [receiver]; receivers of a body are
-                consecutive.
-            barycentrics: Where on it, shape [receiver, 3].
-            geometry: Where the bodies are, by default where the scene has them.
-        Differentiable: geometry.
-        """
-        blocking, merged_scene, vertices, spheres = (
-            self._blocking(geometry),
-            self.merged_scene,
-            self._vertices,
-            self._spheres,
-        )
-        if geometry is not None:
-            vertices = Input("vertices", geometry.positions)
-            spheres = Input("spheres", (geometry.centers, geometry.radii))
-        separate_bodies = self._method.separate_bodies(blocking)
-        bodies = (
-            None
-            if separate_bodies is None
-            else separate_bodies[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
-        )
-        normals = Node("", vertex_normals, vertices, merged_scene.faces)
-        arguments = merged_scene.faces, sides, barycentrics, bodies
-        node = Node("", receivers_on_faces, vertices, normals, *arguments)
-        points = self._method, self._materials, vertices, spheres, node, self._call()
-        return LitPoints(*points, normals=normals, blocking=blocking)
+    at_points = _delegated("_views", SceneViews.at_points)
+    on_faces = _delegated("_views", SceneViews.on_faces)
 
     @functools.cached_property
     def _own_view(self) -> View:
@@ -397,7 +282,7 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._own_view
-        parts = view.transfers.value(self._call(view))
+        parts = view.transfers.value(self._views.call(view))
         if len(parts) == 1:
             return parts[0]
         count = parts[0].shape[2]
@@ -421,7 +306,7 @@ class SceneRenderer:
         Differentiable: light, view.
         """
         view = self._own(view)
-        return view.shading(light).value(self._call(view))
+        return view.shading(light).value(self._views.call(view))
 
     @_said
     def reflect(
@@ -443,7 +328,7 @@ class SceneRenderer:
         """
         view = self._own(view)
         albedo, textures = self._per_body(albedo, textures)
-        return view.reflection(view.materials.replaced(albedo, textures)).samples.value(self._call(view))
+        return view.reflection(view.materials.replaced(albedo, textures)).samples.value(self._views.call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:
@@ -495,7 +380,7 @@ class SceneRenderer:
         Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._own(view)
-        return view.image(light, *self._per_body(albedo, textures), self._gloss(gloss)).value(self._call(view))
+        return view.image(light, *self._per_body(albedo, textures), self._gloss(gloss)).value(self._views.call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -571,11 +456,11 @@ class SceneRenderer:
         view = self.view(geometry, clip_matrices)
         if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
             seen = seen.at_receivers_of(view)
-        received = seen.white(light, *reflecting).value(without._call(seen))
+        received = seen.white(light, *reflecting).value(without._views.call(seen))
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, Input("light without the others", received)
         return view.in_photograph(*arguments, self._catches, light, colors, images, self._gloss(gloss)).value(
-            self._call(view)
+            self._views.call(view)
         )
 
     @property
@@ -641,11 +526,11 @@ class SceneRenderer:
         others = SceneRenderer(**arguments | {"scene": replace(self.scene, bodies=bodies)})
         with unrecorded():
             view = self._own_view
-            call = self._call(view)
+            call = self._views.call(view)
             receivers = Node("", Receivers.without_owners, view.receivers_node)
             none = tuple(empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
             spheres = Input("spheres", none)
-            free = LitPoints(others._method, others._materials, self._vertices, spheres, receivers, call)
+            free = LitPoints(others._method, others._materials, self._views.vertices, spheres, receivers, call)
             images = (view.white_image(item.shading(None)).value(call) for item in (view, free))
             received, unblocked = (image.numpy()[..., :3].copy() for image in images)
         ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
@@ -683,7 +568,7 @@ class SceneRenderer:
             view = self._own(view)
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
-            view = self._wired(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+            view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
         image = view.preview().image(light, *self._per_body(albedo, textures), self._gloss(gloss))
         is_host = self.device.is_cpu or self.clock.waits
         notes = receiver_notes(self._given_scene, self._choices)
@@ -694,7 +579,9 @@ class SceneRenderer:
                     "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
                 )
             )
-        return Explanation(image, self._call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes)
+        return Explanation(
+            image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
+        )
 
 
 def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

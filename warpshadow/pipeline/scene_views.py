@@ -1,0 +1,160 @@
+"""Views of a scene: its geometries seen by cameras, which are used again while their inputs stay the same."""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warpshadow import check
+from warpshadow.assets.camera import Camera
+from warpshadow.device.batch import common_batch
+from warpshadow.pipeline.geometry import PLACED, Geometry
+from warpshadow.pipeline.lighting import Blocking, LitPoints, Method
+from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.reflectance import Materials
+from warpshadow.pipeline.static import StaticBodies
+from warpshadow.pipeline.view import View
+from warpshadow.stages.normals import vertex_normals
+from warpshadow.stages.project import check_clip_space
+from warpshadow.stages.receivers import Receivers, receivers_on_faces
+
+
+class SceneViews:
+    """Views of a scene, and points in it that are lit.
+
+    Args:
+        method: How light is blocked.
+        materials: Reflectance of the bodies.
+        cameras: The cameras that see the scene, of one size and near plane.
+        clock: Where times are noted.
+    Attributes:
+        clip_matrices: The cameras.
+        last: The last views that were cached: of the scene itself, and of another geometry or by other cameras.
+    """
+
+    def __init__(self, method: Method, materials: Materials, cameras: Sequence[Camera], clock: Clock):
+        self._method, self._materials, self._clock, self._merged_scene = method, materials, clock, method.merged_scene
+        scene = self._merged_scene
+        self.vertices = Input("vertices", lambda: scene.scene_geometry.positions)
+        self._spheres = Input("spheres", lambda: (scene.scene_geometry.centers, scene.scene_geometry.radii))
+        self._rotations = Input("rotations", lambda: scene.scene_geometry.rotations)
+        self._static: dict[tuple[int, ...], StaticBodies] = {}  # by moving bodies
+        self._see_by(cameras)
+
+    def _see_by(self, cameras: Sequence[Camera]) -> None:
+        matrices, device = [camera.clip_matrix() for camera in cameras], self._merged_scene.device
+        self._cameras = tuple(cameras)
+        self.clip_matrices = Input("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=device))
+        self.last: tuple[View | None, View | None] = None, None
+        self._last_cameras: Input | None = None
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> "SceneViews":
+        """Views by other cameras of the same bodies."""
+        other = copy.copy(self)
+        other._see_by(cameras)
+        return other
+
+    def call(self, points: LitPoints | None = None) -> Call:
+        """A call, with the cached values of points."""
+        return Call(self._clock, points.call if points else None, caches=not self._merged_scene.device.is_capturing)
+
+    def is_of_scene(self, view: View) -> bool:
+        """Whether a view is of the bodies where the scene has them, by its cameras."""
+        return view.vertices is self.vertices and view.cameras is self.clip_matrices
+
+    def keep(self, view: View) -> None:
+        """Cache a view whose receivers are found, to be used again."""
+        self._last_cameras = view.cameras
+        if view.static is not None:
+            self._static[view.static.moving] = view.static
+        if view.receivers_node.is_cached:
+            self.last = (view, self.last[1]) if self.is_of_scene(view) else (self.last[0], view)
+
+    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """Build a lazy view, or reuse a cached one whose inputs match."""
+        vertices, spheres, cameras, static = self.vertices, self._spheres, self.clip_matrices, None
+        last, poses, matrices = self.last[1], [None], self._cameras
+        if geometry is not None:
+            rest = self._merged_scene.rest.arrays()
+            for name, array in geometry.arrays().items():
+                check.shape(f"geometry.{name}", array.shape, ("batch", *rest[name].shape[1:]), PLACED)
+            poses = geometry.positions
+            vertices = Input.renewed("vertices", poses, last.vertices if last else None)
+            spheres = Input.renewed("spheres", (geometry.centers, geometry.radii), last.spheres if last else None)
+        if clip_matrices is not None:
+            matrices = clip_matrices
+            cameras = Input.renewed("cameras", matrices, self._last_cameras)
+        image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
+        # rays look at all moving bodies, and light bounces from moving bodies to static ones
+        caches_rows = not (self._method.lights_samples or self._merged_scene.scene.bounces)
+        if geometry is not None and geometry.moving is not None and caches_rows:
+            static = self._static.get(geometry.moving)
+            if static is None or not static.are_those_of(geometry):
+                static = StaticBodies(self._merged_scene, geometry)
+        arguments = vertices, spheres, cameras, static, self._blocking(geometry, last)
+        for view in self.last:
+            if view is not None and view.given == arguments:
+                return view
+        if clip_matrices is not None:
+            check_clip_space(clip_matrices)
+        return View(
+            self._method,
+            self._materials,
+            *arguments,
+            call=self.call(),
+            camera=self._cameras[0],
+            counts=(len(poses), image_count),
+            is_static=geometry is None and clip_matrices is None and image_count == 1,
+        )
+
+    def _blocking(self, geometry: Geometry | None, last: LitPoints | None = None) -> Blocking:
+        """How the bodies of a geometry, by default the scene's, block light."""
+        rotations = self._rotations
+        if geometry is not None and geometry.rotations is not None:
+            count = len(self._merged_scene.scene.bodies)
+            check.shape("geometry.rotations", geometry.rotations.shape, ("batch", count))
+            rotations = Input.renewed("rotations", geometry.rotations, last.blocking.rotations if last else None)
+        return self._method.blocking(geometry, rotations)
+
+    def _bodies(self, geometry: Geometry | None) -> tuple[Input, Input]:
+        """Vertices and spheres of a geometry, by default the scene's."""
+        if geometry is None:
+            return self.vertices, self._spheres
+        return Input("vertices", geometry.positions), Input("spheres", (geometry.centers, geometry.radii))
+
+    def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
+        """Points to be lit by :meth:`shade` that are given, not found in an image.
+
+        Nobody knows which body a point is on: all spheres block its light, and where light bounces, none comes from its
+        own body as such. For points of bodies take :meth:`on_faces`.
+
+        Args:
+            points: Positions [scene units], vec3 of shape [batch, receiver].
+            normals: Unit normals, vec3 of shape [batch, receiver].
+            geometry: Geometry of the blockers, by default the scene's bodies.
+        Differentiable: all.
+        """
+        receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
+        node = Node("", lambda arguments: arguments, receivers)
+        bodies, blocking = self._bodies(geometry), self._method.blocking(geometry, None)
+        return LitPoints(self._method, self._materials, *bodies, node, self.call(), blocking=blocking)
+
+    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
+        """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
+
+        Args:
+            sides: Face of each, backs numbered after the last face, int of shape [receiver]; receivers of a body are
+                consecutive.
+            barycentrics: Where on it, shape [receiver, 3].
+            geometry: Where the bodies are, by default where the scene has them.
+        Differentiable: geometry.
+        """
+        scene, blocking, bodies = self._merged_scene, self._blocking(geometry), self._bodies(geometry)
+        owners = self._method.separate_bodies(blocking)
+        if owners is not None:
+            owners = owners[scene.body_of_face[sides % len(scene.body_of_face)]]
+        normals = Node("", vertex_normals, bodies[0], scene.faces)
+        node = Node("", receivers_on_faces, bodies[0], normals, scene.faces, sides, barycentrics, owners)
+        points = self._method, self._materials, *bodies, node, self.call()
+        return LitPoints(*points, normals=normals, blocking=blocking)
