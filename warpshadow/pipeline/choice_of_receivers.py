@@ -40,12 +40,13 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.harmonic_light import as_light
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.scene.scene import AUTO, Scene, Visibility
+from warpshadow.scene.scene import AUTO, Body, Scene, Visibility
 from warpshadow.spheres import Spheres
 from warpshadow.stages.project import to_clip
 from warpshadow.stages.rasterization import rasterize
@@ -195,6 +196,16 @@ def receiver_notes(scene: Scene, choices: Sequence[Choice]) -> list[str]:
         for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True))
         if body.receivers == AUTO and choice.size is not None
     ]
+
+
+def warn_of_coarse_faces(bodies: Sequence[Body], sizes: Sequence[FaceSize]) -> None:
+    """Warn of bodies whose receivers are at vertices, and whose faces are so large that shadows fall between these."""
+    for number, (body, size) in enumerate(zip(bodies, sizes, strict=True)):
+        if body.receivers == "vertex" and size.exceeds(COARSE_FACE):
+            check.warn(
+                f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
+                'receivers = "auto" or "pixel" evaluates it at every pixel',
+            )
 
 
 _WHERE = {

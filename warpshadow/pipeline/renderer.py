@@ -21,10 +21,10 @@ from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.choice_of_receivers import (
-    COARSE_FACE,
     choose_receivers,
     face_sizes,
     receiver_notes,
+    warn_of_coarse_faces,
     with_receivers,
 )
 from warpshadow.pipeline.explain import Explanation, decide
@@ -232,7 +232,11 @@ class SceneRenderer:
     def _own_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
-        self._warn_of_coarse_faces(view)
+        bodies = self._given_scene.bodies
+        if any(body.receivers == "vertex" for body in bodies) and not self._method.lights_samples:
+            clip_positions = view.clip_positions.value(view.call).numpy()
+            images = zip(view.fragments.face_ids.numpy(), clip_positions, strict=True)
+            warn_of_coarse_faces(bodies, face_sizes(images, self.merged_scene, self.cameras[0]))
         return view
 
     @one_at_a_time
@@ -249,21 +253,6 @@ class SceneRenderer:
         if view.merged_scene is not self.merged_scene:
             raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
         return view
-
-    def _warn_of_coarse_faces(self, view: View) -> None:
-        """Say which bodies show faces so large that light at their corners alone misses shadows."""
-        requested = [body.receivers == "vertex" for body in self._given_scene.bodies]
-        if self._method.lights_samples or not any(requested):
-            return
-        clip_positions = view.clip_positions.value(view.call).numpy()
-        images = zip(view.fragments.face_ids.numpy(), clip_positions, strict=True)
-        sizes = face_sizes(images, self.merged_scene, self.cameras[0])
-        for number, (body, size) in enumerate(zip(self._given_scene.bodies, sizes, strict=True)):
-            if requested[number] and size.exceeds(COARSE_FACE):
-                check.warn(
-                    f"body {number} ({body.called!r}): {size}, and light is evaluated at their corners alone; "
-                    'receivers = "auto" or "pixel" evaluates it at every pixel',
-                )
 
     # ------------------------------------------------------------------------------------------ light and reflectance
 
@@ -327,8 +316,7 @@ class SceneRenderer:
         Differentiable: albedo, textures, view.
         """
         view = self._own(view)
-        albedo, textures = self._per_body(albedo, textures)
-        return view.reflection(view.materials.replaced(albedo, textures)).samples.value(self._views.call(view))
+        return view.reflection(self._reflecting(albedo, textures)).samples.value(self._views.call(view))
 
     @one_at_a_time
     def seen_texels(self, body: BodyLike) -> np.ndarray:
@@ -344,14 +332,17 @@ class SceneRenderer:
         """
         return self._own_view.seen_texels(self.scene.body_number(body))
 
-    def _per_body(
-        self, albedo: PerBody[wp.array] | None, textures: PerBody[wp.array] | None
-    ) -> tuple[list[wp.array | None], list[wp.array | None]]:
-        return self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
-
-    def _gloss(self, gloss: Mapping[str, PerBody[wp.array]] | None) -> dict[str, list[wp.array | None]]:
+    def _reflecting(
+        self,
+        albedo: PerBody[wp.array] | None,
+        textures: PerBody[wp.array] | None,
+        gloss: Mapping[str, PerBody[wp.array]] | None = None,
+    ) -> Materials:
+        """The scene's materials with others in their place, checked."""
         check.known_keys("gloss", gloss or {}, GLOSS)
-        return {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
+        shiny = {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
+        colors = self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
+        return self._materials.replaced(*colors, shiny)
 
     # ------------------------------------------------------------------------------------------ image
 
@@ -380,7 +371,7 @@ class SceneRenderer:
         Differentiable: light, albedo, textures, gloss, view.
         """
         view = self._own(view)
-        return view.image(light, *self._per_body(albedo, textures), self._gloss(gloss)).value(self._views.call(view))
+        return view.image(light, self._reflecting(albedo, textures, gloss)).value(self._views.call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
         """Render the image of the scene.
@@ -449,19 +440,17 @@ class SceneRenderer:
             if geometry.moving is None or set(geometry.moving) & set(catchers):
                 alone = self.merged_scene.part(geometry, catchers)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
-        colors, images = self._per_body(albedo, textures)
-        without = self._without_others
+        materials, without = self._reflecting(albedo, textures, gloss), self._without_others
         seen = without.view(alone, clip_matrices)
-        reflecting = [colors[number] for number in catchers], [images[number] for number in catchers]
+        colors, images = self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
+        reflecting = without._reflecting([colors[body] for body in catchers], [images[body] for body in catchers])
         view = self.view(geometry, clip_matrices)
         if self._method.lights_samples:  # rays are drawn by the number of a receiver, and so are the same for both
             seen = seen.at_receivers_of(view)
-        received = seen.white(light, *reflecting).value(without._views.call(seen))
+        received = seen.white(light, reflecting).value(without._views.call(seen))
         photo_input = None if photograph is None else Input("photograph", photograph)
-        arguments = photo_input, Input("light without the others", received)
-        return view.in_photograph(*arguments, self._catches, light, colors, images, self._gloss(gloss)).value(
-            self._views.call(view)
-        )
+        arguments = photo_input, Input("light without the others", received), self._catches, light, materials
+        return view.in_photograph(*arguments).value(self._views.call(view))
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -569,7 +558,7 @@ class SceneRenderer:
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
-        image = view.preview().image(light, *self._per_body(albedo, textures), self._gloss(gloss))
+        image = view.preview().image(light, self._reflecting(albedo, textures, gloss))
         is_host = self.device.is_cpu or self.clock.waits
         notes = receiver_notes(self._given_scene, self._choices)
         if self.scene.bounces:

@@ -3,7 +3,6 @@
 import copy
 import functools
 import operator
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, Method, receiver_words
 from warpshadow.pipeline.node import Call, Fixed, Input, Node
-from warpshadow.pipeline.reflectance import Given, Materials, Reflection
+from warpshadow.pipeline.reflectance import Materials, Reflection
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
 from warpshadow.stages.project import to_clip
@@ -178,16 +177,9 @@ class View(LitPoints):
             result[[body for body in static.bodies if set(casting) - {body}]] = True
         return result
 
-    def image(
-        self,
-        light: Light | None = None,
-        albedo: Given = None,
-        textures: Given = None,
-        gloss: Mapping[str, Given] | None = None,
-    ) -> Node:
+    def image(self, light: Light | None, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
-        materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.reflection(materials)
         if materials.gloss:
             samples = self._glossy(lit, light, materials, reflected.samples)
@@ -257,10 +249,8 @@ class View(LitPoints):
         photograph: Input | None,
         unshadowed: Input,
         catches: wp.array,
-        light: Light | None = None,
-        albedo: Given = None,
-        textures: Given = None,
-        gloss: Mapping[str, Given] | None = None,
+        light: Light | None,
+        materials: Materials,
     ) -> Node:
         """The image in a photograph that the catchers model: linear RGB, vec3 of shape [batch, height, width].
 
@@ -268,11 +258,10 @@ class View(LitPoints):
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
             unshadowed, catches: As for :func:`warpshadow.stages.photograph.find_ratio_image`.
-            light, albedo, textures, gloss: As for :meth:`image`.
+            light, materials: As for :meth:`image`.
         """
         from warpshadow.stages.photograph import compose, find_ratio_image, over_nothing
 
-        materials = self.materials.replaced(albedo, textures, gloss)
         lit, reflected = self.shading(light, materials), self.reflection(materials)
 
         def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
@@ -289,12 +278,12 @@ class View(LitPoints):
             return Node("photograph", over_nothing, *films, caches=False)
         return Node("photograph", compose, photograph, *films, caches=False)
 
-    def white(self, light: Light | None = None, albedo: Given = None, textures: Given = None) -> Node:
+    def white(self, light: Light | None, materials: Materials) -> Node:
         """Light received by the samples, and coverage, vec4 of shape [batch, height · across, width · across].
 
-        Albedo and textures matter where light bounces.
+        Materials matter where light bounces.
         """
-        return self._white_radiance_of(self.shading(light, self.materials.replaced(albedo, textures)))
+        return self._white_radiance_of(self.shading(light, materials))
 
     def white_image(self, lit: Node) -> Node:
         """The image if every surface were white, of light on the receivers; vec4 of shape [batch, height, width]."""

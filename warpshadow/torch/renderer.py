@@ -13,6 +13,7 @@ from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.explain import Explanation
 from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, Geometry
 from warpshadow.scene.scene import GLOSS, BodyLike, PerBody, Scene
@@ -22,6 +23,9 @@ from warpshadow.stages.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.tuning.renderer import Renderer
+
+REFLECTANCE = ("albedo", "textures", *GLOSS)
+"""Arguments that bodies have, each its own."""
 
 
 class LayerTensors(NamedTuple):
@@ -169,7 +173,7 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
+        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
 
         def draw(arrays: Mapping[str, wp.array]) -> wp.array:
             inputs = self._inputs(stored, arrays, light)
@@ -192,7 +196,7 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        stored = self._given(None, None, None, geometry, clip_matrices)
+        stored = self._given(None, geometry, clip_matrices)
 
         def find(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
             view = self.warp.view(stored.geometry("geometry", arrays), arrays.get("clip_matrices"))
@@ -230,7 +234,7 @@ class TorchRenderer(torch.nn.Module):
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
+        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
         camera = self.cameras[0]
         stored.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
         return stored.apply(
@@ -252,19 +256,17 @@ class TorchRenderer(torch.nn.Module):
         specular: PerBody[torch.Tensor] | None = None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        stored = self._given(light, albedo, textures, geometry, clip_matrices, (roughness, metallic, specular))
+        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
         return self.warp.explain(**self._inputs(stored, stored.arrays(), light))
 
     def _given(
         self,
-        light: torch.Tensor | EnvironmentMap | None,
-        albedo: PerBody[torch.Tensor] | None,
-        textures: PerBody[torch.Tensor] | None,
-        geometry: Geometry[torch.Tensor] | None,
-        clip_matrices: torch.Tensor | None,
-        gloss: tuple[PerBody[torch.Tensor] | None, ...] = (),
+        light: torch.Tensor | EnvironmentMap | None = None,
+        geometry: Geometry[torch.Tensor] | None = None,
+        clip_matrices: torch.Tensor | None = None,
+        of_bodies: Sequence[PerBody[torch.Tensor] | None] = (),
     ) -> Arguments:
-        """The tensors among the arguments of a call, checked."""
+        """The tensors among the arguments of a call, checked; reflectance of bodies in the order of its names."""
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         stored = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         if isinstance(light, torch.Tensor):
@@ -276,28 +278,26 @@ class TorchRenderer(torch.nn.Module):
             stored.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
             stored.add("clip_matrices", clip_matrices, wp.mat44, ())
-        for number, tensor in enumerate(self.scene.per_body(albedo, "albedo")):
-            if tensor is not None:
-                counts = np.shape(tensor)[-2:-1]  # of colors: none for a single one
-                shape = counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,)
-                stored.add(f"albedo[{number}]", tensor, wp.vec3, shape, messages=self._said("albedo", albedo, number))
-        for number, tensor in enumerate(self.scene.per_body(textures, "textures")):
-            if tensor is not None:
-                remedy = check.channels_last(np.shape(tensor))
-                messages = self._said("textures", textures, number)
-                stored.add(f"textures[{number}]", tensor, wp.vec3, ("height", "width"), remedy, messages=messages)
-        self._add_gloss(stored, dict(zip(GLOSS, gloss, strict=False)))
-        return stored
-
-    def _add_gloss(self, stored: Arguments, gloss: Mapping[str, PerBody[torch.Tensor] | None]) -> None:
-        """Add roughness and the like, checked."""
-        for name, values in gloss.items():
+        for name, values in zip(REFLECTANCE, of_bodies, strict=False):
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
-                    row = tensor.reshape(1) if isinstance(tensor, torch.Tensor) and tensor.ndim == 0 else tensor
-                    count = self.scene.bodies[number].mesh.vertex_count
-                    shape = (1 if np.shape(row)[-1:] == (1,) else count,)
-                    stored.add(f"{name}[{number}]", row, wp.float32, shape, messages=self._said(name, values, number))
+                    messages = self._said(name, values, number)
+                    stored.add(f"{name}[{number}]", *self._of_body(name, number, tensor), messages=messages)
+        return stored
+
+    def _of_body(
+        self, name: str, number: int, tensor: torch.Tensor
+    ) -> tuple[torch.Tensor, type, tuple[int | str, ...], str]:
+        """What is given for a body: rows of items, their dtype, the shape to expect, and a remedy."""
+        if name == "textures":
+            return tensor, wp.vec3, ("height", "width"), check.channels_last(np.shape(tensor))
+        dtype = wp.vec3 if name == "albedo" else wp.float32
+        item = item_shape(dtype)
+        if isinstance(tensor, torch.Tensor) and tuple(tensor.shape) == item:  # one for the whole body
+            tensor = tensor[None]
+        shape = np.shape(tensor)
+        counts = shape[: len(shape) - len(item)][-1:]
+        return tensor, dtype, counts if counts in ((), (1,)) else (self.scene.bodies[number].mesh.vertex_count,), ""
 
     def _said(self, argument: str, stored: PerBody[torch.Tensor] | None, number: int) -> str:
         """Name of an item for a body in messages: by the name of the body where that was given."""
@@ -312,12 +312,12 @@ class TorchRenderer(torch.nn.Module):
     ) -> dict[str, Any]:
         """The array arguments of the renderer, in place of tensors."""
         bodies = range(len(self.scene.bodies))
-        colors = [arrays.get(f"albedo[{number}]") for number in bodies]
+        albedo, textures, *gloss = ([arrays.get(f"{name}[{body}]") for body in bodies] for name in REFLECTANCE)
         return {
             "light": arrays.get("light", light),
-            "albedo": [color.reshape((1, 1)) if color is not None and color.ndim == 1 else color for color in colors],
-            "textures": [arrays.get(f"textures[{number}]") for number in bodies],
-            "gloss": {name: [arrays.get(f"{name}[{number}]") for number in bodies] for name in GLOSS},
+            "albedo": albedo,
+            "textures": textures,
+            "gloss": dict(zip(GLOSS, gloss, strict=True)),
             "geometry": stored.geometry("geometry", arrays),
             "clip_matrices": arrays.get("clip_matrices"),
         }
