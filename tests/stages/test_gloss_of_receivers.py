@@ -54,8 +54,8 @@ def test_lobes_take_as_much_even_light_as_the_surface_reflects(device, roughness
     normal = np.array([0.0, 0.0, 1.0])
     point = twins.eye_of(CAMERA) - 2 * np.array([np.sqrt(1 - cosine**2), 0, cosine])
     values = point[None, None], normal[None, None], np.array([[roughness]]), CAMERA[None]
-    _, weights, _ = lobes.sample_lobes(*arrays(device, *values), 32)
-    got = weights.numpy()[0, 0].sum(axis=0)
+    _, filters, _ = lobes.sample_lobes(*arrays(device, *values), 32)
+    got = filters.numpy()[0, 0].sum(axis=0)
     for part, expected in zip(got, twins.lobe_energy(cosine, roughness), strict=False):
         assert part == pytest.approx(expected, abs=ENERGY)
 
@@ -77,11 +77,11 @@ def test_prefiltered_light_is_blurred_by_gaussians(device):
     texels = wp.array(prefilter.prefilter(radiance)[None], dtype=wp.vec3, device=device)
     directions = fibonacci(16).astype(np.float32)[None]
     for sigma in (0.1, 0.4):
-        weights = np.zeros((1, 1, 16, 3), np.float32)
-        weights[..., 2] = sigma
-        inputs = [wp.array(value, dtype=wp.vec3, device=device) for value in (directions[None], weights)]
+        filters = np.zeros((1, 1, 16, 3), np.float32)
+        filters[..., 2] = sigma
+        inputs = [wp.array(value, dtype=wp.vec3, device=device) for value in (directions[None], filters)]
         expected = twins.blurred(radiance, directions[0], sigma)
-        got = prefilter.look_up(texels, *inputs).numpy()[0, 0]
+        got = prefilter.look_up_light(texels, *inputs).numpy()[0, 0]
         # texels are as wide as the Gaussian, and levels interpolate: measured 10%
         assert np.linalg.norm(got - expected) < 0.12 * np.linalg.norm(expected - expected.mean(axis=0))
 
@@ -89,8 +89,8 @@ def test_prefiltered_light_is_blurred_by_gaussians(device):
 def test_even_light_stays_as_it_is_at_any_level(device):
     texels = wp.array(prefilter.prefilter(np.full((8, 16, 3), 0.7))[None], dtype=wp.vec3, device=device)
     directions = wp.array(fibonacci(16)[None, None], dtype=wp.vec3, device=device)
-    weights = wp.array(np.linspace(0, 1.5, 48).reshape(1, 1, 16, 3), dtype=wp.vec3, device=device)
-    assert np.abs(prefilter.look_up(texels, directions, weights).numpy() - 0.7).max() < FLOAT32
+    filters = wp.array(np.linspace(0, 1.5, 48).reshape(1, 1, 16, 3), dtype=wp.vec3, device=device)
+    assert np.abs(prefilter.look_up_light(texels, directions, filters).numpy() - 0.7).max() < FLOAT32
 
 
 def test_maps_keep_their_energy_with_other_rows():
@@ -125,10 +125,10 @@ def test_blockers_send_what_is_blocked(device):
     openness = wp.array([[[0.5] * 3, [1.0] * 3]], dtype=wp.vec3, device=device)
     blocked = reflection.blocked_radiance(even, direct, openness)
     np.testing.assert_allclose(blocked.numpy()[0], [[0.7] * 3, [0.0] * 3], rtol=1e-6)
-    weights = wp.full((1, 2, 4), wp.vec3(0.25), dtype=wp.vec3, device=device)
+    filters = wp.full((1, 2, 4), wp.vec3(0.25), dtype=wp.vec3, device=device)
     light = wp.full((1, 2, 4), wp.vec3(0.7), dtype=wp.vec3, device=device)
     through = wp.array(np.linspace(0, 1, 8).reshape(1, 2, 4), dtype=wp.float32, device=device)
-    for total in reflection.sum_lobes(weights, light, through, blocked):
+    for total in reflection.sum_lobes(filters, light, through, blocked):
         np.testing.assert_allclose(total.numpy()[0, 0], 0.7, rtol=1e-6)
 
 
@@ -138,7 +138,7 @@ def test_diffuse_receivers_keep_their_light(device):
     diffuse = wp.array(rng.uniform(size=(1, 3, 3)), dtype=wp.vec3, device=device)
     lobe = [wp.array(rng.uniform(size=(1, 1, 3)), dtype=wp.vec3, device=device) for _ in range(2)]
     scalars = [wp.array([[value]], dtype=wp.float32, device=device) for value in (0.5, 1.0, 1.0)]
-    colored, white = reflection.reflect(numbers, diffuse, *lobe, *scalars)
+    colored, white = reflection.mix_reflection(numbers, diffuse, *lobe, *scalars)
     assert np.array_equal(colored.numpy()[0, ::2], diffuse.numpy()[0, ::2]) and not white.numpy()[0, ::2].any()
     straight, grazing = (item.numpy()[0, 0] for item in lobe)
     np.testing.assert_allclose(colored.numpy()[0, 1], straight - grazing, rtol=1e-5)
@@ -150,6 +150,6 @@ def test_plastic_takes_from_its_diffuse_layer_the_light_that_its_coat_reflects(d
     numbers, one = wp.array([0], dtype=wp.int32, device=device), np.ones((1, 1, 3))
     light = [wp.array(value * one, dtype=wp.vec3, device=device) for value in (1.0, 0.0, 0.0)]
     scalars = [wp.array([[value]], dtype=wp.float32, device=device) for value in (cosine, 0.0, 1.0)]
-    colored, _ = reflection.reflect(numbers, *light, *scalars)
+    colored, _ = reflection.mix_reflection(numbers, *light, *scalars)
     # three coefficients for all cosines
     assert colored.numpy().mean() == pytest.approx(0.96 * (1 - twins.even_grazing(cosine)), abs=1e-3)

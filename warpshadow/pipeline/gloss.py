@@ -19,9 +19,8 @@ from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import GLOSS
 from warpshadow.stages.gloss.lobes import sample_lobes
-from warpshadow.stages.gloss.prefilter import look_up as look_up_light
-from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.gloss.reflection import reflect, sum_lobes
+from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
+from warpshadow.stages.gloss.reflection import mix_reflection, sum_lobes
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import Receivers
@@ -65,18 +64,18 @@ class GlossyPoints(LitPoints):
             return Node("lobes", _sample, *inputs, items=words)
 
         sampled = self.cached("lobes", key, lobes)
-        directions, weights, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
+        directions, filters, cosines = (Node("", operator.itemgetter(part), sampled) for part in range(3))
         source = self.light_input(light)
         texels = self.cached("prefiltered", source, lambda: self._prefiltered(source))
-        radiance = Node("prefiltered light", look_up_light, texels, directions, weights, items=words)
+        radiance = Node("prefiltered light", look_up_light, texels, directions, filters, items=words)
         through = self.method.lobe_transmittance(self, directions, source)
         blocked = None
         if self.merged_scene.scene.bounces:
             blocked = self.method.blocked_radiance(self, self.chosen(diffuse), source, view, self.chosen)
-        sums = Node("gloss", sum_lobes, weights, radiance, through, blocked, items=words)
+        sums = Node("gloss", sum_lobes, filters, radiance, through, blocked, items=words)
         straight, grazing = (Node("", operator.itemgetter(part), sums) for part in range(2))
         arguments = self._numbers, diffuse, straight, grazing, cosines, metallic, specular
-        mix = Node("reflection", reflect, *arguments, items=words)
+        mix = Node("reflection", mix_reflection, *arguments, items=words)
         return Node("", operator.itemgetter(0), mix), Node("", operator.itemgetter(1), mix)
 
     def chosen(self, light: Node) -> Node:

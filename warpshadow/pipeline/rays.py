@@ -99,9 +99,15 @@ class Rays(Method):
 
     def lobe_transmittance(self, points: LitPoints, directions: Node, light: Input) -> Node:
         """Transmittance towards the samples of lobes: rays, each of its own."""
-        trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
         words = functools.partial(receiver_words, points)
-        return Node("transmittance of lobes", _trace_lobes, trees, points.receivers_node, directions, items=words)
+        return Node(
+            "transmittance of lobes",
+            _trace_lobes,
+            self._trees_around(points),
+            points.receivers_node,
+            directions,
+            items=words,
+        )
 
     def blocked_radiance(
         self, points: LitPoints, diffuse: Node, light: Input, view: LitPoints, choose: Callable[[Node], Node]
@@ -113,7 +119,7 @@ class Rays(Method):
             direct = view.cached(
                 "direct", light, lambda: Node("", self._shade, self._meshes(view), view.receivers_node)
             )
-        trees = points.cached("trees", points.vertices, lambda: Node("", self._trees, points.vertices))
+        trees = self._trees_around(points)
         openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
         return Node("light of blockers", blocked_radiance, diffuse, choose(direct), openness)
 
@@ -132,12 +138,14 @@ class Rays(Method):
 
     def _blockers(self, points: LitPoints, receivers: Node) -> Node:
         """Node of what rays in known light meet: trees of all vertices, or meshes for each instance of receivers."""
-        if not self.shares_directions:
-            return self._meshes(points) if receivers is points.receivers_node else self._meshes_for(points, receivers)
+        if self.shares_directions:
+            return self._trees_around(points, "visibility")
+        return self._meshes(points) if receivers is points.receivers_node else self._meshes_for(points, receivers)
+
+    def _trees_around(self, points: LitPoints, name: str = "") -> Node:
+        """Node of the trees of all vertices around points."""
         items = functools.partial(receiver_words, points)
-        return points.cached(
-            "trees", points.vertices, lambda: Node("visibility", self._trees, points.vertices, items=items)
-        )
+        return points.cached("trees", points.vertices, lambda: Node(name, self._trees, points.vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
         """Hierarchies of what casts shadows, for packets of rays."""

@@ -22,6 +22,7 @@ import warp as wp
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty, zeros
 from warpshadow.stages.light_samples import LightSamples
 from warpshadow.stages.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.ray_tracing import parts
@@ -173,9 +174,8 @@ def find_shares(tree: FaceTree, points: wp.array, normals: wp.array, samples: Li
     count = points.shape[0]
     chosen = np.arange(min(count, _PILOTS)) * count // max(min(count, _PILOTS), 1)
     at, facing = (wp.array(rows.numpy()[chosen], dtype=wp.vec3, device=points.device) for rows in (points, normals))
-    received = wp.zeros(
-        (len(chosen), samples.directions.shape[1] // PACKET, PACKET), dtype=wp.float32, device=at.device
-    )
+    shape = len(chosen), samples.directions.shape[1] // PACKET, PACKET
+    received = zeros(shape, dtype=wp.float32, device=at.device)
     _Tracing(tree, at, facing, samples).trace(received=received)
     light = received.numpy().reshape(len(chosen), -1)
     light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-12)
@@ -223,21 +223,20 @@ def trace_shared(
     if corners is None:
         corners = Corners.none(len(points))
     has_corners = corners.receivers[:, 0] >= 0
-    names, slots = np.unique(corners.receivers[has_corners], return_inverse=True)
-    known = wp.empty((len(names), tracing.packet_count), dtype=wp.int32, device=points.device)
-    for part in parts(len(names), size, progress):
-        tracing.trace(names[part], open_lanes=known[part])
-    is_corner = np.zeros(len(has_corners), bool)
-    is_corner[names] = True
-    assert not (is_corner & has_corners).any()
-    if len(names):
+    at_corners, rows_of_corners = np.unique(corners.receivers[has_corners], return_inverse=True)
+    if has_corners[at_corners].any():
+        raise ValueError("corners: got receivers at corners that have corners themselves, expected none")
+    known = empty((len(at_corners), tracing.packet_count), dtype=wp.int32, device=points.device)
+    for part in parts(len(at_corners), size, progress):
+        tracing.trace(at_corners[part], open_lanes=known[part])
+    if len(at_corners):
         rows = np.full(corners.receivers.shape, -1)
-        rows[has_corners] = slots.reshape(-1, 4)
+        rows[has_corners] = rows_of_corners.reshape(-1, 4)
         light = np.zeros(len(points), np.float32)  # of corners; the others are not traced yet
-        light[names] = np.abs(tracing.shading.numpy()[names]).sum(axis=1)
+        light[at_corners] = np.abs(tracing.shading.numpy()[at_corners]).sum(axis=1)
         light = (light[corners.receivers] * corners.weights).sum(axis=1)
         tracing.take_over(known, rows, corners.weights, TOLERANCE * np.pi * light)
-    others = np.flatnonzero(~is_corner)
+    others = np.setdiff1d(np.arange(len(points)), at_corners, assume_unique=True)
     for part in parts(len(others), size, progress):
         tracing.trace(others[part])
     return tracing.shading
@@ -297,7 +296,7 @@ class _Tracing:
         light = constant(packets_of(samples.radiance[0]), lane_type(PACKET), device)
         self.packet_count = len(packets)
         self._inputs = tree, points, normals, directions, light
-        self.shading = wp.empty(points.shape, dtype=wp.vec3, device=device)
+        self.shading = empty(points.shape, dtype=wp.vec3, device=device)
 
     def take_over(self, known: wp.array, rows: np.ndarray, weights: np.ndarray, tolerances: np.ndarray) -> None:
         """From now on receivers take over the visibility of their corners, whose rows of ``known`` are given."""
@@ -311,8 +310,8 @@ class _Tracing:
         device = self.shading.device
         count = len(self.shading) if chosen is None else len(chosen)
         numbers = None if chosen is None else wp.array(chosen, dtype=wp.int32, device=device)
-        open_lanes = wp.empty((0, 0), dtype=wp.int32, device=device) if open_lanes is None else open_lanes
-        received = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if received is None else received
+        open_lanes = empty((0, 0), dtype=wp.int32, device=device) if open_lanes is None else open_lanes
+        received = empty((0, 0, 0), dtype=wp.float32, device=device) if received is None else received
         launch(
             _make_trace(),
             count,

@@ -89,7 +89,7 @@ def _sample_lobes(
     places: wp.array(dtype=wp.vec3),
     # out
     directions: wp.array3d(dtype=wp.vec3),
-    weights: wp.array3d(dtype=wp.vec3),
+    filters: wp.array3d(dtype=wp.vec3),
     cosines: wp.array2d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
@@ -133,7 +133,7 @@ def _sample_lobes(
         spread = mirror[2] * mirror[2] * (width * width - 1.0) + 1.0
         density = width * width / (wp.pi * spread * spread) / (2.0 * (cosine + slant))
         blur = wp.sqrt(1.0 / (2.0 * wp.pi * float(directions.shape[2]) * density))
-        weights[batch, receiver, i] = wp.vec3(weight, weight * rest * rest * rest * rest * rest, blur)
+        filters[batch, receiver, i] = wp.vec3(weight, weight * rest * rest * rest * rest * rest, blur)
 
 
 def sample_lobes(
@@ -150,8 +150,8 @@ def sample_lobes(
         sample_count: Number of samples.
 
     Returns:
-        Directions, unit vectors, vec3 of shape [batch, receiver, sample]; w, w' and the blur σ [radians], vec3 of the
-        same shape; and the cosines μ between normals and viewers, float32 of shape [batch, receiver].
+        Directions, unit vectors, vec3 of shape [batch, receiver, sample]; filters, w, w' and the blur σ [radians],
+        vec3 of the same shape; and the cosines μ between normals and viewers, float32 of shape [batch, receiver].
 
     Differentiable: points, normals, roughness, clip_matrices.
     """
@@ -159,14 +159,14 @@ def sample_lobes(
     check.shape("roughness", roughness.shape, ("batch", points.shape[1]))
     count = common_batch({"points": points, "roughness": roughness, "clip_matrices": clip_matrices})
     device, shape = points.device, (count, points.shape[1], sample_count)
-    directions, weights = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
+    directions, filters = (wp.empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
     cosines = wp.empty(shape[:2], dtype=wp.float32, device=device)
     launch(
         _sample_lobes,
         shape[0] * shape[1],
         inputs=[points, normals, roughness, clip_matrices, constant(sample_places(sample_count), wp.vec3, device)],
-        outputs=[directions, weights, cosines],
+        outputs=[directions, filters, cosines],
         shared=[clip_matrices, points, normals, roughness],
         cost=_COST * sample_count,
     )
-    return directions, weights, cosines
+    return directions, filters, cosines

@@ -124,7 +124,7 @@ def _look_up(
     texels: wp.array2d(dtype=wp.vec3),
     levels: wp.array(dtype=wp.vec2i),
     directions: wp.array3d(dtype=wp.vec3),
-    weights: wp.array3d(dtype=wp.vec3),
+    filters: wp.array3d(dtype=wp.vec3),
     # out
     light: wp.array3d(dtype=wp.vec3),
 ):
@@ -138,7 +138,7 @@ def _look_up(
         azimuth = wp.atan2(direction[0], -direction[2]) / (2.0 * wp.pi)
         azimuth = azimuth - wp.floor(azimuth)
         # half a texel of the map itself is between levels 0 and 1
-        blur = wp.max(weights[located, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
+        blur = wp.max(filters[located, receiver, i][2] * float(levels[0][1]) / wp.pi, 0.5)
         height = wp.clamp(wp.log2(blur) + 1.0, 0.0, float(_LEVELS) - 1.001)
         level = int(height)
         a = _at_level(lit, levels[level][0], levels[level][1], polar, azimuth)
@@ -146,28 +146,28 @@ def _look_up(
         light[batch, receiver, i] = a + (height - float(level)) * (b - a)
 
 
-def look_up(texels: wp.array, directions: wp.array, weights: wp.array) -> wp.array:
+def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> wp.array:
     """Look up light from the directions of lobes.
 
     Args:
         texels: Of :func:`prefilter`, linear RGB, vec3 of shape [batch, texel].
-        directions, weights: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample].
+        directions, filters: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample].
 
     Returns:
         Radiance, vec3 of shape [batch, receiver, sample].
 
-    Differentiable: texels, directions, weights.
+    Differentiable: texels, directions, filters.
     """
-    check.shape("weights", weights.shape, directions.shape)
+    check.shape("filters", filters.shape, directions.shape)
     count = common_batch({"texels": texels, "directions": directions})
     light = wp.empty((count, *directions.shape[1:]), dtype=wp.vec3, device=directions.device)
     levels = constant(_levels_of(texels.shape[1]), wp.vec2i, directions.device)
     launch(
         _look_up,
         count * directions.shape[1],
-        inputs=[texels, levels, directions, weights],
+        inputs=[texels, levels, directions, filters],
         outputs=[light],
-        shared=[texels, directions, weights],
+        shared=[texels, directions, filters],
         cost=_COST * directions.shape[2],
     )
     return light

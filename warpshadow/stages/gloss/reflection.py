@@ -38,7 +38,7 @@ def _sum_lobes(
     first_row: int,
     worker: int,
     # in
-    weights: wp.array3d(dtype=wp.vec3),
+    filters: wp.array3d(dtype=wp.vec3),
     light: wp.array3d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     blocked: wp.array2d(dtype=wp.vec3),
@@ -48,7 +48,7 @@ def _sum_lobes(
 ):
     """A thread owns a receiver: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
-    located = instance_in(batch, weights.shape[0])
+    located = instance_in(batch, filters.shape[0])
     lit = instance_in(batch, light.shape[0])
     through = instance_in(batch, transmittance.shape[0])
     instead = wp.vec3()
@@ -56,8 +56,8 @@ def _sum_lobes(
         instead = blocked[instance_in(batch, blocked.shape[0]), receiver]
     total = wp.vec3()
     total_grazing = wp.vec3()
-    for i in range(weights.shape[2]):
-        weight = weights[located, receiver, i]
+    for i in range(filters.shape[2]):
+        weight = filters[located, receiver, i]
         share = transmittance[through, receiver, i]
         radiance = share * light[lit, receiver, i] + (1.0 - share) * instead
         total += weight[0] * radiance
@@ -67,12 +67,12 @@ def _sum_lobes(
 
 
 def sum_lobes(
-    weights: wp.array, light: wp.array, transmittance: wp.array, blocked: wp.array | None = None
+    filters: wp.array, light: wp.array, transmittance: wp.array, blocked: wp.array | None = None
 ) -> tuple[wp.array, wp.array]:
     """Sum the light of lobes.
 
     Args:
-        weights: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
+        filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
         blocked: R, of :func:`blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not bounce.
@@ -82,16 +82,16 @@ def sum_lobes(
 
     Differentiable: all.
     """
-    arrays = {"weights": weights, "light": light, "transmittance": transmittance, "blocked": blocked}
+    arrays = {"filters": filters, "light": light, "transmittance": transmittance, "blocked": blocked}
     count = common_batch(arrays)
-    sums = [wp.empty((count, weights.shape[1]), dtype=wp.vec3, device=weights.device) for _ in range(2)]
+    sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
     launch(
         _sum_lobes,
-        count * weights.shape[1],
-        inputs=[weights, light, transmittance, blocked],
+        count * filters.shape[1],
+        inputs=[filters, light, transmittance, blocked],
         outputs=sums,
-        shared=[weights, light, transmittance, blocked],
-        cost=_COST * weights.shape[2],
+        shared=[filters, light, transmittance, blocked],
+        cost=_COST * filters.shape[2],
     )
     return sums[0], sums[1]
 
@@ -182,7 +182,7 @@ def _reflect(
         white[batch, receiver] = (1.0 - m) * s * (STRAIGHT * lobe + (1.0 - STRAIGHT) * rest) + m * rest
 
 
-def reflect(
+def mix_reflection(
     numbers: wp.array,
     diffuse: wp.array,
     straight: wp.array,
