@@ -93,9 +93,8 @@ class SphereMethod(Method):
         """What blocks light among bodies, given how they do, their vertices and spheres. Differentiable: arrays."""
         owners = self.planes, self.parts, self.self_visibility, self.visibility.merging
         frames = self.planes.frames(blocking.planes, positions) if blocking.planes else None
-        corners = self.planes.corners(positions) if self.planes.numbers else None
         placed = self.parts.placed(blocking.convex, positions) if blocking.convex else None
-        return Blockers(self.merged_scene, blocking, *owners, len(positions), spheres, frames, corners, placed)
+        return Blockers(self.merged_scene, blocking, *owners, positions, spheres, frames, placed)
 
     def past_planes(self, group: Group, seen: Transmittance, projected_light: Any) -> Transmittance:
         """Visibility of a group past the flat bodies around it, given its visibility past all other blockers."""

@@ -106,10 +106,9 @@ class Blockers(NamedTuple):
     parts: SceneParts
     self_visibility: SelfVisibility
     merging: float
-    pose_count: int
+    positions: wp.array  # of all vertices, vec3 [batch, vertex]
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, those that do not block among them
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
-    corners: wp.array | None  # vertices of all bodies that are farthest out, vec3 [batch, corner]; None without planes
     placed: PlacedParts | None  # where convex parts are; None without any
 
     def solid(self, bodies: Iterable[int]) -> list[int]:
@@ -183,6 +182,7 @@ def _groups_that_move(
     """Groups of receivers that may move."""
     solid = blockers.solid(blockers.bodies)
     blocking, none = blockers.spheres_of(solid), blockers.spheres_of([])
+    corners = blockers.planes.corners(blockers.positions) if blockers.planes.numbers and receivers.spans else None
     clusters, nearest_blockers = None, _nearest_blockers(blocker_of_point, blockers)
     if not receivers.spans:
         facing = receivers.points, receivers.normals
@@ -190,7 +190,7 @@ def _groups_that_move(
     for span in receivers.spans:
         facing = receivers.points, receivers.normals
         assert receivers.vertices is not None
-        if span.first < receivers.vertices.size and blockers.pose_count == 1:  # all cameras see the same vertices
+        if span.first < receivers.vertices.size and len(blockers.positions) == 1:  # all cameras see the same vertices
             facing = receivers.points[:1], receivers.normals[:1]
         is_traced = span.body in blockers.blocking.traced
         skip = blockers.merged_scene.spheres_among(solid, span.body) if is_traced else (0, 0)
@@ -204,9 +204,9 @@ def _groups_that_move(
         if span.body >= 0:
             places = blockers.self_visibility.places(receivers, span)
             group = group._replace(body=span.body, places=places, self_lookup=self_lookups.get(span.body))
-            if blockers.corners is not None:
+            if corners is not None:
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
-                group = group._replace(corners=cut(blockers.corners, *bounds))
+                group = group._replace(corners=cut(corners, *bounds))
         if nearest_blockers is not None:
             group = group._replace(nearest_blockers=nearest_blockers.part(slice(span.first, span.end)))
         yield group
