@@ -560,7 +560,7 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
         raise AssertionError("it is seen again")
 
     with monkeypatch.context() as patch:
-        for function in ("see", "past_planes", "transfer", "look_up"):
+        for function in ("see", "past_planes", "transfer", "self_lookups"):
             patch.setattr(type(renderer.warp._method), function, refuse)
         patch.setattr(pipeline_bounces, "see_cells", refuse)
         patch.setattr(patches, "receivers_on_faces", refuse)

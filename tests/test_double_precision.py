@@ -598,7 +598,7 @@ def test_prefiltered_light(double, device, check):
     module = double("stages.gloss.prefilter")
     texels = put(module.prefilter(random(0, 8, 16, 3) ** 2)[None], wp.vec3d, device)
     towards, weights = unit(random(1, 1, 2, 3, 3)), np.abs(random(2, 1, 2, 3, 3)) + 0.1
-    check(lambda d, w: module.look_up(texels, d, w), (wp.vec3d, towards), (wp.vec3d, weights))
+    check(lambda d, w: module.look_up_light(texels, d, w), (wp.vec3d, towards), (wp.vec3d, weights))
 
 
 def test_transmittance_of_lobes(double, device, check, glossy):
@@ -624,7 +624,7 @@ def test_radiance_of_blockers(double, device, check):
 
 @pytest.mark.parametrize("quantity", [0, 1])
 def test_reflection(quantity, double, device, check):
-    reflect, numbers = double("stages.gloss.reflection").reflect, put(np.int32([-1, 1, 0]), wp.int32, device)
+    mix, numbers = double("stages.gloss.reflection").mix_reflection, put(np.int32([-1, 1, 0]), wp.int32, device)
     lights = [(wp.vec3d, random(0, 2, 3, 3)), *((wp.vec3d, random(seed, 2, 2, 3)) for seed in (1, 2))]
     scalars = [(wp.float64, np.abs(np.tanh(random(seed, 1, 2)))) for seed in (3, 4, 5)]
-    check(lambda *arguments: reflect(numbers, *arguments)[quantity], *lights, *scalars)
+    check(lambda *arguments: mix(numbers, *arguments)[quantity], *lights, *scalars)

@@ -21,7 +21,7 @@ from warpshadow.pipeline.lighting import (
     KnownLight,
     LitPoints,
     Method,
-    converted,
+    change_basis,
     joined,
     receiver_words,
 )
@@ -41,14 +41,14 @@ class SphereMethod(Method):
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         joins_cached: Whether visibility combines cached rows with moving blockers.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
-        shades_what_is_seen: Whether known light is shaded without transfer vectors, by :meth:`light_seen`.
+        shades_transmittance: Whether known light is shaded without transfer vectors, by :meth:`shade_transmittance`.
     """
 
     free_projection: Any
     why_no_shadows = ""
     joins_cached = False
     traces_self_visibility = False
-    shades_what_is_seen = False
+    shades_transmittance = False
 
     @functools.cached_property
     def plane_blockers(self) -> tuple[int, ...]:
@@ -108,7 +108,7 @@ class SphereMethod(Method):
         """Number of coefficients of the light that take part; None: light that is not known yet, so all of them."""
         raise NotImplementedError
 
-    def look_up(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Any) -> dict[int, Any]:
+    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Any) -> dict[int, Any]:
         """Self-visibility of receivers of some bodies, :attr:`Group.self_lookup` by body. Differentiable: rotations."""
         raise NotImplementedError
 
@@ -120,11 +120,11 @@ class SphereMethod(Method):
         """Transfer vectors of a group."""
         raise NotImplementedError
 
-    def light_part(self, transfer: wp.array, group: Group, projected_light: Any) -> wp.array:
+    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: Any) -> wp.array:
         """Shading of a group in known light."""
         return shade(transfer, projected_light.coefficients, maximum=LARGEST_COEFFICIENT)
 
-    def light_seen(self, seen: Transmittance, group: Group, projected_light: Any) -> wp.array:
+    def shade_transmittance(self, seen: Transmittance, group: Group, projected_light: Any) -> wp.array:
         """Shading of a group in known light."""
         raise NotImplementedError
 
@@ -172,7 +172,7 @@ class SphereMethod(Method):
 
     def _projected_if_given(self, light: wp.array) -> Any:
         """Project given free light for the method. Differentiable: light."""
-        return self.free_projection._replace(coefficients=converted(light, self.native_from_basis))
+        return self.free_projection._replace(coefficients=change_basis(light, self.native_from_basis))
 
     def transfers(self, points: LitPoints, where: str = "") -> Node:
         """Transfer vectors of points to :attr:`basis`; where they vary, to the method's native basis."""
@@ -247,7 +247,7 @@ class InParts(Node):
             caches=False,
         )
         is_lit = light is not None and is_shaded
-        self._is_transferred = not (is_lit and method.shades_what_is_seen)
+        self._is_transferred = not (is_lit and method.shades_transmittance)
         self._transfer = result = Node(
             f"transfer{where}",
             method.transfer if self._is_transferred else None,
@@ -259,7 +259,7 @@ class InParts(Node):
         )
         self._shading = None
         if is_lit:
-            shade_part = method.light_part if self._is_transferred else method.light_seen
+            shade_part = method.shade_transfer if self._is_transferred else method.shade_transmittance
             arguments = self._transfer, projected_light
             self._shading = result = Node(f"shading{where}", shade_part, *arguments, items=words, caches=False)
         shadows = _static_shadows(method, points, light)
@@ -359,7 +359,7 @@ def _self_visibility(method: SphereMethod, points: LitPoints, projected_light: A
         known = f"{missing} to be traced, or read from the cache" if missing else "traced once, cached"
         return f"{len(named)} {'body' if len(named) == 1 else 'bodies'}: {known}"
 
-    return Node("self-shadows", functools.partial(method.look_up, bodies), rotations, projected_light, items=state)
+    return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
 def _why_no_self_visibility(method: SphereMethod, points: LitPoints) -> str:

@@ -21,7 +21,7 @@ from warpshadow.pipeline.lighting import (
     Blocking,
     KnownLight,
     LitPoints,
-    converted,
+    change_basis,
     joined,
     map_of,
     receiver_words,
@@ -68,7 +68,7 @@ class Directional(SphereMethod):
     """Visibility for each cell of directions by itself."""
 
     traces_self_visibility = True
-    shades_what_is_seen = True
+    shades_transmittance = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.visibility.directions)
@@ -97,7 +97,7 @@ class Directional(SphereMethod):
         """Number of coefficients that take part: all."""
         return len(self._directions)
 
-    def look_up(
+    def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
@@ -187,9 +187,9 @@ class Directional(SphereMethod):
         """Transmittance past the body of the receivers: looked up, and of a sun by rays where these are asked for."""
         if group.self_lookup is None or not group.points.size:
             return None
-        assert group.places is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
+        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLookup)
         rows, lookup, kernels, rays = group.self_lookup
-        transmittance_self = gather_self_transmittance(group.normals, group.places, lookup, kernels, rows)
+        transmittance_self = gather_self_transmittance(group.normals, group.probe_weights, lookup, kernels, rows)
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -198,7 +198,7 @@ class Directional(SphereMethod):
                 'have, expected "traced" or "spheres"'
             )
         assert group.body is not None
-        of_sun = trace_sun_cells(rays[0], group.places, rays[1], group.body, projected_light.sun)
+        of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
         return overwrite_sharp_cells(transmittance_self, of_sun, projected_light.sun.places)
 
     def transfer(self, seen: Transmittance, group: Group, projected_light: ProjectedCells) -> wp.array:
@@ -212,16 +212,16 @@ class Directional(SphereMethod):
             else cell_transfer(seen.transmittance_total, group.cached_rows)
         )
 
-    def light_part(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def shade_transfer(self, transfer: wp.array, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Shading of a part, vec3 of shape [batch, receiver]."""
         if group.cached_rows is not None and _has_light(group.cached_rows):
             return light_cells(transfer, group.cached_rows)
-        return super().light_part(transfer, group, projected_light)
+        return super().shade_transfer(transfer, group, projected_light)
 
-    def light_seen(self, seen: Transmittance, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def shade_transmittance(self, seen: Transmittance, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Shading of a group in known light."""
         if group.cached_rows is not None:
-            return self.light_part(self.transfer(seen, group, projected_light), group, projected_light)
+            return self.shade_transfer(self.transfer(seen, group, projected_light), group, projected_light)
         assert seen.transmittance_total is not None and projected_light.coefficients is not None
         arguments = seen.transmittance_total, group.normals, projected_light.directions, projected_light.coefficients
         return shade_cells(*arguments, maximum=LARGEST_COEFFICIENT)
@@ -307,7 +307,7 @@ class Directional(SphereMethod):
             return diffuse
         count = len(projected_light.directions)
         transfer = directional_transfer(_joined_cells(cells, count), receivers.normals, projected_light.directions)
-        light = projected_light.coefficients if free is None else converted(free, self.native_from_basis)
+        light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
         assert light is not None
         even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
         direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(transfer, even)

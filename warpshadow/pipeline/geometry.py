@@ -80,8 +80,8 @@ def as_geometry(name: str, arguments: object) -> Geometry:
     return Geometry(*arguments)
 
 
-def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
-    """Exchange runs of items of a whole.
+def splice(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
+    """Put parts in the place of runs of items of a whole.
 
     Args:
         whole: Shape [batch, item].
@@ -89,7 +89,7 @@ def exchanged(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callabl
         part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
     Returns:
         Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
-    Differentiable: whole, where it is not exchanged, and parts.
+    Differentiable: whole, where nothing takes its place, and parts.
     """
     pieces, last = [] if runs else [whole], 0
     for first, end in runs:

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device.batch import concatenate, cut
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, converted, map_of, receiver_words
+from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_words
 from warpshadow.pipeline.node import Fixed, Input, Node
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import GLOSS
@@ -105,7 +105,7 @@ class GlossyPoints(LitPoints):
 
     def _blurred(self, light: wp.array) -> wp.array:
         """Texels of free light. Differentiable: light."""
-        return converted(light, _blurred_basis(self.method.basis))
+        return change_basis(light, _blurred_basis(self.method.basis))
 
 
 @functools.lru_cache(maxsize=4)

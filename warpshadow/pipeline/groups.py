@@ -41,7 +41,7 @@ class Group(NamedTuple):
     radii: wp.array  # [batch, sphere] float32
     cached_rows: CachedRows | None = None  # of static bodies, which block their light, too
     body: int | None = None  # whose receivers they are, where bodies are told apart
-    places: ProbeWeights | None = None  # where they lie on that body
+    probe_weights: ProbeWeights | None = None  # where they lie on that body
     self_lookup: SelfVisibilityLookup | SelfVisibilityLobes | None = (
         None  # by rays; None where there is none, or its spheres block
     )
@@ -83,7 +83,7 @@ class Group(NamedTuple):
                 normals=normals[:, part].contiguous(),
                 centers=centers,
                 radii=radii,
-                places=None if self.places is None else self.places.part(part),
+                probe_weights=None if self.probe_weights is None else self.probe_weights.part(part),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.part(part),
                 clusters=clusters,
             )
@@ -202,8 +202,8 @@ def _groups_that_move(
             clusters = clusters or find_clusters(*blocking, blockers.merging)
             group = group._replace(skip=skip, clusters=clusters)
         if span.body >= 0:
-            places = blockers.self_visibility.places(receivers, span)
-            group = group._replace(body=span.body, places=places, self_lookup=self_lookups.get(span.body))
+            weights = blockers.self_visibility.probe_weights(receivers, span)
+            group = group._replace(body=span.body, probe_weights=weights, self_lookup=self_lookups.get(span.body))
             if corners is not None:
                 bounds = blockers.planes.first_corner[span.body : span.body + 2].tolist()
                 group = group._replace(corners=cut(corners, *bounds))

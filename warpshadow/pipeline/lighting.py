@@ -315,11 +315,11 @@ def _shade(transfers: list[wp.array], light: wp.array, *, matrix: np.ndarray | N
     """Light the receivers of all groups, by light that a matrix converts. Differentiable: transfers, light."""
     maximum = check.LARGEST
     if matrix is not None:
-        light, maximum = converted(light, matrix), LARGEST_COEFFICIENT
+        light, maximum = change_basis(light, matrix), LARGEST_COEFFICIENT
     return joined([shade(transfer, light, maximum=maximum) for transfer in transfers])
 
 
-def converted(light: wp.array, matrix: np.ndarray | None) -> wp.array:
+def change_basis(light: wp.array, matrix: np.ndarray | None) -> wp.array:
     """Coefficients of light in another basis, to which a matrix takes them, None for the same; differentiable in it."""
     return light if matrix is None else shade(constant(matrix[None], wp.float32, light.device), light)
 

@@ -58,7 +58,7 @@ class LogSH(SphereMethod):
             return self.free_projection.bands**2
         return as_light(known).bands(self._order) ** 2
 
-    def look_up(
+    def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands
     ) -> dict[int, SelfVisibilityLobes]:
         """The lobes of some bodies, turned. Differentiable: rotations."""
@@ -103,10 +103,10 @@ class LogSH(SphereMethod):
             return lobes
         if group.self_lookup is None or not group.points.size:
             return None
-        assert group.places is not None and isinstance(group.self_lookup, SelfVisibilityLobes)
+        assert group.probe_weights is not None and isinstance(group.self_lookup, SelfVisibilityLobes)
         bands = projected_light.bands if seen.transmittance_total is None else self._order
         return self_visibility_lobes(
-            group.self_lookup.lobes, group.places, group.self_lookup.turn, order=self._order, bands=bands
+            group.self_lookup.lobes, group.probe_weights, group.self_lookup.turn, order=self._order, bands=bands
         )
 
     def cached_rows(self, static: StaticBodies, light: Input | None, blocking: Blocking) -> VertexRows:
@@ -138,7 +138,7 @@ class LogSH(SphereMethod):
             if body in turned:
                 lobes, turn = turned[body]
                 result = self_visibility_lobes(
-                    lobes, self.self_visibility.places_of(body, vertices[of_body]), turn, order=self._order
+                    lobes, self.self_visibility.probe_weights_of(body, vertices[of_body]), turn, order=self._order
                 )
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)

@@ -12,7 +12,7 @@ from warpshadow.device.batch import common_batch, concatenate
 from warpshadow.device.memory import empty
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.spatial_sort import z_order
-from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, exchanged
+from warpshadow.pipeline.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import AUTO, SPHERE_METHODS, BodyLike, Scene
 from warpshadow.spheres import MANY, Spheres
@@ -231,13 +231,13 @@ class MergedScene:
         if turned is not None:
             assert own.rotations is not None
             every, arguments = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
-            turned = exchanged(own.rotations, every, lambda a, b: arguments[:, a:b])
+            turned = splice(own.rotations, every, lambda a, b: arguments[:, a:b])
         return Geometry(
-            exchanged(
+            splice(
                 own.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
             ),
-            exchanged(own.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
-            exchanged(own.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            splice(own.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
+            splice(own.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,
@@ -364,7 +364,7 @@ class MergedScene:
             _spliced("centers", rest.centers, centers, first_sphere),
             _spliced("radii", rest.radii, radii, first_sphere),
             moving=None if rest.moving is None else (*rest.moving, number),
-            rotations=None if rest.rotations is None else exchanged(rest.rotations, [], lambda *_: rest.rotations),
+            rotations=None if rest.rotations is None else splice(rest.rotations, [], lambda *_: rest.rotations),
             deformed=(*rest.deformed, number),
         )
 
@@ -450,8 +450,8 @@ def _stacked_faces(parts: list[np.ndarray], starts: np.ndarray) -> np.ndarray:
 def _spliced(name: str, whole: wp.array, part: wp.array | None, place: np.ndarray) -> wp.array:
     """Put a part [batch, item] in its place, from one item up to another, in the whole [batch, item]."""
     if part is None:
-        return exchanged(whole, [], lambda *_: whole)
+        return splice(whole, [], lambda *_: whole)
     first, end = place.tolist()
     check.shape(name, part.shape, ("batch", end - first))
     common_batch({"rest": whole, name: part})
-    return exchanged(whole, [(first, end)], lambda *_: part)
+    return splice(whole, [(first, end)], lambda *_: part)

@@ -20,7 +20,7 @@ from warpshadow.stages.textures.footprint import find_footprints
 from warpshadow.stages.textures.pyramid import mip_pyramids
 from warpshadow.stages.textures.sample import sample_albedo
 
-Given = Sequence[wp.array | None] | None
+BodyArrays = Sequence[wp.array | None] | None
 """For each body an array, or None for the scene's own; None for all bodies' own."""
 
 
@@ -92,7 +92,9 @@ class Materials:
         body = self.merged_scene.scene.bodies[number]
         return not arguments and not np.any(body.albedo if body.texture is None else body.texture)
 
-    def replaced(self, albedo: Given, textures: Given, gloss: Mapping[str, Given] | None = None) -> "Materials":
+    def replaced(
+        self, albedo: BodyArrays, textures: BodyArrays, gloss: Mapping[str, BodyArrays] | None = None
+    ) -> "Materials":
         """A copy with some materials replaced, checked; nodes of the others are shared.
 
         Itself where nothing is given.
@@ -100,7 +102,7 @@ class Materials:
         shiny = self._shiny(gloss or {})
         return self._colored(albedo, textures) if shiny is self else shiny._colored(albedo, textures)
 
-    def _shiny(self, gloss: Mapping[str, Given]) -> "Materials":
+    def _shiny(self, gloss: Mapping[str, BodyArrays]) -> "Materials":
         """A copy with other roughness and the like; itself where nothing is given."""
         bodies, changed = self.merged_scene.scene.bodies, {}
         for name, arrays in gloss.items():
@@ -123,7 +125,7 @@ class Materials:
         materials.gloss = self.gloss | inputs
         return materials
 
-    def _colored(self, albedo: Given, textures: Given) -> "Materials":
+    def _colored(self, albedo: BodyArrays, textures: BodyArrays) -> "Materials":
         """A copy with other albedo and textures; itself where nothing is given."""
         bodies = self.merged_scene.scene.bodies
         colors, images = list(self.albedo.value()), list(self.textures.value())

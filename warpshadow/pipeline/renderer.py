@@ -48,7 +48,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def _said(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Concatenate[RendererType, P], R]:
+def _announced(function: Callable[Concatenate[RendererType, P], R]) -> Callable[Concatenate[RendererType, P], R]:
     """Make a method one of a call at a time that says in files that it runs, should that take long."""
 
     @one_at_a_time
@@ -70,7 +70,7 @@ def _delegated(part: str, function: Callable[Concatenate[Any, P], R]) -> Callabl
     return called
 
 
-_OF_CAMERAS = ("_own_view", "_without_others")  # cached values of a renderer's cameras
+_OF_CAMERAS = ("_scene_view", "_without_others")  # cached values of a renderer's cameras
 
 
 class SceneRenderer:
@@ -116,7 +116,7 @@ class SceneRenderer:
             "progress": progress,
         }
         self.has_camera_batch = cameras is not None
-        self.cameras = (scene.camera,) if cameras is None else _alike(cameras)
+        self.cameras = (scene.camera,) if cameras is None else _as_batch(cameras)
         self.device = where
         self.progress = progress
         with waiting("preparing", shows=progress):
@@ -148,7 +148,7 @@ class SceneRenderer:
         other = object.__new__(type(self))
         vars(other).update({name: value for name, value in vars(self).items() if name not in _OF_CAMERAS})
         other._arguments = self._arguments | {"cameras": cameras}
-        other.cameras, other.has_camera_batch = _alike(cameras), True
+        other.cameras, other.has_camera_batch = _as_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
         other._has_warned = True
         if "_without_others" in vars(self):
@@ -189,7 +189,7 @@ class SceneRenderer:
         """The cameras, mat44 of shape [camera]."""
         return self._views.clip_matrices.value()
 
-    @_said
+    @_announced
     def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
@@ -229,7 +229,7 @@ class SceneRenderer:
     on_faces = _delegated("_views", SceneViews.on_faces)
 
     @functools.cached_property
-    def _own_view(self) -> View:
+    def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
         bodies = self._given_scene.bodies
@@ -242,21 +242,21 @@ class SceneRenderer:
     @one_at_a_time
     def body_ids(self, view: View | None = None) -> np.ndarray:
         """Body that each sample sees, -1 for none, shape [batch, height, width]."""
-        view = self._own(view)
+        view = self._checked(view)
         face_ids = view.fragments.face_ids.numpy()
         return np.where(face_ids >= 0, self.merged_scene.body_of_face[face_ids], -1)
 
-    def _own(self, view: Any) -> Any:
+    def _checked(self, view: Any) -> Any:
         """A view of this renderer, by default the scene's; other views reuse their cached values."""
         if view is None:
-            return self._own_view
+            return self._scene_view
         if view.merged_scene is not self.merged_scene:
             raise ValueError("view: got one that another renderer made, expected one of this renderer's view()")
         return view
 
     # ------------------------------------------------------------------------------------------ light and reflectance
 
-    @_said
+    @_announced
     def transfer(self) -> wp.array:
         """Transfer vectors of the visible receivers to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
@@ -270,7 +270,7 @@ class SceneRenderer:
                 f"scene.bounces: got {self.scene.bounces}, expected 0 for transfer vectors, which are of direct light; "
                 "shade and draw take free light that bounces, with any method"
             )
-        view = self._own_view
+        view = self._scene_view
         parts = view.transfers.value(self._views.call(view))
         if len(parts) == 1:
             return parts[0]
@@ -278,7 +278,7 @@ class SceneRenderer:
         rows = joined([part.reshape((part.shape[0], -1)) for part in parts])
         return rows.reshape((rows.shape[0], -1, count))
 
-    @_said
+    @_announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
         """Light the receivers of a view.
 
@@ -294,10 +294,10 @@ class SceneRenderer:
             ValueError: where rays are asked for a gradient to geometry.
         Differentiable: light, view.
         """
-        view = self._own(view)
+        view = self._checked(view)
         return view.shading(light).value(self._views.call(view))
 
-    @_said
+    @_announced
     def reflect(
         self,
         albedo: PerBody[wp.array] | None = None,
@@ -315,7 +315,7 @@ class SceneRenderer:
             vec3 of shape [batch, height, width]. Not to be written to.
         Differentiable: albedo, textures, view.
         """
-        view = self._own(view)
+        view = self._checked(view)
         return view.reflection(self._reflecting(albedo, textures)).samples.value(self._views.call(view))
 
     @one_at_a_time
@@ -330,7 +330,7 @@ class SceneRenderer:
         Raises:
             ValueError: for a body without a texture.
         """
-        return self._own_view.seen_texels(self.scene.body_number(body))
+        return self._scene_view.seen_texels(self.scene.body_number(body))
 
     def _reflecting(
         self,
@@ -346,7 +346,7 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ image
 
-    @_said
+    @_announced
     def draw(
         self,
         light: Light | None = None,
@@ -370,7 +370,7 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: light, albedo, textures, gloss, view.
         """
-        view = self._own(view)
+        view = self._checked(view)
         return view.image(light, self._reflecting(albedo, textures, gloss)).value(self._views.call(view))
 
     def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
@@ -386,7 +386,7 @@ class SceneRenderer:
             images = (self._in_photograph(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
-    @_said
+    @_announced
     def insert(
         self,
         photograph: wp.array,
@@ -486,7 +486,7 @@ class SceneRenderer:
         has_batch = self.has_camera_batch or view is not None
         height, width = self._size
         with unrecorded():
-            layers = find_layers(self._own(view), (width, height), supersampling=self.scene.supersampling)
+            layers = find_layers(self._checked(view), (width, height), supersampling=self.scene.supersampling)
         return layers if has_batch else Layers(*(item[0] for item in layers))
 
     @one_at_a_time
@@ -496,7 +496,7 @@ class SceneRenderer:
         Differentiable: view, as :func:`warpshadow.pipeline.layers.find_layer_arrays` says.
         """
         height, width = self._size
-        return find_layer_arrays(self._own(view), (width, height), supersampling=self.scene.supersampling)
+        return find_layer_arrays(self._checked(view), (width, height), supersampling=self.scene.supersampling)
 
     @one_at_a_time
     def shadow(self) -> np.ndarray:
@@ -514,7 +514,7 @@ class SceneRenderer:
         bodies = tuple(replace(body, blockers=0) for body in self.scene.bodies)
         others = SceneRenderer(**arguments | {"scene": replace(self.scene, bodies=bodies)})
         with unrecorded():
-            view = self._own_view
+            view = self._scene_view
             call = self._views.call(view)
             receivers = Node("", Receivers.without_owners, view.receivers_node)
             none = tuple(empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
@@ -554,7 +554,7 @@ class SceneRenderer:
         """
         hidden: set[Node] = set()
         if view is not None:
-            view = self._own(view)
+            view = self._checked(view)
             hidden = {*decide(view.receivers_node, view.call), view.silhouettes}
         else:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
@@ -573,7 +573,7 @@ class SceneRenderer:
         )
 
 
-def _alike(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+def _as_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """Cameras whose images are a batch, checked; all get the nearest of their near planes."""
     check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
     if not cameras:

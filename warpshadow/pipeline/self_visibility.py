@@ -155,7 +155,7 @@ class SelfVisibility:
             cached[key] = find()
         return cached[key]
 
-    def places(self, receivers: Receivers, span: Span) -> ProbeWeights:
+    def probe_weights(self, receivers: Receivers, span: Span) -> ProbeWeights:
         """Where receivers of a body lie among its probes. Differentiable: barycentrics of samples."""
         assert receivers.vertices is not None
         table, first, end = self._table(span.body), span.first, span.end
@@ -166,7 +166,7 @@ class SelfVisibility:
         assert seen is not None
         return table.of_samples(Fragments(cut(seen.face_ids, first, end), cut(seen.barycentrics, first, end)))
 
-    def places_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
+    def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body, after the last of which backs are numbered, lie among its probes."""
         return self._table(body).of_vertices(from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device))
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
-from warpshadow.pipeline.geometry import Geometry, exchanged
+from warpshadow.pipeline.geometry import Geometry, splice
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.stages.cached_cells import CachedRows
@@ -84,12 +84,12 @@ class StaticBodies:
 
     def with_moving_clip_positions(self, positions: wp.array, clip_matrices: wp.array, cached: wp.array) -> wp.array:
         """Overwrite the clip positions of moving vertices. Differentiable: positions."""
-        return exchanged(cached, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
+        return splice(cached, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
 
     def with_moving_normals(self, positions: wp.array, cached: wp.array) -> wp.array:
         """Overwrite the normals of moving vertices. Differentiable: positions."""
         faces_of = self._merged_scene.faces_of
-        return exchanged(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
+        return splice(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
 
     def receivers(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
         """Gather points and normals of some vertices: vec3 of shape [1, receiver].

@@ -292,13 +292,13 @@ class View(LitPoints):
     def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
 
-        def exchanged() -> View:
+        def among_these() -> View:
             arguments = self.vertices, self.spheres, other.receivers_node, self.call, None, self.normals, self.blocking
             view = copy.copy(self)
             LitPoints.__init__(view, self.method, self.materials, *arguments)
             return view
 
-        return other.cached("in another scene", self, exchanged)
+        return other.cached("in another scene", self, among_these)
 
     def _radiance(self, lit: Node, reflected: Node) -> Node:
         """Node of the samples."""

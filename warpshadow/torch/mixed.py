@@ -54,7 +54,7 @@ class MixedRenderer(torch.nn.Module):
 
     def __init__(self, renderers: Iterable[TorchRenderer]):
         super().__init__()
-        self.renderers = torch.nn.ModuleList(_alike(renderers))
+        self.renderers = torch.nn.ModuleList(_as_batch(renderers))
         scenes = [self._renderer(number).scene for number in range(len(self.renderers))]
         self._body_count = max(len(scene.bodies) for scene in scenes)
         self._vertex_counts: list[dict[BodyLike, int]] = [
@@ -341,7 +341,7 @@ def _cut(arguments: Any, ndim: int, count: int) -> Any:
     return arguments.narrow(-ndim, 0, count)
 
 
-def _alike(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
+def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     """Renderers whose images are a batch, checked."""
     check.instance("renderers", renderers, Iterable, "a list of TorchRenderers, one for each scene")
     arguments = list(renderers)
@@ -353,7 +353,7 @@ def _alike(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
         if renderer.warp.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
         got, expected = _described(renderer), _described(arguments[0])
-        if got != expected or not _is_same(renderer.basis, arguments[0].basis):
+        if got != expected or not _is_same_basis(renderer.basis, arguments[0].basis):
             raise ValueError(f"{name}: got {got}, expected {expected}, as the first has")
     return arguments
 
@@ -367,7 +367,7 @@ def _described(renderer: TorchRenderer) -> str:
     )
 
 
-def _is_same(one: Basis, other: Basis) -> bool:
+def _is_same_basis(one: Basis, other: Basis) -> bool:
     if isinstance(one, CellBasis) and isinstance(other, CellBasis):
         return np.array_equal(one.directions, other.directions)
     return one == other

@@ -102,7 +102,9 @@ class LitParts(Node):
         extra_inputs: tuple[Node, ...] = (),
     ):
         self._seen = seen
-        self._shade = Node(f"shading{where}", seen.method.light_part, seen, projected_light, items=words, caches=False)
+        self._shade = Node(
+            f"shading{where}", seen.method.shade_transfer, seen, projected_light, items=words, caches=False
+        )
         super().__init__("", None, projected_light, *others, extra_inputs=(seen, self._shade, *extra_inputs))
 
     def compute(self, call: Call) -> Any:

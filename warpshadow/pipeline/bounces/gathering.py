@@ -308,8 +308,8 @@ class Gathering:
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         if group.body not in outgoing.senders.bodies or self._is_flat[group.body]:
             return None
-        assert group.body is not None and group.places is not None
-        return self_light(self._self_form_factors.of(group.body), outgoing.of_body(group.body), *group.places)
+        assert group.body is not None and group.probe_weights is not None
+        return self_light(self._self_form_factors.of(group.body), outgoing.of_body(group.body), *group.probe_weights)
 
     def _from_planes(self, group: Group, cells: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array:
         planes = outgoing.proxies.planes

@@ -68,8 +68,8 @@ class SelfFormFactors:
         shape, body = (group.points.shape[1], len(senders.areas)), group.body
         if body not in senders.bodies or senders.merged_scene.is_flat[body]:
             return csr_matrix(shape, dtype=np.float32)
-        assert body is not None and group.places is not None
-        factors, (probes, weights) = self.of(body).on_host(), (item.numpy()[0] for item in group.places)
+        assert body is not None and group.probe_weights is not None
+        factors, (probes, weights) = self.of(body).on_host(), (item.numpy()[0] for item in group.probe_weights)
         starts = np.arange(0, probes.size + 1, 3)
         of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
         first = senders.first[senders.bodies.index(body)]
