@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide
-from warpshadow.pipeline.node import Call, Clock, Fixed, Input, Node
+from warpshadow.pipeline.node import Call, Clock, Input, Node, detached
 
 
 @pytest.fixture
@@ -157,7 +157,7 @@ def wired(vertices=2, cameras=3, **options):
     silhouettes = Node("silhouettes", lambda clip: clip, clip, has_adjoint=False)
     normals = Node("normals", lambda a: 1, vertices)
     sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
-    image = Node("image", lambda *given: sum(given), sides, Fixed(silhouettes), normals, caches=False)
+    image = Node("image", lambda *given: sum(given), sides, detached(silhouettes), normals, caches=False)
     return image, {node.name: node for node in (clip, silhouettes, normals, sides, image)}
 
 
@@ -205,11 +205,12 @@ def test_gradients_pass_where_they_can(clock):
     assert explanation["sides"].backward.why == "nothing is computed"
 
 
-def test_a_fixed_input_matters_and_gets_no_gradient(clock):
+def test_a_detached_input_matters_and_gets_no_gradient(clock):
     vertices = Input("vertices", array(requires_grad=True))
-    fixed, constant = (Node("node", None, Fixed(vertices, is_constant=is_constant)) for is_constant in (False, True))
+    inputs = (detached(vertices, is_constant=is_constant) for is_constant in (False, True))
+    fixed, constant = (Node("node", None, each) for each in inputs)
     assert fixed.requires_grad and not fixed.differentiated_inputs and list(fixed.sources) == [vertices]
-    assert not constant.requires_grad and not constant.sources and not constant.before
+    assert not constant.requires_grad and not constant.sources and not constant.before[0].before
 
 
 # ---------------------------------------------------------------------------------------------- times

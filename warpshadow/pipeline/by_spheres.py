@@ -25,7 +25,7 @@ from warpshadow.pipeline.lighting import (
     joined,
     receiver_words,
 )
-from warpshadow.pipeline.node import Call, Fixed, Input, Node
+from warpshadow.pipeline.node import Call, Input, Node, detached
 from warpshadow.pipeline.planes import ScenePlanes
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.pipeline.self_visibility import SelfVisibility
@@ -387,7 +387,7 @@ def _static_shadows(method: SphereMethod, points: LitPoints, light: Input | None
     return Node(
         "static shadows",
         rows.of_receivers,
-        Fixed(points.receivers_node),
+        detached(points.receivers_node),
         static.normals,
         items=lambda: f"up to {missing():,} vertices not seen before",
         idle=lambda: method.why_no_shadows or ("" if missing() else "cached: static bodies are the same"),

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from warpshadow.pipeline.node import AnyInput, Call, Fixed, Input, Node, Timing
+from warpshadow.pipeline.node import AnyInput, Call, Input, Node, Timing
 
 
 @dataclass(frozen=True)
@@ -94,14 +94,21 @@ class Explanation:
         return "\n".join([*lines, *self.notes])
 
 
+def bounce_notes(count: int | str) -> list[str]:
+    """Say how often light bounces, where it does."""
+    if not count:
+        return []
+    times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
+    return [f"Light bounces {times}."]
+
+
 def decide(image: Node, call: Call) -> dict[Node, Decision]:
     """Decide which nodes run when a call asks for an image, in the order in which they do; nothing is computed."""
     decisions: dict[Node, Decision] = {}
     requested: set[Node] = set()
 
-    def visit(arguments: AnyInput, reason: Decision) -> None:
+    def visit(node: AnyInput, reason: Decision) -> None:
         """Decide on a node, which is asked for if the reason is that something runs."""
-        node = arguments.node if isinstance(arguments, Fixed) else arguments
         if isinstance(node, Input) or node in requested or (node in decisions and not reason):
             return
         if reason:

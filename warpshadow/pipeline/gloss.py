@@ -15,7 +15,7 @@ import warp as wp
 from warpshadow.device.batch import concatenate, cut
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.lighting import KnownLight, Light, LitPoints, change_basis, map_of, receiver_words
-from warpshadow.pipeline.node import Fixed, Input, Node
+from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.scene.scene import GLOSS
 from warpshadow.stages.gloss.lobes import sample_lobes
@@ -44,7 +44,7 @@ class GlossyPoints(LitPoints):
         receivers = Node("", functools.partial(_glossy_receivers, glossy), view.receivers_node)
         arguments = view.method, view.materials, view.vertices, view.spheres, receivers, view.call
         super().__init__(*arguments, normals=view.normals, blocking=view.blocking, is_static=view.is_static)
-        self._numbers = Node("", functools.partial(_numbers, glossy), Fixed(view.receivers_node))
+        self._numbers = Node("", functools.partial(_numbers, glossy), detached(view.receivers_node))
 
     def mixed(self, view: LitPoints, diffuse: Node, light: Light | None, materials: Materials) -> tuple[Node, Node]:
         """Light that colored and that white surfaces reflect, of all receivers of the view: vec3 [batch, receiver].
@@ -80,7 +80,7 @@ class GlossyPoints(LitPoints):
 
     def chosen(self, light: Node) -> Node:
         """Node of light on these receivers, given that of all receivers of the view."""
-        return Node("", _chosen, light, Fixed(self._all_receivers), self.merged_scene.is_glossy)
+        return Node("", _chosen, light, detached(self._all_receivers), self.merged_scene.is_glossy)
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""

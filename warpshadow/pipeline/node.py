@@ -130,7 +130,7 @@ class Node:
         self.differentiated_inputs: dict[Input, None] = {}
         self.requires_grad = False
         for item in (*inputs, *extra_inputs):
-            if isinstance(item, (Node, Input)) or (isinstance(item, Fixed) and not item.is_constant):
+            if isinstance(item, (Node, Input)):
                 self.before.append(item)
                 self.sources |= item.sources
                 self.differentiated_inputs |= item.differentiated_inputs
@@ -158,7 +158,7 @@ class Node:
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
-        return [item.value(call) if isinstance(item, (Node, Input, Fixed)) else item for item in self.inputs]
+        return [item.value(call) if isinstance(item, (Node, Input)) else item for item in self.inputs]
 
     def run(self, call: "Call", *values: Any) -> Any:
         """Call the function, and time it."""
@@ -175,21 +175,21 @@ class Node:
         return self._cached if self.is_cached else call.get(self)
 
 
-class Fixed:
-    """An input that matters by its value alone: it gets no gradient.
+AnyInput = Node | Input
+
+
+def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
+    """Make an input that matters by its value alone: it gets no gradient.
 
     Args:
         node: The node or source.
         is_constant: Whether the value is independent of the sources' values.
     """
-
-    def __init__(self, node: Node | Input, *, is_constant: bool = False):
-        self.node, self.value, self.is_constant = node, node.value, is_constant
-        self.requires_grad, self.sources = node.requires_grad, node.sources
-        self.differentiated_inputs: dict[Input, None] = {}
-
-
-AnyInput = Node | Input | Fixed
+    result = Node("", lambda value: value, node, caches=False)
+    result.differentiated_inputs = {}
+    if is_constant:
+        result.before, result.sources, result.requires_grad = [], {}, False
+    return result
 
 
 class Timing:

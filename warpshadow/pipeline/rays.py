@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis
 from warpshadow.pipeline.lighting import KnownLight, LitPoints, Method, map_of, receiver_words
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Fixed, Input, Node
+from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.traced import trace_lobes
@@ -160,7 +160,7 @@ class Rays(Method):
             "visibility",
             self._casting_meshes,
             points.vertices,
-            Fixed(points.receivers_node),
+            detached(points.receivers_node),
             items=lambda: f"{receiver_words(points)} by rays",
             idle="" if self.merged_scene.casting else "no body has blockers",
             caches=False,
@@ -169,7 +169,7 @@ class Rays(Method):
 
     def _meshes_for(self, points: LitPoints, receivers: Node) -> Node:
         """Node of the meshes that rays of other receivers among the same bodies meet."""
-        return Node("", self._casting_meshes, points.vertices, Fixed(receivers), caches=False)
+        return Node("", self._casting_meshes, points.vertices, detached(receivers), caches=False)
 
     @property
     def _sample_count(self) -> int:

@@ -13,7 +13,7 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.merged_scene import MergedScene
-from warpshadow.pipeline.node import Fixed, Input, Node
+from warpshadow.pipeline.node import Input, Node, detached
 from warpshadow.scene.scene import GLOSS
 from warpshadow.stages.interpolation import interpolate
 from warpshadow.stages.textures.footprint import find_footprints
@@ -199,7 +199,7 @@ class Materials:
         """Node of the samples' footprints in the textures."""
         merged_scene = self.merged_scene
         maps = merged_scene.uvs, merged_scene.uv_faces, self.texture_of_face
-        sizes = Fixed(pyramids, is_constant=True)  # of which it takes these alone
+        sizes = detached(pyramids, is_constant=True)  # of which it takes these alone
         arguments = fragments, merged_scene.faces, clip_positions, *maps, sizes
         return Node("footprints", find_footprints, *arguments, items=items)
 

@@ -27,7 +27,7 @@ from warpshadow.pipeline.choice_of_receivers import (
     warn_of_coarse_faces,
     with_receivers,
 )
-from warpshadow.pipeline.explain import Explanation, decide
+from warpshadow.pipeline.explain import Explanation, bounce_notes, decide
 from warpshadow.pipeline.geometry import Geometry, as_geometry
 from warpshadow.pipeline.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.lighting import Light, LitPoints, joined
@@ -35,7 +35,7 @@ from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.methods import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.reflectance import Materials
-from warpshadow.pipeline.scene_views import SceneViews
+from warpshadow.pipeline.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.view import View
 from warpshadow.scene.creases import rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
@@ -116,7 +116,7 @@ class SceneRenderer:
             "progress": progress,
         }
         self.has_camera_batch = cameras is not None
-        self.cameras = (scene.camera,) if cameras is None else _as_batch(cameras)
+        self.cameras = (scene.camera,) if cameras is None else camera_batch(cameras)
         self.device = where
         self.progress = progress
         with waiting("preparing", shows=progress):
@@ -148,7 +148,7 @@ class SceneRenderer:
         other = object.__new__(type(self))
         vars(other).update({name: value for name, value in vars(self).items() if name not in _OF_CAMERAS})
         other._arguments = self._arguments | {"cameras": cameras}
-        other.cameras, other.has_camera_batch = _as_batch(cameras), True
+        other.cameras, other.has_camera_batch = camera_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
         other._has_warned = True
         if "_without_others" in vars(self):
@@ -560,31 +560,7 @@ class SceneRenderer:
             view = self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
         image = view.preview().image(light, self._reflecting(albedo, textures, gloss))
         is_host = self.device.is_cpu or self.clock.waits
-        notes = receiver_notes(self._given_scene, self._choices)
-        if self.scene.bounces:
-            count = self.scene.bounces
-            notes.append(
-                "Light bounces {}.".format(
-                    "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
-                )
-            )
+        notes = [*receiver_notes(self._given_scene, self._choices), *bounce_notes(self.scene.bounces)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )
-
-
-def _as_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """Cameras whose images are a batch, checked; all get the nearest of their near planes."""
-    check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
-    if not cameras:
-        raise ValueError("cameras: got none, expected at least one, or None for the scene's")
-    first = cameras[0]
-    for number, camera in enumerate(cameras):
-        check.instance(f"cameras[{number}]", camera, Camera, "a Camera")
-        if (camera.width, camera.height) != (first.width, first.height):
-            raise ValueError(
-                f"cameras[{number}]: got {camera.width} × {camera.height} pixels, "
-                f"expected {first.width} × {first.height}, as the first has"
-            )
-    near = min(camera.near for camera in cameras)
-    return tuple(camera if camera.near == near else replace(camera, near=near) for camera in cameras)

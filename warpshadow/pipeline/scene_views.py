@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -158,3 +159,20 @@ class SceneViews:
         node = Node("", receivers_on_faces, bodies[0], normals, scene.faces, sides, barycentrics, owners)
         points = self._method, self._materials, *bodies, node, self.call()
         return LitPoints(*points, normals=normals, blocking=blocking)
+
+
+def camera_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Cameras whose images are a batch, checked; all get the nearest of their near planes."""
+    check.instance("cameras", cameras, Sequence, "a list of Cameras, [camera], or None for the scene's")
+    if not cameras:
+        raise ValueError("cameras: got none, expected at least one, or None for the scene's")
+    first = cameras[0]
+    for number, camera in enumerate(cameras):
+        check.instance(f"cameras[{number}]", camera, Camera, "a Camera")
+        if (camera.width, camera.height) != (first.width, first.height):
+            raise ValueError(
+                f"cameras[{number}]: got {camera.width} × {camera.height} pixels, "
+                f"expected {first.width} × {first.height}, as the first has"
+            )
+    near = min(camera.near for camera in cameras)
+    return tuple(camera if camera.near == near else replace(camera, near=near) for camera in cameras)

@@ -11,7 +11,7 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.lighting import Blocking, Light, LitPoints, Method, receiver_words
-from warpshadow.pipeline.node import Call, Fixed, Input, Node
+from warpshadow.pipeline.node import Call, Input, Node, detached
 from warpshadow.pipeline.reflectance import Materials, Reflection
 from warpshadow.stages.film import average, sample_radiance, sum_radiance
 from warpshadow.stages.normals import vertex_normals
@@ -92,7 +92,7 @@ class View(LitPoints):
             clip = Node("clip positions", static.with_moving_clip_positions, vertices, cameras, cached, items=corners)
         fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
         if two_sided.size:
-            placed = Fixed(vertices), Fixed(cameras)
+            placed = detached(vertices), detached(cameras)
             sides = Node("sides", find_sides, fragments, faces, two_sided, *placed, items=samples, has_adjoint=False)
         else:
             sides = Node("sides", _same, fragments, idle="every body is closed: none is seen from behind")
@@ -105,11 +105,11 @@ class View(LitPoints):
         else:
             normals = Node("normals", static.with_moving_normals, vertices, static.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
-        seen = sides if method.samples_receive.any() else Fixed(sides)
+        seen = sides if method.samples_receive.any() else detached(sides)
         words = functools.partial(receiver_words, self)
-        arguments = [vertices, normals, seen, Fixed(silhouettes)]
+        arguments = [vertices, normals, seen, detached(silhouettes)]
         if method.is_adaptive.any():
-            arguments.append(Fixed(spheres))
+            arguments.append(detached(spheres))
         receivers = Node("receivers", self._receive, *arguments, items=words)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
@@ -267,7 +267,7 @@ class View(LitPoints):
         def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
             return find_ratio_image(fragments.face_ids, catches, *arguments)
 
-        seen = Fixed(self.fragments_node), reflected.samples, unshadowed
+        seen = detached(self.fragments_node), reflected.samples, unshadowed
         division = Node("ratio", divide, *seen, items=self._samples, caches=False)
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, caches=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
