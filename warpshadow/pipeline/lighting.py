@@ -97,6 +97,13 @@ class LitPoints:
             self._cached[name] = key, make()
         return self._cached[name][1]
 
+    def with_receivers(self: Points, receivers: Node) -> Points:
+        """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
+        points = copy.copy(self)
+        points.receivers_node, points.static, points.is_static = receivers, None, False
+        points._cached, points._last_light = {}, None
+        return points
+
     def preview(self: Points) -> Points:
         """The points with the values cached so far, which does not add its own to them."""
         points = copy.copy(self)

@@ -1,5 +1,6 @@
 """Merged scene: the bodies of a scene as one mesh with one set of spheres, at rest and placed in the world."""
 
+import copy
 import functools
 from collections.abc import Callable, Collection, Iterable, Sequence
 
@@ -50,6 +51,12 @@ class MergedScene:
         self.faces = self._array(_stacked_faces(faces, self.first_vertex), wp.vec3i)
         self.uvs = self._array(np.concatenate(uvs)[None], wp.vec2)
         self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
+
+    def with_settings(self, scene: Scene) -> "MergedScene":
+        """The same bodies with other settings, such as receivers; both share the arrays that are made already."""
+        other = copy.copy(self)
+        other.scene = scene
+        return other
 
     @functools.cached_property
     def vertex_order(self) -> np.ndarray:

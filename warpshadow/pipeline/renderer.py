@@ -120,11 +120,11 @@ class SceneRenderer:
         self.device = where
         self.progress = progress
         with waiting("preparing", shows=progress):
-            self.merged_scene = MergedScene(scene, device=self.device, progress=progress)
+            merged_scene = MergedScene(scene, device=self.device, progress=progress)
             with unrecorded():
-                choices = choose_receivers(self.merged_scene, self.cameras, is_light_free=basis is not None)
-            self._given_scene, self._choices = scene, choices
-        self.merged_scene.scene = self.scene = with_receivers(scene, self._choices)
+                self._choices = choose_receivers(merged_scene, self.cameras, is_light_free=basis is not None)
+        self._given_scene, self.scene = scene, with_receivers(scene, self._choices)
+        self.merged_scene = merged_scene.with_settings(self.scene)
         self.clock = Clock()
         self._method = make_method(self.merged_scene, basis, progress=progress)
         self._materials = Materials.of_scene(self.merged_scene)

@@ -1,6 +1,5 @@
 """Views: a geometry seen by cameras, wired from the vertices to the image."""
 
-import copy
 import functools
 import operator
 from typing import TYPE_CHECKING
@@ -291,14 +290,7 @@ class View(LitPoints):
 
     def at_receivers_of(self, other: "View") -> "View":
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
-
-        def among_these() -> View:
-            arguments = self.vertices, self.spheres, other.receivers_node, self.call, None, self.normals, self.blocking
-            view = copy.copy(self)
-            LitPoints.__init__(view, self.method, self.materials, *arguments)
-            return view
-
-        return other.cached("in another scene", self, among_these)
+        return other.cached("in another scene", self, lambda: self.with_receivers(other.receivers_node))
 
     def _radiance(self, lit: Node, reflected: Node) -> Node:
         """Node of the samples."""
