@@ -1,4 +1,4 @@
-"""Convex parts: closed convex pieces of a mesh, such as the boxes and rods that furniture is made of."""
+"""Convex parts: closed convex pieces of a mesh, such as the boxes and rods of furniture, and panels of its sheets."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.maths.components import connected_components
+from warpshadow.maths.panels import MOST_PANELS, TOLERANCE, find_panels
 
 MOST_FACES = 64
 """Faces of a part at most; a cylinder of 48 sides has 50."""
 
 _MOST_TRIANGLES = 16 * MOST_FACES
-"""Triangles of a part at most: its faces may be divided."""
+"""Triangles of a solid at most: its faces may be divided."""
 
 _FLATNESS = 1e-4
 """Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
@@ -20,7 +21,7 @@ _FLATNESS = 1e-4
 
 
 class ConvexPart(NamedTuple):
-    """A closed convex piece of a mesh, without the edges inside its faces."""
+    """A closed convex piece of a mesh, without the edges inside its faces; or a panel, whose faces are its sides."""
 
     corners: np.ndarray
     """Vertices of the mesh at its corners, int of shape [corner]."""
@@ -38,24 +39,31 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
-        The parts, which may touch and overlap; None where a piece of the mesh is open, hollow or curved, or has more
-        than 64 faces.
+        The parts, which may touch and overlap: a solid for each closed piece of the mesh, panels for each open one. None
+        where a closed piece is hollow or curved, or has more than 64 faces, and where there are more than 32 panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
+    points, solids, panels = positions.astype(np.float64)[first], [], []
+    tolerance = TOLERANCE * np.ptp(points, axis=0).max()
     piece = _pieces(triangles)
-    if np.bincount(piece).max() > _MOST_TRIANGLES:
-        return None
-    points, parts = positions.astype(np.float64)[first], []
     for number in range(piece.max() + 1):
-        part = _part(points, triangles[piece == number])
-        if part is None:
-            return None
-        parts.append(part._replace(corners=first[part.corners]))
-    return parts
+        some = triangles[piece == number]
+        if _is_open(some):
+            found = find_panels(points, some, tolerance, MOST_PANELS - len(panels))
+            if found is None:
+                return None
+            panels += found
+        else:
+            solid = _solid(points, some)
+            if solid is None:
+                return None
+            solids.append(solid)
+    parts = [*solids, *map(_panel, panels)]
+    return [part._replace(corners=first[part.corners]) for part in parts]
 
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:
@@ -72,8 +80,26 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
-def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
-    """The convex part of some triangles; None where they are none."""
+def _is_open(triangles: np.ndarray) -> bool:
+    """Whether triangles have a border."""
+    _, counts = np.unique(np.sort(_edges(triangles), axis=1), axis=0, return_counts=True)
+    return bool((counts % 2).any())
+
+
+def _panel(corners: np.ndarray) -> ConvexPart:
+    """A panel, given its corners in order."""
+    count = len(corners)
+    third, two_thirds = count // 3, 2 * count // 3
+    sides = np.array([[0, third, two_thirds], [0, two_thirds, third]])
+    begin = np.arange(count)
+    edges = np.stack([begin, np.roll(begin, -1), np.zeros(count, int), np.ones(count, int)], axis=1)
+    return ConvexPart(corners, sides, edges)
+
+
+def _solid(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
+    """The convex solid that triangles enclose; None where they enclose none."""
+    if len(triangles) > _MOST_TRIANGLES:
+        return None
     edges, count = _edges(triangles), len(triangles)
     triangle_at = {(a, b): number % count for number, (a, b) in enumerate(edges.tolist())}
     if len(triangle_at) != len(edges) or not all((b, a) in triangle_at for a, b in triangle_at):
@@ -83,7 +109,7 @@ def _part(points: np.ndarray, triangles: np.ndarray) -> ConvexPart | None:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     volume, size = (normals * corners[:, 0]).sum() / 6, np.ptp(points[used], axis=0).max()
     if volume < 0:
-        return _part(points, triangles[:, ::-1])
+        return _solid(points, triangles[:, ::-1])
     lengths = np.linalg.norm(normals, axis=1)
     if volume <= _FLATNESS**2 * size**3 or not lengths.all():
         return None

@@ -66,7 +66,10 @@ def _find_silhouette(
     part: int,
     silhouette: wp.array(dtype=wp.vec3),
 ):
-    """Store a part's silhouette; return how many edges it has, 0 for a tiny one, −1 for a receiver inside the part."""
+    """Store a part's silhouette.
+
+    Returns how many edges it has, 0 for a tiny one or a polygon from the side, −1 for a receiver inside the part.
+    """
     first_face = parts.first_face[part]
     facing = wp.uint64(0)
     for face in range(first_face, parts.first_face[part + 1]):
@@ -74,7 +77,7 @@ def _find_silhouette(
         if plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] > plane[3]:
             facing = facing | (wp.uint64(1) << wp.uint64(face - first_face))
     if facing == wp.uint64(0):
-        return -1
+        return wp.where(parts.first_face[part + 1] - first_face > 2, -1, 0)
     count = int(0)
     for e in range(parts.first_edge[part], parts.first_edge[part + 1]):
         edge = parts.edges[e]
@@ -87,9 +90,10 @@ def _find_silhouette(
             a = corners[begin] - point
             b = corners[end] - point
             n = wp.cross(a, b)
-            length = wp.length(n)
-            if length > _TINY * wp.length(a) * wp.length(b):
-                silhouette[_ROWS * count] = n / length
+            length2 = wp.length_sq(n)
+            if length2 > _TINY * _TINY * wp.length_sq(a) * wp.length_sq(b):
+                length = wp.sqrt(length2)
+                silhouette[_ROWS * count] = (1.0 / length) * n
                 silhouette[_ROWS * count + 1] = a
                 silhouette[_ROWS * count + 2] = b
                 silhouette[_ROWS * count + 3] = wp.vec3(float(begin), float(end), length)
@@ -106,7 +110,7 @@ class Chord:
     begin: float  # s₀
     end: float  # s₁
     along: wp.vec3  # t
-    sine: float  # √(1 − (m·ω)²), of the angle between ω and the normal
+    scale: float  # 1/√(1 − (m·ω)²), of the angle between ω and the normal
 
 
 @wp.func
@@ -125,17 +129,29 @@ def _along_line(end: wp.vec3, axis: wp.vec3, direction: wp.vec3, half: float, be
 def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, direction: wp.vec3, radius: float):
     """Find the chord of an edge, m·ω = ``cosine``."""
     chord = Chord()
-    chord.sine = wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
-    chord.distance = cosine / chord.sine
+    chord.scale = 1.0 / wp.sqrt(wp.max(0.0, 1.0 - cosine * cosine))
+    chord.distance = cosine * chord.scale
     half2 = radius * radius - chord.distance * chord.distance
     a = silhouette[_ROWS * e + 1]
     b = silhouette[_ROWS * e + 2]
     if half2 > 0.0 and (wp.dot(a, direction) > 0.0 or wp.dot(b, direction) > 0.0):
         half = wp.sqrt(half2)
-        chord.along = wp.cross(direction, silhouette[_ROWS * e]) / chord.sine
+        chord.along = chord.scale * wp.cross(direction, silhouette[_ROWS * e])
         chord.begin = _along_line(b, chord.along, direction, half, -half)
         chord.end = _along_line(a, chord.along, direction, half, half)
     return chord
+
+
+@wp.func
+def _angle(x: float, y: float):
+    """Angle of (x, y), y ≥ 0, from the x axis, within 2e-6: as atan2, in a third of the time."""
+    across = wp.abs(x)
+    t = wp.min(across, y) / wp.max(wp.max(across, y), 1.0e-30)
+    t2 = t * t
+    a = ((-0.0117212 * t2 + 0.05265332) * t2 - 0.11643287) * t2 + 0.19354346
+    angle = t * ((a * t2 - 0.33262347) * t2 + 0.99997726)
+    angle = wp.where(y > across, 0.5 * wp.pi - angle, angle)
+    return wp.where(x < 0.0, wp.pi - angle, angle)
 
 
 @wp.func
@@ -159,7 +175,7 @@ def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, 
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
                 d = chord.distance
-                angle = wp.atan2(wp.abs(d) * length, d * d + chord.begin * chord.end)
+                angle = _angle(d * d + chord.begin * chord.end, wp.abs(d) * length)
                 area += 0.5 * (d * length - radius * radius * wp.where(cosine > 0.0, angle, -angle))
     return wp.clamp(wp.where(nearest > 0.0, 1.0, 0.0) + area / (wp.pi * radius * radius), 0.0, 1.0)
 
@@ -173,9 +189,9 @@ def _share_adjoint(silhouette: wp.array(dtype=wp.vec3), count: int, direction: w
         if wp.abs(cosine) < limit:
             chord = _find_chord(silhouette, e, cosine, direction, radius)
             if chord.end > chord.begin:
-                foot = direction - (chord.distance / chord.sine) * (silhouette[_ROWS * e] - cosine * direction)
+                foot = direction - (chord.distance * chord.scale) * (silhouette[_ROWS * e] - cosine * direction)
                 middle = foot + 0.5 * (chord.begin + chord.end) * chord.along
-                scale = adj * (chord.end - chord.begin) / (wp.pi * radius * radius * chord.sine)
+                scale = adj * chord.scale * (chord.end - chord.begin) / (wp.pi * radius * radius)
                 silhouette[_ROWS * e + 4] = silhouette[_ROWS * e + 4] + scale * middle
 
 
@@ -259,8 +275,10 @@ def _add_coverage(
                 if _reaches(bound, cells.axes[bundle], cells.half_angles[bundle]):
                     for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                         direction = cells.directions[q]
-                        if (not covers or coverage[q] < 1.0) and (
-                            wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
+                        if (
+                            wp.dot(bound.axis, direction) > bound.cosine
+                            and (not covers or coverage[q] < 1.0)
+                            and (wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0)
                         ):
                             if not covers:
                                 for k in range(cells.directions.shape[0]):
