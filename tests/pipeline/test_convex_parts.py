@@ -23,9 +23,20 @@ TABLE = mesh_of(
 )
 
 
-def scene_of(*, method="directional", blockers="auto", bounces=0, **options):
-    """A table beside a ball, over a ground."""
-    table = ws.Body(TABLE, albedo=(0.8, 0.5, 0.3), blockers=blockers, name="table", **options)
+def awning():
+    """Cloth of one layer over a ridge."""
+    grid = ws.plane(1.0, 12)
+    x, _, z = 0.6 * grid.positions.T
+    height = 0.7 - np.abs(x) - 0.03 * np.sin(10 * np.abs(x))
+    return ws.Mesh(np.stack([2 * x, height, 1.4 * z], axis=1), grid.faces)
+
+
+AWNING = awning()
+
+
+def scene_of(mesh=TABLE, *, method="directional", blockers="auto", bounces=0, **options):
+    """A table, or an awning, beside a ball, over a ground."""
+    table = ws.Body(mesh, albedo=(0.8, 0.5, 0.3), blockers=blockers, name="table", **options)
     ball = ws.Body(
         ws.icosphere(0.3, 3), blockers=ws.Spheres([[0, 0, 0]], [0.3]), translation=(0.3, 1.1, 0.1), name="ball"
     )
@@ -40,10 +51,11 @@ def covered(image):
     return image[image[..., 3] > 0.99][:, :3]
 
 
-def test_images_are_those_of_rays_and_spheres_are_farther_off():
-    truth = covered(ws.render(scene_of(method="ray-traced")))
+@pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
+def test_images_are_those_of_rays_and_spheres_are_farther_off(mesh):
+    truth = covered(ws.render(scene_of(mesh, method="ray-traced")))
     errors = [
-        np.abs(covered(ws.Renderer(scene_of(blockers=blockers)).render()) - truth).mean() / truth.mean()
+        np.abs(covered(ws.Renderer(scene_of(mesh, blockers=blockers)).render()) - truth).mean() / truth.mean()
         for blockers in ("auto", 32)
     ]
     assert errors[0] < 0.015
@@ -64,12 +76,13 @@ MOVES = {
 
 @pytest.mark.parametrize(("bounces", "tolerance"), [(0, 0.01), (1, 0.15)])  # measured with a bounce: 10%
 @pytest.mark.parametrize("moving", [None, ["table"], ["ball"]], ids=["all", "table", "ball"])
-def test_gradients_of_the_ground_are_those_of_differences(moving, bounces, tolerance):
+@pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
+def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces, tolerance):
     """No pixel shows another body, so no rasterizer takes part."""
     if moving and bounces:
         pytest.skip("where light bounces nothing of static bodies is cached")
     camera = ws.Camera.look_at((0, 1.5, 2.2), (0, 0, 1.4), fov_y=20, size=(24, 24))
-    scene = scene_of(bounces=bounces)
+    scene = scene_of(mesh, bounces=bounces)
     renderer = TorchRenderer(dataclasses.replace(scene, camera=camera))
     assert (renderer.warp.body_ids() == 2).all()
     rotations, translations, scales = renderer.scene_poses()

@@ -47,7 +47,7 @@ def hits(vertices, point, rays):
     return (np.maximum(entry, 0) < leave) & ~((toward == 0) & (height > 0)).any(axis=1)
 
 
-def twin(point, directions, radius, bodies, across=200):
+def twin(point, directions, radius, bodies, across=200, vertices=VERTICES):
     """Transmittance of a receiver, by rays through the disc of each cell."""
     axis = (np.arange(across) + 0.5) / across * 2 - 1
     u, v = np.meshgrid(axis, axis)
@@ -57,7 +57,7 @@ def twin(point, directions, radius, bodies, across=200):
         side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
         frame = np.stack([side, np.cross(direction, side)]) / np.linalg.norm(side)
         rays = direction + disc @ frame
-        shares = [sum(hits(VERTICES[part], point, rays).mean() for part in parts) for parts in bodies]
+        shares = [sum(hits(vertices[part], point, rays).mean() for part in parts) for parts in bodies]
         result.append(np.prod(np.maximum(0, 1 - np.array(shares))))
     return np.array(result)
 
@@ -78,6 +78,21 @@ def of_kernel(points, device, directions=DIRECTIONS, **options):
 def test_shares_of_cells_are_those_of_rays(number, device):
     expected = twin(POINTS[number], DIRECTIONS, cell_radius(32), BODIES)
     np.testing.assert_allclose(of_kernel(POINTS[[number]], device)[0], expected, rtol=0, atol=RAYS)
+
+
+def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(device):
+    corners = np.array([[-0.5, 0.2, -0.4], [0.6, 0.2, -0.5], [0.5, 0.2, 0.6], [-0.4, 0.2, 0.3]])
+    (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    some = ConvexBlockers.of([ConvexBody([panel], 0)], 4, device=device)
+    placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
+    points = np.array([[0.1, 1.0, 0.0], [0.1, -0.1, 0.1], [0.1, 0.2, 0.1], [3.0, 0.2, 0.1]])
+    arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS
+    got = transmittance_past_parts(*arguments).numpy()[0]
+    thick = np.concatenate([corners - [0, 1e-4, 0], corners + [0, 1e-4, 0]])
+    expected = [twin(point, DIRECTIONS, cell_radius(32), [[0]], vertices=[thick]) for point in points[:2]]
+    np.testing.assert_allclose(got[:2], expected, rtol=0, atol=RAYS)
+    assert got[:2].min(axis=1).max() < 0.1
+    np.testing.assert_array_equal(got[2:], 1)
 
 
 def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
