@@ -39,15 +39,17 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
         faces: Triangles that wind alike, shape [face, 3].
 
     Returns:
-        The parts, which may touch and overlap: a solid for each closed piece of the mesh, panels for each open one. None
-        where a closed piece is hollow or curved, or has more than 64 faces, and where there are more than 32 panels.
+        The parts, which may touch and overlap: a solid for each closed piece of the mesh, panels for each open one.
+        None where a closed piece is hollow or curved, or has more than 64 faces, or where there are more than 32
+        panels.
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if not len(triangles):
         return None
-    points, solids, panels = positions.astype(np.float64)[first], [], []
+    points, solids = positions.astype(np.float64)[first], []
+    panels: list[np.ndarray] = []
     tolerance = TOLERANCE * np.ptp(points, axis=0).max()
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):

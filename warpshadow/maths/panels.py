@@ -1,4 +1,4 @@
-"""Panels: nearly flat, convex regions of a sheet, which is a mesh of one layer, such as cloth or a box without a lid."""
+"""Panels: nearly flat, convex regions of a sheet, which is a mesh of one layer, such as cloth."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import numpy as np
 TOLERANCE = 0.02
 """Thickness and mean gap of a panel at most, over the size of the mesh.
 
-A tent of 2048 faces has 6 panels, and an image of it is 3.1% off, the ground by pixel; with 0.01 it has 16, and the image
-is 2.9% off, in 1.5 times the time. The spheres that stood in for it had 10.2%.
+The tent of demos/kinds.py has 6 panels, and its image by pixel is 3.1% off; with 0.01 it has 16, and the image is 2.9%
+off, in 1.5 times the time. With spheres it was 10.2% off.
 """
 
 MOST_PANELS = 32
-"""Panels of a sheet at most: where a sheet bends so often, spheres are faster."""
+"""Panels of a mesh at most: beyond, spheres are faster.
+
+With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off in
+place of 5.6%.
+"""
 
 _CREASE = 0.94
 """Cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them."""

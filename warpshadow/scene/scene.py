@@ -213,8 +213,8 @@ class Body:
         blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
             (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
             shadow, by rays neither. By method "directional" a flat body blocks light as the part of a plane that it is,
-            for any number, and with "auto" a body of closed convex pieces, such as boxes, the light of others as these;
-            by others a flat body with all else on one side is a ground, for which any number means one sphere touching
+            for any number, and with "auto" a body of closed convex pieces, such as boxes, or of at most 32 panels of
+            cloth, the light of others as these; by others a flat body with all else on one side is a ground, for which any number means one sphere touching
             it from behind. Where light bounces, a body of 0 or none is lit and reflects all the same,
             and takes its light from nobody. If it is not flat, other bodies get that light by rays only: a sphere sends
             light in place of the light it blocks.
@@ -227,7 +227,7 @@ class Body:
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
             of few faces needs to receive a shadow; or "adaptive": on a flat body at some pixels, close to each other
             where shadows have edges, between which it is interpolated (by pixel on other bodies, and on a GPU). "auto"
-            leaves it to each renderer: flat bodies of faces of more than 4 pixels are adaptive, with directional
+            leaves it to each renderer: flat bodies of faces of more than 2 pixels are adaptive, with directional
             visibility on a CPU. Else it is by pixel where its cameras see faces of more than 16 pixels on average, or
             5% of the body's pixels show faces longer than 16 pixels (in images larger than 256 × 256, 1/4096 of the
             pixels, at most 400, and four times the root of that). Pictures that are made once, as by
