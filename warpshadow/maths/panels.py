@@ -14,8 +14,8 @@ off, in 1.5 times the time. With spheres it was 10.2% off.
 MOST_PANELS = 32
 """Panels of a mesh at most: beyond, spheres are faster.
 
-With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off in
-place of 5.6%.
+With a panel for each of the 162 leaves of the tree of demos/kinds.py its image takes 2.4 times as long, and is 5.3% off
+in place of 5.6%.
 """
 
 _CREASE = 0.94

@@ -64,8 +64,8 @@ SMALL_FACE = 2.0
 """Pixels of an average face up to which the vertices of a flat body are as close as shadows need; in a small image an
 edge is as sharp there (a ground of 64² quads in 64² pixels is 0.9% off its image by pixel, adaptive 1.1%). Thin things
 need more: on grounds whose faces have 2.7 to 2.9 pixels, in 128² pixels, adaptive receivers took the errors of the
-chair, wheel and fence of demos/kinds.py from 7.3 to 5.5%, of the tent from 6.5 to 3.7% and of the cage from 9.3 to 8.7%,
-in 1.1 to 1.2 times the time.
+chair, wheel and fence of demos/kinds.py from 7.3 to 5.5%, of the tent from 6.5 to 3.7% and of the cage from 9.3 to
+8.7%, in 1.1 to 1.2 times the time.
 """
 
 FEW_FACES = 256

@@ -1,7 +1,7 @@
 """Convex blockers of a scene: bodies that consist of convex parts, such as boxes, rods and panels of cloth.
 
-Spheres bulge out of flat sides and thin boards, and light comes between them. Instead, the share of a cell of directions that each part covers is
-computed. On themselves such bodies cast shadows found by rays.
+Spheres bulge out of flat sides and thin boards, and light comes between them. Instead, the share of a cell of
+directions that each part covers is computed. On themselves such bodies cast shadows found by rays.
 """
 
 from __future__ import annotations
