@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpshadow.maths.components import connected_components
+
 TOLERANCE = 0.02
 """Thickness and mean gap of a panel at most, over the size of the mesh.
 
@@ -55,9 +57,6 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, mos
 
 def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
     """Regions between creases, of triangles that have an area."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
@@ -68,9 +67,8 @@ def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> list[np.ndarra
     is_same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
     pairs = np.stack([order[1:], order[:-1]])[:, is_same] % count
     pairs = pairs[:, np.abs((normals[pairs[0]] * normals[pairs[1]]).sum(axis=1)) > _CREASE]
-    graph = coo_array((np.ones(pairs.shape[1]), pairs), shape=(count, count))
-    region_count, region = connected_components(graph, directed=False)
-    return [triangles[region == number] for number in range(region_count)]
+    region = connected_components(pairs[0], pairs[1], count)
+    return [triangles[region == number] for number in range(region.max(initial=-1) + 1)]
 
 
 def _principal_axes(places: np.ndarray) -> np.ndarray:

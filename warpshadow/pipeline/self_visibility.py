@@ -250,8 +250,8 @@ class SelfVisibility:
     @property
     def is_cached(self) -> bool:
         """Whether the disk has the rows of all bodies that cast shadows on themselves, where the scene has them."""
-        bodies = (body for body in self.blocking(None, None).traced if not self._merged_scene.is_flat[body])
-        return all(self._rows_path(body).exists() for body in bodies)
+        traced = (body for body, is_flat in enumerate(self._merged_scene.is_flat) if not is_flat)
+        return all(self._rows_path(body).exists() for body in traced if not self.why_spheres(body, None))
 
     def _row_count(self, body: int) -> int:
         return len(self.probes(body).positions) * (1 + bool(self._merged_scene.is_two_sided[body]))
