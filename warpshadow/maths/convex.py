@@ -55,10 +55,10 @@ def find_convex_parts(positions: np.ndarray, faces: np.ndarray) -> list[ConvexPa
     for number in range(piece.max() + 1):
         some = triangles[piece == number]
         if _is_open(some):
-            found = find_panels(points, some, tolerance, MOST_PANELS - len(panels))
-            if found is None:
+            more = find_panels(points, some, tolerance, MOST_PANELS - len(panels))
+            if more is None:
                 return None
-            panels += found
+            panels += more
         else:
             solid = _solid(points, some)
             if solid is None:

@@ -24,7 +24,7 @@ _CREASE = 0.94
 """Cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them."""
 
 
-def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, most: int) -> list[np.ndarray] | None:
+def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, maximum: int) -> list[np.ndarray] | None:
     """Cut a sheet into panels.
 
     First along creases. A region that is too thick then, or whose outline is not convex, is cut in two across the
@@ -35,16 +35,16 @@ def find_panels(points: np.ndarray, triangles: np.ndarray, tolerance: float, mos
         points: Vertices, float64 of shape [vertex, 3].
         triangles: Triangles, shape [triangle, 3]; those without area do not count.
         tolerance: Thickness and mean gap of a panel at most [units of points].
-        most: Number of panels at most.
+        maximum: Number of panels at most.
 
     Returns:
         Vertices at the corners of each, in order around it, int of shape [corner]; None where there are more.
     """
     regions = _smooth_regions(points, triangles)
-    if len(regions) > most:
+    if len(regions) > maximum:
         return None
     deviations = [_deviation(points, region) for region in regions]
-    while len(regions) + sum(deviation > tolerance for deviation in deviations) <= most:
+    while len(regions) + sum(deviation > tolerance for deviation in deviations) <= maximum:
         if max(deviations, default=0.0) <= tolerance:
             panels = _joined(points, regions, tolerance)
             return [_outline(points, panel, tolerance / 2) for panel in panels]
@@ -116,13 +116,13 @@ def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.nda
 
     used = np.unique(region)
     flat = points[used] @ _principal_axes(points[used])[:2].T
-    around = ConvexHull(flat).vertices
-    chosen = np.array([flat[around, 0].argmin(), flat[around, 0].argmax()])  # of those around, in order
+    rim = ConvexHull(flat).vertices
+    chosen = np.array([flat[rim, 0].argmin(), flat[rim, 0].argmax()])  # of the rim, in order
     while True:
-        corners = flat[around[np.sort(chosen)]]
+        corners = flat[rim[np.sort(chosen)]]
         sides = np.roll(corners, -1, axis=0) - corners
         outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
-        heights = ((flat[around][:, None] - corners) * outward).sum(axis=-1).max(axis=1)
+        heights = ((flat[rim][:, None] - corners) * outward).sum(axis=-1).max(axis=1)
         if len(chosen) > 2 and heights.max() <= tolerance:
-            return used[around[np.sort(chosen)]]
+            return used[rim[np.sort(chosen)]]
         chosen = np.append(chosen, heights.argmax())

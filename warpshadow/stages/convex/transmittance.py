@@ -143,18 +143,6 @@ def _find_chord(silhouette: wp.array(dtype=wp.vec3), e: int, cosine: float, dire
 
 
 @wp.func
-def _angle(x: float, y: float):
-    """Angle of (x, y), y ≥ 0, from the x axis, within 2e-6: as atan2, in a third of the time."""
-    across = wp.abs(x)
-    t = wp.min(across, y) / wp.max(wp.max(across, y), 1.0e-30)
-    t2 = t * t
-    a = ((-0.0117212 * t2 + 0.05265332) * t2 - 0.11643287) * t2 + 0.19354346
-    angle = t * ((a * t2 - 0.33262347) * t2 + 0.99997726)
-    angle = wp.where(y > across, 0.5 * wp.pi - angle, angle)
-    return wp.where(x < 0.0, wp.pi - angle, angle)
-
-
-@wp.func
 def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, radius: float):
     """Share of a cell that a silhouette takes."""
     if count == 0:
@@ -175,7 +163,7 @@ def _share(silhouette: wp.array(dtype=wp.vec3), count: int, direction: wp.vec3, 
             if chord.end > chord.begin:
                 length = chord.end - chord.begin
                 d = chord.distance
-                angle = _angle(d * d + chord.begin * chord.end, wp.abs(d) * length)
+                angle = wp.atan2(wp.abs(d) * length, d * d + chord.begin * chord.end)
                 area += 0.5 * (d * length - radius * radius * wp.where(cosine > 0.0, angle, -angle))
     return wp.clamp(wp.where(nearest > 0.0, 1.0, 0.0) + area / (wp.pi * radius * radius), 0.0, 1.0)
 
