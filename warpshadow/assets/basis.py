@@ -89,8 +89,14 @@ class CellBasis:
 
     def functions(self, directions: np.ndarray) -> np.ndarray:
         """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient], 0 or 1."""
-        nearest = np.argmax(directions @ self.directions.T, axis=1)
-        return np.eye(self.size)[nearest]
+        return np.eye(self.size)[self.cells(directions)]
+
+    def cells(self, directions: np.ndarray) -> np.ndarray:
+        """Number of the cell that each unit vector [direction, 3] is in, shape [direction]."""
+        from scipy.spatial import cKDTree
+
+        nearest: np.ndarray = cKDTree(self.directions).query(directions)[1]
+        return nearest
 
     def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
@@ -153,6 +159,11 @@ def conversion(basis: Basis, other: Basis) -> np.ndarray | None:
         return basis.functions(other.directions).astype(np.float32)
     # to cells: the mean of the harmonics over a cell, or how cells overlap, from many directions
     fine = fibonacci(64 * max(basis.size, other.size))
-    own, cells = other.functions(fine), basis.functions(fine)
+    own = other.functions(fine)
     weights = 1 / own.sum(axis=0)[:, None] if isinstance(other, CellBasis) else 4 * np.pi / len(fine)
-    return (weights * (own.T @ cells)).astype(np.float32)
+    if not isinstance(basis, CellBasis):
+        return (weights * (own.T @ basis.functions(fine))).astype(np.float32)
+    from scipy.sparse import csr_matrix
+
+    in_cells = csr_matrix((np.ones(len(fine)), (basis.cells(fine), np.arange(len(fine)))), (basis.size, len(fine)))
+    return (weights * (in_cells @ own).T).astype(np.float32)

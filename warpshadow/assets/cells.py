@@ -140,6 +140,8 @@ def _split(height: int, count: int) -> int:
 @functools.lru_cache(maxsize=4)
 def _cells_of_pixels(height: int, directions: bytes) -> np.ndarray:
     """Number of the direction, of float32 vectors, that is nearest to each pixel, int32 of shape [height, 2·height]."""
-    columns = np.frombuffer(directions, np.float32).reshape(-1, 3).T
-    towards = sh.equirectangular_directions(height)
-    return np.stack([np.argmax(row.astype(np.float32) @ columns, axis=1).astype(np.int32) for row in towards])
+    from scipy.spatial import cKDTree  # which takes 0.1 s for 512 directions and 512 rows; all products take 1 to 4 s
+
+    tree = cKDTree(np.frombuffer(directions, np.float32).reshape(-1, 3))
+    nearest: np.ndarray = tree.query(sh.equirectangular_directions(height))[1].astype(np.int32)
+    return nearest

@@ -41,12 +41,10 @@ def small_stage(problem: Problem) -> Stage:
 
 
 def unseen_share(model: Model, images: torch.Tensor) -> float:
-    """Share of the counted pixels that see no body; 0 for targets with coverage, which is compared.
+    """Share of the counted pixels that see no body, for targets without coverage, which is not compared then.
 
     Such pixels are black in every image, so their residual stays, and light and reflectance cannot tell why.
     """
-    if model.targets.shape[-1] == 4:
-        return 0.0
     return float((model.weights * (images[..., 3] < 0.5)).sum() / model.weights.sum())
 
 
@@ -84,9 +82,26 @@ def warn_of(
         losses: Of the last descent.
         end: Why it ended.
     """
-    model = Model(problem, setting, small_stage(problem))
-    with torch.no_grad():
-        images = model.images(values)
+    is_exposure_known = problem.basis is None and not any(isinstance(free, Exposure) for free in problem.free)
+    has_coverage = problem.targets[0].image.shape[2] == 4
+    if is_exposure_known or not has_coverage:
+        model = Model(problem, setting, small_stage(problem))
+        with torch.no_grad():
+            images = model.images(values)
+        if not has_coverage:
+            _warn_of_unseen(model, images)
+        if is_exposure_known:
+            _warn_of_exposures(model, images)
+    gain = gain_of_last(losses)
+    if end == "finished" and problem.basis is not None and gain > FALLING:
+        check.warn(
+            f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
+            'give the last stage more iterations, or stages = "photograph", which solves for the light',
+            DiagnosticWarning,
+        )
+
+
+def _warn_of_unseen(model: Model, images: torch.Tensor) -> None:
     share = unseen_share(model, images)
     if share > UNSEEN:
         check.warn(
@@ -94,18 +109,13 @@ def warn_of(
             "ground larger",
             DiagnosticWarning,
         )
-    is_exposure_known = problem.basis is None and not any(isinstance(free, Exposure) for free in problem.free)
-    for view, stops in exposure_gaps(model, images).items() if is_exposure_known else ():
+
+
+def _warn_of_exposures(model: Model, images: torch.Tensor) -> None:
+    for view, stops in exposure_gaps(model, images).items():
         check.warn(
             f"targets[{view}] is {2**stops:.3g} times as bright as what was found, which is most of the residual, and "
             "may have led poses and colors astray: set exposure = true in [free], inverse.Exposure(), or the target's "
             f"exposure = {stops:+.2f} [stops]",
-            DiagnosticWarning,
-        )
-    gain = gain_of_last(losses)
-    if end == "finished" and problem.basis is not None and gain > FALLING:
-        check.warn(
-            f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
-            'give the last stage more iterations, or stages = "photograph", which solves for the light',
             DiagnosticWarning,
         )
