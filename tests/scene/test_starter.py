@@ -47,6 +47,8 @@ def test_the_command_writes_it_and_says_how_to_go_on(tmp_path, monkeypatch):
     assert result.exit_code == 0 and "a.toml: warpshadow view a.toml shows it" in result.stdout
     scene = ws.load_scene("a.toml")
     assert scene.bodies[0].rotation.tolist() == [-90, 0, 0] and scene.camera.width == 20
+    again = CliRunner().invoke(app, ["scene", "a.obj", "-o", "a.toml"])  # it would be another, and the first is edited
+    assert again.exit_code == 1 and ws.load_scene("a.toml").camera.width == 20
 
 
 def test_without_a_mesh_there_is_a_bunny(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -25,7 +26,7 @@ size = [{width}, {height}]            # width, height
 bounces = {bounces}                  # how often light bounces between bodies, or "all"
 
 [[body]]
-mesh = "{mesh}"
+mesh = {mesh}
 on_ground = {{size = 2.0}}     # 2 units large, standing
 {options}
 [[body]]
@@ -33,7 +34,6 @@ primitive = "infinite_ground"
 size = {ground_size}
 albedo = {albedo}
 """
-
 
 _SKY = "sky = {}                     # clear, with a sun"
 
@@ -46,6 +46,8 @@ def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = 
         mesh: File of the mesh.
         scene: Its :func:`warpshadow.default_scene`.
         light: File of the environment map that lights it, if not the sky.
+    Raises:
+        FileExistsError: where the file is there, and differs: it may have been edited.
     """
     body, ground = scene.bodies
     options = []
@@ -57,15 +59,15 @@ def write_starter(path: Path, mesh: Path, scene: Scene, *, light: Path | None = 
         name=path.name,
         width=scene.camera.width,
         height=scene.camera.height,
-        light="sky = {}                     # clear, with a sun"
-        if light is None
-        else f'envmap = "{_from(path, light)}"',
+        light=_SKY if light is None else f"envmap = {_from(path, light)}",
         bounces=scene.bounces,
         mesh=_from(path, mesh),
         options="".join(f"{option}\n" for option in options),
         ground_size=GROUND_SIZE,
         albedo=[round(float(value), 4) for value in ground.albedo],
     )
+    if path.exists() and path.read_text(encoding="utf-8") != lines:
+        raise FileExistsError(f"{path}: got a file that is there and may have been edited, expected none; remove it")
     with files.whole(path) as unfinished:
         unfinished.write_text(lines, encoding="utf-8")
 
@@ -88,5 +90,5 @@ def write_bunny(folder: Path) -> Path:
 
 
 def _from(path: Path, file: Path) -> str:
-    """A file as a scene file names it: from its folder."""
-    return Path(os.path.relpath(file, path.parent)).as_posix()
+    """A file as a scene file names it, from its folder, in quotes."""
+    return json.dumps(Path(os.path.relpath(file, path.parent)).as_posix(), ensure_ascii=False)
