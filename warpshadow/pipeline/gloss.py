@@ -57,7 +57,7 @@ class GlossyPoints(LitPoints):
         """
         words = functools.partial(receiver_words, self)
         roughness, metallic, specular = (self._values(materials, name) for name in GLOSS)
-        key = materials.gloss["roughness"]
+        key = materials.roughness
 
         def lobes() -> Node:
             inputs = self.receivers_node, roughness, self._cameras, self.method.lobe_samples

@@ -2,7 +2,7 @@
 
 import copy
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +42,9 @@ class Materials:
 
     Args:
         merged_scene: The bodies.
-        albedo: Of each body, vec3 of shape [batch, 1] or [batch, vertex].
-        textures: Of each body, vec3 of shape [batch, height, width], None without one.
+        inputs: Arrays of each body, by name: "albedo", vec3 of shape [batch, 1] or [batch, vertex]; "textures", vec3 of
+            shape [batch, height, width], None without one; and where a body shines, those of GLOSS, float32 of shape
+            [batch, 1] or [batch, vertex].
     Attributes:
         images: The textures that there are.
         sizes: Heights and widths of the bodies' textures, None without one.
@@ -51,22 +52,19 @@ class Materials:
         pyramids: Node of the mip levels of the textures, all of them.
     """
 
-    def __init__(self, merged_scene: MergedScene, albedo: Input, textures: Input):
-        self.merged_scene = merged_scene
-        self._take_albedo(albedo)
-        self._take_textures(textures)
-        self._of_scene = list(albedo.value()), list(textures.value())
-        self.gloss: dict[str, Input] = {}
+    def __init__(self, merged_scene: MergedScene, inputs: dict[str, Input]):
+        self.merged_scene, self._inputs, self._of_scene = merged_scene, inputs, inputs
+        self._wire(inputs)
 
-    def _take_albedo(self, albedo: Input) -> None:
-        counts = np.diff(self.merged_scene.first_vertex).tolist()
-        self.albedo, self.vertex_albedo = albedo, Node("", lambda colors: concatenate(colors, counts), albedo)
-
-    def _take_textures(self, textures: Input) -> None:
-        self.textures, images = textures, textures.value()
-        self.images = [image for image in images if image is not None]
-        self.sizes = tuple([None if image is None else image.shape[1:] for image in images])
-        self.pyramids = self.pyramids_to(lambda: None)
+    def _wire(self, changed: Collection[str]) -> None:
+        """Make the nodes of what changed."""
+        if "albedo" in changed:
+            self.vertex_albedo = self._of_vertices("albedo")
+        if "textures" in changed:
+            images = self.textures.value()
+            self.images = [image for image in images if image is not None]
+            self.sizes = tuple([None if image is None else image.shape[1:] for image in images])
+            self.pyramids = self.pyramids_to(lambda: None)
 
     @classmethod
     def of_scene(cls, merged_scene: MergedScene) -> "Materials":
@@ -76,89 +74,80 @@ class Materials:
             return wp.array(values[None], dtype=wp.vec3, device=merged_scene.device)
 
         bodies = merged_scene.scene.bodies
-        albedo = Input("albedo", [array(np.atleast_2d(body.albedo)) for body in bodies])
-        textures = Input("textures", [None if body.texture is None else array(body.texture) for body in bodies])
-        materials = cls(merged_scene, albedo, textures)
+        arrays: dict[str, list[wp.array | None]] = {
+            "albedo": [array(np.atleast_2d(body.albedo)) for body in bodies],
+            "textures": [None if body.texture is None else array(body.texture) for body in bodies],
+        }
         if merged_scene.is_glossy.any():
-            materials.gloss = {name: Input(name, _of_bodies(merged_scene, name)) for name in GLOSS}
-        return materials
+            arrays |= {name: _of_bodies(merged_scene, name) for name in GLOSS}
+        return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
+
+    @property
+    def albedo(self) -> Input:
+        """Albedo of each body."""
+        return self._inputs["albedo"]
+
+    @property
+    def textures(self) -> Input:
+        """Texture of each body, None without one."""
+        return self._inputs["textures"]
+
+    @property
+    def roughness(self) -> Input | None:
+        """Roughness of each body; None where none shines."""
+        return self._inputs.get("roughness")
 
     def is_black(self, number: int) -> bool:
         """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
-        colors, images = self._of_scene
-        arguments = (
-            self.albedo.value()[number] is not colors[number] or self.textures.value()[number] is not images[number]
-        )
+        for name in ("albedo", "textures"):
+            if self._inputs[name].value()[number] is not self._of_scene[name].value()[number]:
+                return False
         body = self.merged_scene.scene.bodies[number]
-        return not arguments and not np.any(body.albedo if body.texture is None else body.texture)
+        return not np.any(body.albedo if body.texture is None else body.texture)
 
-    def replaced(
-        self, albedo: BodyArrays, textures: BodyArrays, gloss: Mapping[str, BodyArrays] | None = None
-    ) -> "Materials":
-        """A copy with some materials replaced, checked; nodes of the others are shared.
+    def replaced(self, given: Mapping[str, BodyArrays]) -> "Materials":
+        """A copy with other arrays of some bodies, by name, checked; nodes of the others are shared.
 
-        Itself where nothing is given.
+        An albedo takes the place of a texture, too. Itself where nothing is given.
         """
-        shiny = self._shiny(gloss or {})
-        return self._colored(albedo, textures) if shiny is self else shiny._colored(albedo, textures)
-
-    def _shiny(self, gloss: Mapping[str, BodyArrays]) -> "Materials":
-        """A copy with other roughness and the like; itself where nothing is given."""
-        bodies, changed = self.merged_scene.scene.bodies, {}
-        for name, arrays in gloss.items():
-            values = list(self.gloss[name].value()) if self.gloss else []
-            for number, array in enumerate(arrays or ()):
-                if array is None:
-                    continue
-                if not bodies[number].is_glossy:
-                    expected = "one for bodies that have roughness in the scene"
-                    raise ValueError(f"{name}[{number}]: got some for {bodies[number].called!r}, expected {expected}")
-                count = 1 if array.shape[1:] == (1,) else bodies[number].mesh.vertex_count
-                check.shape(f"{name}[{number}]", array.shape, ("batch", count))
-                check.finite_arrays({f"{name}[{number}]": array})
-                values[number] = array
-                changed[name] = values
+        values = {name: list(source.value()) for name, source in self._inputs.items()}
+        colored = {number for name, number, _ in _arrays_of(given) if name == "albedo"}
+        for name, number, array in _arrays_of(given):
+            self._check(name, number, array)
+            if name == "textures" and number in colored:
+                raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
+            values[name][number] = array
+            if name == "albedo":
+                values["textures"][number] = None
+        changed = {
+            name: Input(name, arrays, news=f"{name} {'are' if name == 'textures' else 'is'} given")
+            for name, arrays in values.items()
+            if not all(map(operator.is_, arrays, self._inputs[name].value()))
+        }
         if not changed:
             return self
         materials = copy.copy(self)
-        inputs = {name: Input(name, values, news=f"{name} is given") for name, values in changed.items()}
-        materials.gloss = self.gloss | inputs
+        materials._inputs = self._inputs | changed
+        materials._wire(changed)
         return materials
 
-    def _colored(self, albedo: BodyArrays, textures: BodyArrays) -> "Materials":
-        """A copy with other albedo and textures; itself where nothing is given."""
-        bodies = self.merged_scene.scene.bodies
-        colors, images = list(self.albedo.value()), list(self.textures.value())
-        for number, color in enumerate(albedo or ()):
-            if color is not None:
-                vertex_count = bodies[number].mesh.vertex_count
-                check.shape(f"albedo[{number}]", color.shape, ("batch", 1 if color.shape[1:] == (1,) else vertex_count))
-                check.finite_arrays({f"albedo[{number}]": color})
-                self._warn_of_growth(f"albedo[{number}]", color)
-                colors[number], images[number] = color, None
-        for number, image in enumerate(textures or ()):
-            if image is not None:
-                check.shape(f"textures[{number}]", image.shape, ("batch", "height", "width"))
-                if bodies[number].mesh.uvs is None:
-                    raise ValueError(f"textures[{number}]: got an image, but the mesh has no uvs; expected None")
-                if not image.is_contiguous:
-                    raise ValueError(f"textures[{number}]: got a strided array, expected a contiguous one")
-                if albedo is not None and albedo[number] is not None:
-                    raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
-                check.finite_arrays({f"textures[{number}]": image})
-                self._warn_of_growth(f"textures[{number}]", image)
-                images[number] = image
-        has_colors, has_images = (
-            all(map(operator.is_, *item)) for item in ((colors, self.albedo.value()), (images, self.textures.value()))
-        )
-        if has_colors and has_images:
-            return self
-        materials = copy.copy(self)
-        if not has_colors:
-            materials._take_albedo(Input("albedo", colors, news="albedo is given"))
-        if not has_images:
-            materials._take_textures(Input("textures", images, news="textures are given"))
-        return materials
+    def _check(self, name: str, number: int, array: wp.array) -> None:
+        """Raise ValueError for an array that is not one of a body."""
+        body, where = self.merged_scene.scene.bodies[number], f"{name}[{number}]"
+        if name in GLOSS and not body.is_glossy:
+            expected = "one for bodies that have roughness in the scene"
+            raise ValueError(f"{where}: got some for {body.called!r}, expected {expected}")
+        if name == "textures":
+            check.shape(where, array.shape, ("batch", "height", "width"))
+            if body.mesh.uvs is None:
+                raise ValueError(f"{where}: got an image, but the mesh has no uvs; expected None")
+            if not array.is_contiguous:
+                raise ValueError(f"{where}: got a strided array, expected a contiguous one")
+        else:
+            check.shape(where, array.shape, ("batch", 1 if array.shape[1:] == (1,) else body.mesh.vertex_count))
+        check.finite_arrays({where: array})
+        if name not in GLOSS:
+            self._warn_of_growth(where, array)
 
     def _warn_of_growth(self, name: str, values: wp.array) -> None:
         """Say, where the host need not wait for it, that more light is reflected than falls in; Python says it once."""
@@ -170,8 +159,11 @@ class Materials:
 
     def vertex_gloss(self, name: str) -> Node:
         """Node of the roughness of all vertices, or of their metallic or specular, float32 of shape [batch, vertex]."""
+        return self._of_vertices(name)
+
+    def _of_vertices(self, name: str) -> Node:
         counts = np.diff(self.merged_scene.first_vertex).tolist()
-        return Node("", lambda values: concatenate(values, counts), self.gloss[name])
+        return Node("", lambda arrays: concatenate(arrays, counts), self._inputs[name])
 
     @property
     def texture_of_face(self) -> wp.array:
@@ -217,7 +209,15 @@ class Materials:
         return Reflection(samples, self.vertex_albedo, *none)
 
 
-def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array]:
+def _arrays_of(given: Mapping[str, BodyArrays]) -> Iterator[tuple[str, int, wp.array]]:
+    """Arrays that are given, with their names and bodies."""
+    for name, arrays in given.items():
+        for number, array in enumerate(arrays or ()):
+            if array is not None:
+                yield name, number, array
+
+
+def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array | None]:
     """Roughness or the like of each body, float32 of shape [1, 1] or [1, vertex]."""
     values = (getattr(body, name) for body in merged_scene.scene.bodies)
     rows = [GLOSS_DEFAULTS[name] if value is None else value for value in values]

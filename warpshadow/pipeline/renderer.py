@@ -340,9 +340,8 @@ class SceneRenderer:
     ) -> Materials:
         """The scene's materials with others in their place, checked."""
         check.known_keys("gloss", gloss or {}, GLOSS)
-        shiny = {name: self.scene.per_body(values, name) for name, values in (gloss or {}).items()}
-        colors = self.scene.per_body(albedo, "albedo"), self.scene.per_body(textures, "textures")
-        return self._materials.replaced(*colors, shiny)
+        given = {"albedo": albedo, "textures": textures, **(gloss or {})}
+        return self._materials.replaced({name: self.scene.per_body(values, name) for name, values in given.items()})
 
     # ------------------------------------------------------------------------------------------ image
 

@@ -180,7 +180,7 @@ class View(LitPoints):
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         words, clip, fragments = self._samples, self.clip_positions, self.fragments_node
         lit, reflected = self.shading(light, materials), self.reflection(materials)
-        if materials.gloss:
+        if materials.roughness:
             samples = self._glossy(lit, light, materials, reflected.samples)
         elif reflected.pyramids.requires_grad and not (lit.requires_grad or clip.requires_grad):
             result = (Node("reflectance", None, idle="found with the radiance"),)
@@ -270,7 +270,7 @@ class View(LitPoints):
         division = Node("ratio", divide, *seen, items=self._samples, caches=False)
         drawn, inverse, rest = (Node("", operator.itemgetter(part), division, caches=False) for part in range(3))
         is_moving = self.clip_positions.requires_grad
-        parts = self._glossy(lit, light, materials, drawn) if materials.gloss else self._radiance(lit, drawn)
+        parts = self._glossy(lit, light, materials, drawn) if materials.roughness else self._radiance(lit, drawn)
         films = [self._averaged(item, is_moving=is_moving) for item in (parts, self._radiance(lit, inverse))]
         films.append(self._averaged(rest))
         if photograph is None:

@@ -32,7 +32,7 @@ def test_black_bodies_send_nothing(merged_scene):
     materials = Materials.of_scene(merged_scene)
     assert ScenePatches(merged_scene).senders(materials).bodies == (0, 1)
     given = [None, None, wp.zeros((1, 1), dtype=wp.vec3)]
-    assert ScenePatches(merged_scene).senders(materials.replaced(given, None)).bodies == (0, 1, 2)
+    assert ScenePatches(merged_scene).senders(materials.replaced({"albedo": given})).bodies == (0, 1, 2)
 
 
 def test_flat_bodies_have_a_grid_whose_back_nobody_sees(merged_scene):
@@ -87,7 +87,7 @@ def test_one_color_is_that_of_all_patches(merged_scene):
     patches = ScenePatches(merged_scene)
     materials = Materials.of_scene(merged_scene)
     given = wp.array([[(0.2, 0.3, 0.4)]], dtype=wp.vec3)
-    albedo = patches.albedo(materials.replaced([given, given, None], None), (0, 1)).value(Call(Clock()))
+    albedo = patches.albedo(materials.replaced({"albedo": [given, given, None]}), (0, 1)).value(Call(Clock()))
     np.testing.assert_allclose(albedo.numpy()[0], np.tile([0.2, 0.3, 0.4], (albedo.shape[1], 1)), rtol=1e-6)
 
 

@@ -171,7 +171,7 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     materials = view.materials
     if given == "light and colors":  # those that it has
         color = wp.array(np.atleast_2d(scene.bodies[2].albedo)[None], dtype=wp.vec3)
-        materials = materials.replaced([None, None, color], None)
+        materials = materials.replaced({"albedo": [None, None, color]})
     shading = view.shading(light, materials).value(view.call).numpy()[0]
     (factors,) = (node for name, (_, node) in view._cached.items() if name == "form factors")
     factors = factors.value(view.call)
