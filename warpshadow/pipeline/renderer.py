@@ -507,18 +507,18 @@ class SceneRenderer:
             float32 of shape [height, width, 3], or [camera, height, width, 3] where cameras were given. Not
             differentiable.
         """
-        arguments: dict[str, Any] = self._arguments
         if self.scene.bounces:
-            return SceneRenderer(**arguments | {"scene": replace(self.scene, bounces=0)}).shadow()
+            arguments: dict[str, Any] = self._arguments | {"scene": replace(self.scene, bounces=0)}
+            return SceneRenderer(**arguments).shadow()
         bodies = tuple(replace(body, blockers=0) for body in self.scene.bodies)
-        others = SceneRenderer(**arguments | {"scene": replace(self.scene, bodies=bodies)})
+        without_blockers = make_method(MergedScene(replace(self.scene, bodies=bodies), device=self.device), None)
         with unrecorded():
             view = self._scene_view
             call = self._views.call(view)
             receivers = Node("", Receivers.without_owners, view.receivers_node)
             none = tuple(empty((1, 0), dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.float32))
             spheres = Input("spheres", none)
-            free = LitPoints(others._method, others._materials, self._views.vertices, spheres, receivers, call)
+            free = LitPoints(without_blockers, self._materials, self._views.vertices, spheres, receivers, call)
             images = (view.white_image(item.shading(None)).value(call) for item in (view, free))
             received, unblocked = (image.numpy()[..., :3].copy() for image in images)
         ratio = np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)
