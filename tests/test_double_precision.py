@@ -323,6 +323,20 @@ def test_what_patches_show(double, planes, check, device):
     check(lambda n, t: areas.find_projected_areas(n, t, mean, directions), *rest)
 
 
+def test_how_much_sources_count(double, device, check):
+    sources, radiosity = double("stages.bounces.open_sources"), double("stages.bounces.radiosity")
+    directions, owners = double("maths.directions").fibonacci(16), np.array([0, 0, 2])
+    mean = radiosity.mean_over_sources(owners, np.array([0.3, 0.7, 1]), 3, device=device)
+    past_self = np.random.default_rng(1).random((1, 3, 16))
+
+    def shown(albedo, light, normals, past_self, past_all):
+        openness = sources.find_openness(normals, past_self, past_all, directions)
+        return radiosity.patch_radiosity(albedo, light, mean, sources.open_shares(openness, mean, owners))
+
+    colors = (wp.vec3d, random(2, 1, 3, 3)), (wp.vec3d, random(3, 2, 3, 3))
+    check(shown, *colors, (wp.vec3d, unit(random(4, 1, 3, 3))), (wp.float64, past_self), (wp.float64, past_self**2))
+
+
 def test_radiosity_and_self_light(double, device, check):
     sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")

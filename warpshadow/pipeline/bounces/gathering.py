@@ -36,6 +36,8 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
+import os
+_SOFT = float(os.environ.get("SOFT", 1.0))
 CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
@@ -335,7 +337,7 @@ class Gathering:
             expand_rows(cells.transmittance_spheres, count),
             cells.transmittance_self,
             cells.directions,
-            softness=self._visibility.softness,
+            softness=max(_SOFT, self._visibility.softness),
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
             clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,

@@ -38,10 +38,12 @@ def _reflect(
     radiosity[batch, patch] = wp.cw_mul(reflectance, light[instance_in(batch, light.shape[0]), patch])
 
 
-def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp.array:
+def patch_radiosity(
+    albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None
+) -> wp.array:
     """Radiosity of patches: albedo times the mean light of their sources.
 
-        B_p = a_p Σ_s w_ps (S_s + I_s)
+        B_p = a_p Σ_s w_ps f_s (S_s + I_s)
 
     A white patch under a radiance of 1 has radiosity 1, as receivers have.
 
@@ -49,16 +51,18 @@ def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix) -> wp
         albedo: Mean reflectance of each patch, vec3 of shape [batch, patch].
         light: Light that each source would reflect if it were white, direct and bounced, vec3 of shape [batch, source].
         mean: The weights w, from :func:`mean_over_sources`.
+        shares: f, how much each source counts, vec3 of shape [batch, source], from :func:`.open_sources.open_shares`;
+            None for 1.
     Returns:
-        vec3 of shape [batch, patch]; the batch of albedo or light may be 1, and then serves every instance.
-    Differentiable: albedo, light.
+        vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
+    Differentiable: albedo, light, shares.
     """
     check.shape("albedo", albedo.shape, ("batch", mean.shape[0]))
-    return reflect(albedo, multiply(mean, light))
+    return reflect(albedo, multiply(mean, light if shares is None else reflect(shares, light)))
 
 
 def reflect(albedo: wp.array, light: wp.array) -> wp.array:
-    """Radiosity of patches: albedo times mean light, vec3 of shape [batch, patch]; a batch of 1 serves every instance.
+    """Albedo times light, of patches or points: vec3 of shape [batch, patch]; a batch of 1 serves every instance.
 
     Differentiable: albedo, light.
     """

@@ -1,0 +1,64 @@
+"""How much sources count in their patches: against float64 NumPy, differences of it, and cases with known answers."""
+
+import numpy as np
+import pytest
+import warp as wp
+from test_projected_areas import DIRECTIONS, compare
+
+from warpshadow.stages.bounces.open_sources import find_openness, open_shares
+from warpshadow.stages.bounces.radiosity import mean_over_sources, patch_radiosity
+
+pytestmark = pytest.mark.usefixtures("poisoned_outputs")
+
+HIDDEN = 0.01
+PATCHES, WEIGHTS = np.array([0, 0, 2, 2, 2]), np.array([0.4, 0.6, 0.5, 0.2, 0.3])
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def twin(normals, past_self, past_all):
+    cosines = 4 / len(DIRECTIONS) * np.maximum(normals @ DIRECTIONS.T, 0)
+    openness = ((cosines * past_all).sum(axis=1) + HIDDEN) / ((cosines * past_self).sum(axis=1) + HIDDEN)
+    sums = np.bincount(PATCHES, WEIGHTS * openness)
+    return np.repeat((openness / sums[PATCHES])[:, None], 3, axis=1)
+
+
+def shares(normals, past_self, past_all, device):
+    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
+    return open_shares(find_openness(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
+
+
+def test_shares_of_sources_are_those_of_the_twin(device):
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(5, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    past_self = rng.random((5, 32))
+    values = [normals, past_self, past_self * rng.random((5, 32))]
+    compare(lambda *arrays: shares(*arrays, device), twin, values, (wp.vec3, wp.float32, wp.float32), device)
+
+
+@pytest.mark.parametrize("has_self", [True, False])
+def test_a_buried_source_hardly_darkens_its_patch(has_self, device):
+    """Sources 1 and 4 are black inside another body, the others stand free."""
+    normals = wp.array(np.tile(UP, (1, 5, 1)), dtype=wp.vec3, device=device)
+    is_free = np.float32([1, 0, 1, 1, 0])
+    past_all = wp.array(np.tile(is_free[None, :, None], (1, 1, 32)), dtype=wp.float32, device=device)
+    past_self = wp.full((1, 5, 32), 1.0, dtype=wp.float32, device=device) if has_self else None
+    light = wp.array(is_free[None, :, None] * np.ones(3), dtype=wp.vec3, device=device)
+    white = wp.full((1, 3), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    mean = mean_over_sources(PATCHES, WEIGHTS, 3, device=device)
+    weighted = patch_radiosity(white, light, mean, shares(normals, past_self, past_all, device)).numpy()[0, :, 0]
+    np.testing.assert_allclose(weighted, [1, 0, 1], atol=0.02)
+    np.testing.assert_allclose(patch_radiosity(white, light, mean).numpy()[0, :, 0], [0.4, 0, 0.7], atol=1e-6)
+
+
+def test_of_a_patch_that_is_buried_wholly_all_sources_count(device):
+    normals = wp.array(np.tile(UP, (1, 5, 1)), dtype=wp.vec3, device=device)
+    nothing = wp.zeros((1, 5, 32), dtype=wp.float32, device=device)
+    np.testing.assert_allclose(shares(normals, None, nothing, device).numpy(), 1, rtol=1e-5)
+
+
+def test_what_does_not_fit_is_refused(device):
+    normals = wp.zeros((1, 5), dtype=wp.vec3, device=device)
+    passing = wp.zeros((1, 5, 8), dtype=wp.float32, device=device)
+    with pytest.raises(ValueError, match=r"transmittance_spheres: got shape \(1, 5, 8\), expected \[batch, 5, 32\]"):
+        find_openness(normals, None, passing, DIRECTIONS)
