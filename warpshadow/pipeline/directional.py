@@ -35,6 +35,7 @@ from warpshadow.stages.cached_cells import CachedRows, cell_transfer, light_cell
 from warpshadow.stages.gloss.reflection import blocked_radiance
 from warpshadow.stages.gloss.transmittance import transmittance_towards
 from warpshadow.stages.light_samples import CellSamples, cell_samples, even_samples, sample_map
+from warpshadow.stages.planes.partial_cells import SAMPLES, coverage_of_light
 from warpshadow.stages.planes.transmittance import plane_coverage, transmittance_past_planes
 from warpshadow.stages.ray_tracing import trace_cells
 from warpshadow.stages.receivers import Receivers
@@ -61,6 +62,7 @@ class ProjectedCells(NamedTuple):
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
+    samples: np.ndarray | None = None  # directions drawn from known light in its cells [direction, sample, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
 
 
@@ -86,9 +88,18 @@ class Directional(SphereMethod):
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
+        samples = self._samples(cells.directions, power, draw) if self.plane_blockers else None
         return ProjectedCells(
-            cells.directions, self._on_device(cells.radiance), cells.spots, cells.spreads, *sharp_cells, sun
+            cells.directions, self._on_device(cells.radiance), cells.spots, cells.spreads, *sharp_cells, samples, sun
         )
+
+    def _samples(
+        self, directions: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
+    ) -> np.ndarray:
+        """Directions drawn from the light of each cell, [direction, sample, 3]: of dark cells, all the same."""
+        samples, lit = np.repeat(directions[:, None], SAMPLES, axis=1), np.flatnonzero(power > 0)
+        samples[lit] = draw(lit, SAMPLES)
+        return samples
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return wp.array(coefficients[None], dtype=wp.vec3, device=self.merged_scene.device)
@@ -172,6 +183,17 @@ class Directional(SphereMethod):
         covered = cover(projected_light.directions)
         if covered is None:
             return seen
+        if projected_light.samples is not None:
+            covered = coverage_of_light(
+                points,
+                covered,
+                planes.frames,
+                planes.planes,
+                projected_light.samples,
+                facing=facing,
+                fronts=fronts,
+                skip=planes.skip,
+            )
         if projected_light.sharp_cells_past_planes is not None:
             directions, places, scale = projected_light.sharp_cells_past_planes
             # a plane has its own edges: they need no room for the rest of a cell, as spheres do not

@@ -53,7 +53,7 @@ class _Covered:
 
 
 @wp.func
-def _cover(
+def cover(
     scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, is_back: bool, direction: wp.vec3, presence: float
 ):
     """Coverage of a cell by a side of a plane, for the visible part of the cell."""
@@ -72,7 +72,7 @@ def _cover(
 
 
 @wp.func
-def _cover_adjoint(
+def cover_adjoint(
     scene: PlaneArrays,
     grid: PlaneGrid,
     place: ReceiverInPlane,
@@ -108,7 +108,7 @@ def _cover_adjoint(
 
 
 @wp.func
-def _normal(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
+def normal_of(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
     """Where a receiver looks; 0 for one that looks everywhere."""
     if facing:
         return facing[instance_in(batch, facing.shape[0]), receiver]
@@ -116,7 +116,7 @@ def _normal(facing: wp.array2d(dtype=wp.vec3), batch: int, receiver: int):
 
 
 @wp.func
-def _looks(normal: wp.vec3, direction: wp.vec3):
+def looks(normal: wp.vec3, direction: wp.vec3):
     """Whether it looks towards a direction."""
     return wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
 
@@ -143,15 +143,15 @@ def _add_coverage(
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
-    normal = _normal(facing, batch, receiver)
+    normal = normal_of(facing, batch, receiver)
     for q in range(directions.shape[0]):
         direction = directions[q]
         part = float(0.0)
         if covered:
             part = covered[batch, receiver, q]
-        if exists and part < 1.0 and _looks(normal, direction):
-            part += _cover(scene, grid, place, False, direction, front).coverage
-            part += _cover(scene, grid, place, True, direction, 1.0 - front).coverage
+        if exists and part < 1.0 and looks(normal, direction):
+            part += cover(scene, grid, place, False, direction, front).coverage
+            part += cover(scene, grid, place, True, direction, 1.0 - front).coverage
         result[batch, receiver, q] = part
 
 
@@ -184,7 +184,7 @@ def _add_coverage_adjoint(
     exists = wp.length_sq(place.normal) > 0.0
     grid = scene.grids[f]
     front = front_of(fronts, grid, place.at[2], batch, receiver, f)
-    normal = _normal(facing, batch, receiver)
+    normal = normal_of(facing, batch, receiver)
     adj_place = ReceiverInPlane()
     adj_front = float(0.0)
     for q in range(directions.shape[0]):
@@ -193,12 +193,12 @@ def _add_coverage_adjoint(
         part = float(0.0)
         if covered:
             part = covered[batch, receiver, q]
-        if exists and adj != 0.0 and part < 1.0 and _looks(normal, direction):
+        if exists and adj != 0.0 and part < 1.0 and looks(normal, direction):
             for side in range(2):
                 is_back, presence = side == 1, wp.where(side == 1, 1.0 - front, front)
-                result = _cover(scene, grid, place, is_back, direction, presence)
+                result = cover(scene, grid, place, is_back, direction, presence)
                 if result.coverage > 0.0 and result.coverage < 1.0:  # a cell that is covered wholly stays so
-                    adj_place, adj_presence = _cover_adjoint(
+                    adj_place, adj_presence = cover_adjoint(
                         scene, grid, place, is_back, direction, presence, result, adj, adj_place
                     )
                     adj_front += wp.where(is_back, -adj_presence, adj_presence)
