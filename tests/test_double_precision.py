@@ -284,6 +284,15 @@ def test_transmittance_past_planes(double, planes, check):
     check(lambda p, t, f: past.transmittance_past_planes(t, past.plane_coverage(p, f, planes, directions)), *given)
 
 
+def test_coverage_of_light_in_cells(double, planes, check):
+    directions = double("maths.directions").fibonacci(16)
+    find = double("stages.planes.partial_cells").coverage_of_light
+    samples = unit(directions[:, None] + 0.2 * random(4, 16, 4, 3))
+    covered = np.random.default_rng(1).uniform(-0.1, 1.1, size=(1, 3, 16))
+    given = (wp.vec3d, plane_receivers()[0]), (wp.float64, covered), (wp.vec3d, FRAMES)
+    check(lambda p, c, f: find(p, c, f, planes, samples), *given)
+
+
 def test_transmittance_past_convex_parts(double, check, device):
     """A wedge and a tetrahedron, which share a body, and a second tetrahedron."""
     module, find = double("stages.convex.prepared"), double("maths.convex").find_convex_parts

@@ -74,16 +74,17 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize(("bounces", "tolerance"), [(0, 0.01), (1, 0.15)])  # measured with a bounce: 10%
+@pytest.mark.parametrize("bounces", [0, 1])
 @pytest.mark.parametrize("moving", [None, ["table"], ["ball"]], ids=["all", "table", "ball"])
 @pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
-def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces, tolerance):
-    """No pixel shows another body, so no rasterizer takes part."""
+def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces):
+    """No pixel shows another body, so no rasterizer takes part; where light bounces none touches another: it would jump."""
     if moving and bounces:
         pytest.skip("where light bounces nothing of static bodies is cached")
     camera = ws.Camera.look_at((0, 1.5, 2.2), (0, 0, 1.4), fov_y=20, size=(24, 24))
-    scene = scene_of(mesh, bounces=bounces)
-    renderer = TorchRenderer(dataclasses.replace(scene, camera=camera))
+    table, ball, floor = (scene := scene_of(mesh, bounces=bounces)).bodies
+    bodies = [table, dataclasses.replace(ball, translation=(0.3, 1.9 if bounces else 1.1, 0.1)), floor]
+    renderer = TorchRenderer(dataclasses.replace(scene, bodies=bodies, camera=camera))
     assert (renderer.warp.body_ids() == 2).all()
     rotations, translations, scales = renderer.scene_poses()
     step = torch.from_numpy(MOVES["table" if moving is None else moving[0]])
@@ -92,11 +93,11 @@ def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces,
         geometry = renderer.placed(rotations, translations + shift * step, scales, moving=moving)
         return (renderer(geometry=geometry)[..., :3].double() * torch.linspace(0, 1, 24)[:, None]).sum()
 
-    shift = torch.tensor(0.5, requires_grad=True)
+    shift = torch.tensor(0.4, requires_grad=True)
     loss(shift).backward()
     with torch.no_grad():
-        ends = [float(loss(torch.tensor(0.5 + sign * STEP))) for sign in (1, -1)]
-    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=tolerance)
+        ends = [float(loss(torch.tensor(0.4 + sign * STEP))) for sign in (1, -1)]
+    assert float(shift.grad) == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=0.01)  # measured: 0.002
 
 
 def test_a_table_whose_shape_is_free_blocks_by_spheres():

@@ -36,10 +36,14 @@ from warpshadow.stages.receivers import Receivers
 from warpshadow.stages.visibility.directional import transmittance
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
-import os
-_SOFT = float(os.environ.get("SOFT", 1.0))
 CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
+
+_SOFTNESS = 1.0
+"""κ of proxies, at least: they reach as far as a cell of radius ρ does. Bodies block cells by other shapes than these, by
+convex parts or by fewer spheres. By κ = 0.35 cells which they blocked had no proxy in them, and lost 1 to 5% of the
+light from others in a shelf of books; and as a proxy came or went, light jumped: gradients of poses were up to twice as
+large as differences of images, now they are within 2%. It takes 1.1 times as long."""
 
 
 class CellTransmittance(NamedTuple):
@@ -337,7 +341,7 @@ class Gathering:
             expand_rows(cells.transmittance_spheres, count),
             cells.transmittance_self,
             cells.directions,
-            softness=max(_SOFT, self._visibility.softness),
+            softness=max(_SOFTNESS, self._visibility.softness),
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
             clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,
