@@ -284,13 +284,27 @@ def test_transmittance_past_planes(double, planes, check):
     check(lambda p, t, f: past.transmittance_past_planes(t, past.plane_coverage(p, f, planes, directions)), *given)
 
 
-def test_coverage_of_light_in_cells(double, planes, check):
-    directions = double("maths.directions").fibonacci(16)
+@pytest.fixture
+def holed_planes(double, device):
+    """A triangle, which leaves half of its rectangle open, and a square."""
+    square = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
+    faces, find = np.int32([[0, 1, 2], [0, 2, 3]]), double("stages.bounces.patches").find_plane_patches
+    module = double("stages.planes.prepared")
+    bodies = []
+    for number, own in enumerate((faces[:1], faces)):
+        patches = find(square, own, is_two_sided=False)
+        bodies.append(module.PlaneBody(patches.grid, square, own, 4 * number, 0, True))
+    return module.PlaneBlockers.of(bodies, 0, 8, device=device)
+
+
+@pytest.mark.parametrize("name", ["planes", "holed_planes"])
+def test_coverage_of_light_in_cells(name, double, request, check):
+    planes, directions = request.getfixturevalue(name), double("maths.directions").fibonacci(16)
     find = double("stages.planes.partial_cells").coverage_of_light
-    samples = unit(directions[:, None] + 0.2 * random(4, 16, 4, 3))
+    samples = unit(directions[:, None] + 0.2 * random(4, 16, 8, 3))
     covered = np.random.default_rng(1).uniform(-0.1, 1.1, size=(1, 3, 16))
     given = (wp.vec3d, plane_receivers()[0]), (wp.float64, covered), (wp.vec3d, FRAMES)
-    check(lambda p, c, f: find(p, c, f, planes, samples), *given)
+    check(lambda p, c, f: find(p, c, f, planes, directions, samples), *given)
 
 
 def test_transmittance_past_convex_parts(double, check, device):

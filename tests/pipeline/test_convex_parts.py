@@ -78,7 +78,10 @@ MOVES = {
 @pytest.mark.parametrize("moving", [None, ["table"], ["ball"]], ids=["all", "table", "ball"])
 @pytest.mark.parametrize("mesh", [TABLE, AWNING], ids=["table", "awning"])
 def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces):
-    """No pixel shows another body, so no rasterizer takes part; where light bounces none touches another: it would jump."""
+    """No pixel shows another body, so no rasterizer takes part.
+
+    Where light bounces no body touches another: light of a patch jumps as one of its sources enters a part.
+    """
     if moving and bounces:
         pytest.skip("where light bounces nothing of static bodies is cached")
     camera = ws.Camera.look_at((0, 1.5, 2.2), (0, 0, 1.4), fov_y=20, size=(24, 24))

@@ -1,10 +1,7 @@
-"""Cells that planes cover in part, by the light in them: against coverage of each direction alone, and paths of rays."""
-
-import dataclasses
+"""Cells that planes cover in part, by where their light is: against coverage of each direction alone, and rays."""
 
 import numpy as np
 import pytest
-import warp as wp
 from test_plane_light import DIRECTIONS, Setting
 
 import warpshadow as ws
@@ -19,36 +16,45 @@ FLOAT32 = 2e-5
 
 
 def samples_of_cells():
-    """Four directions in each cell."""
-    drawn = DIRECTIONS[:, None] + np.random.default_rng(3).normal(scale=0.08, size=(len(DIRECTIONS), 4, 3))
+    """Four directions in a part of each cell, and four in all of it."""
+    rng = np.random.default_rng(3)
+    drawn = [DIRECTIONS[:, None] + rng.normal(scale=scale, size=(len(DIRECTIONS), 4, 3)) for scale in (0.05, 0.1)]
+    drawn[0] += 0.1 * rng.normal(size=(len(DIRECTIONS), 1, 3))
+    drawn = np.concatenate(drawn, axis=1)
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("skip", [None, 1])
 @pytest.mark.parametrize("is_facing", [False, True])
-def test_coverage_of_light_is_the_mean_over_directions_where_cells_are_covered_in_part(skip, is_facing, device):
-    setting = Setting(device, blocks=(True, False, True))
+@pytest.mark.parametrize("names", [("ground", "wall"), ("l",)])
+def test_coverage_is_moved_by_where_light_is_in_cells_that_are_covered_in_part(names, skip, is_facing, device):
+    """Of planes without holes against even directions, of others against the whole cell."""
+    setting = Setting(device, names=names, blocks=(True,) * len(names))
+    skip = skip if len(names) > 1 else None
     points, normals, _, vertices, _ = setting.arrays()
     frames, samples = setting.planes.frames(vertices), samples_of_cells()
+    assert setting.planes.has_holes == (names == ("l",))
     options = {"facing": normals if is_facing else None, "skip": skip}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
-    found = coverage_of_light(points, covered, frames, setting.planes, samples, **options).numpy()
-    small = cell_radius(samples[..., 0].size)
-    each = plane_coverage(points, frames, setting.planes, samples.reshape(-1, 3), radius=small, **options).numpy()
-    means = np.minimum(each.reshape(*found.shape, 4), 1).mean(axis=-1)
-    coverage = covered.numpy()
+    found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
+    coverage, means = covered.numpy(), []
+    small = cell_radius(4 * len(DIRECTIONS))
+    for drawn in (samples[:, :4], samples[:, 4:]):
+        each = plane_coverage(points, frames, setting.planes, drawn.reshape(-1, 3), radius=small, **options).numpy()
+        means.append(np.minimum(each.reshape(*found.shape, 4), 1).mean(axis=-1))
     gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1)
-    np.testing.assert_allclose(found, coverage + gate * (means - coverage), atol=FLOAT32)
-    assert (np.abs(found - coverage) > 0.1).sum() > 5
+    wanted = coverage + gate * (means[0] - (np.minimum(coverage, 1) if setting.planes.has_holes else means[1]))
+    np.testing.assert_allclose(found, np.where(gate > 0, np.clip(wanted, 0, 1), coverage), atol=FLOAT32)
+    assert (np.abs(found - coverage) > 0.1).sum() > 3
 
 
-def test_samples_of_a_cell_are_four(device):
+def test_directions_of_a_cell_are_eight(device):
     setting = Setting(device)
     points, _, _, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS)
-    with pytest.raises(ValueError, match=r"samples: got shape \(64, 2, 3\), expected \[direction, 4, 3\]"):
-        coverage_of_light(points, covered, frames, setting.planes, samples_of_cells()[:, :2])
+    with pytest.raises(ValueError, match=r"samples: got shape \(64, 4, 3\), expected \[64, 8, 3\]"):
+        coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples_of_cells()[:, :4])
 
 
 def behind_a_window(**visibility):

@@ -62,7 +62,7 @@ class ProjectedCells(NamedTuple):
     spreads: np.ndarray | None = None  # half-angles of where known light comes from in its cells [direction]
     sharp_cells: SharpCells | None = None  # cells that a sun is in, where spheres block it
     sharp_cells_past_planes: SharpCells | None = None  # and where planes do
-    samples: np.ndarray | None = None  # directions drawn from known light in its cells [direction, sample, 3]
+    samples: np.ndarray | None = None  # directions drawn from known light in its cells, and even ones [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
 
 
@@ -88,18 +88,19 @@ class Directional(SphereMethod):
         draw = functools.partial(draw_in_cells, known.radiance, self._directions)
         sun = find_sun_cells(power, draw) if self.self_visibility.wants_rays else None
         sharp_cells = find(), find(WIDEST_PAST_PLANES)
-        samples = self._samples(cells.directions, power, draw) if self.plane_blockers else None
+        samples = self._samples(known.radiance, power, draw) if self.plane_blockers else None
         return ProjectedCells(
             cells.directions, self._on_device(cells.radiance), cells.spots, cells.spreads, *sharp_cells, samples, sun
         )
 
     def _samples(
-        self, directions: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
+        self, radiance: np.ndarray, power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarray]
     ) -> np.ndarray:
-        """Directions drawn from the light of each cell, [direction, sample, 3]: of dark cells, all the same."""
-        samples, lit = np.repeat(directions[:, None], SAMPLES, axis=1), np.flatnonzero(power > 0)
-        samples[lit] = draw(lit, SAMPLES)
-        return samples
+        """Directions drawn from the light of each cell, and even ones in it, [direction, 8, 3]; the same if dark."""
+        even = draw_in_cells(np.ones_like(radiance), self._directions, np.arange(len(power)), SAMPLES)
+        drawn, lit = even.copy(), np.flatnonzero(power > 0)
+        drawn[lit] = draw(lit, SAMPLES)
+        return np.concatenate([drawn, even], axis=1)
 
     def _on_device(self, coefficients: np.ndarray) -> wp.array:
         return wp.array(coefficients[None], dtype=wp.vec3, device=self.merged_scene.device)
@@ -183,12 +184,13 @@ class Directional(SphereMethod):
         covered = cover(projected_light.directions)
         if covered is None:
             return seen
-        if projected_light.samples is not None:
+        if projected_light.samples is not None and planes.planes.has_holes:
             covered = coverage_of_light(
                 points,
                 covered,
                 planes.frames,
                 planes.planes,
+                projected_light.directions,
                 projected_light.samples,
                 facing=facing,
                 fronts=fronts,

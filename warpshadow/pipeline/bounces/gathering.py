@@ -39,11 +39,11 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 CELLS = fibonacci(64)  # where receivers look for bounced light if direct light is found in harmonics
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
-_SOFTNESS = 1.0
-"""κ of proxies, at least: they reach as far as a cell of radius ρ does. Bodies block cells by other shapes than these, by
-convex parts or by fewer spheres. By κ = 0.35 cells which they blocked had no proxy in them, and lost 1 to 5% of the
-light from others in a shelf of books; and as a proxy came or went, light jumped: gradients of poses were up to twice as
-large as differences of images, now they are within 2%. It takes 1.1 times as long."""
+_SOFTNESS_OF_PARTS = 1.0
+"""κ of proxies where convex parts block, at least: parts are seen by all of a cell's disc, of radius ρ. By κ = 0.35 some
+cells that parts blocked had no proxy in them, which lost 1 to 5% of the light from other bodies in a shelf of books.
+And as a proxy came or went, light jumped: a table's gradient was up to twice as large as differences of images, and is
+1% off. It takes 1.1 times as long."""
 
 
 class CellTransmittance(NamedTuple):
@@ -329,6 +329,9 @@ class Gathering:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
         shown, proxy_radiance = outgoing.shown, outgoing.proxy_radiance
+        softness = self._visibility.softness
+        if group.parts_around is not None:
+            softness = max(softness, _SOFTNESS_OF_PARTS)
         count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": shown.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
         centers, radii = expand(shown.centers, count), expand(shown.radii, count)
@@ -341,7 +344,7 @@ class Gathering:
             expand_rows(cells.transmittance_spheres, count),
             cells.transmittance_self,
             cells.directions,
-            softness=max(_SOFTNESS, self._visibility.softness),
+            softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
             clusters=shown.clusters if radii is shown.radii and centers is shown.centers else None,

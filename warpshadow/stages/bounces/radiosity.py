@@ -38,9 +38,7 @@ def _reflect(
     radiosity[batch, patch] = wp.cw_mul(reflectance, light[instance_in(batch, light.shape[0]), patch])
 
 
-def patch_radiosity(
-    albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None
-) -> wp.array:
+def patch_radiosity(albedo: wp.array, light: wp.array, mean: SparseMatrix, shares: wp.array | None = None) -> wp.array:
     """Radiosity of patches: albedo times the mean light of their sources.
 
         B_p = a_p Σ_s w_ps f_s (S_s + I_s)

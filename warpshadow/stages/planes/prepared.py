@@ -60,6 +60,7 @@ class PlaneBlockers:
         covered: Coverage of each texel by the mesh, in all three components, vec3 of shape [texel].
         texels_of_patches: Matrix of mip levels, [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
+        has_holes: Whether a mesh of the plane blockers leaves a part of its rectangle open, as a window.
     """
 
     count: int
@@ -70,6 +71,7 @@ class PlaneBlockers:
     covered: wp.array
     texels_of_patches: SparseMatrix | None
     frames_of_vertices: SparseMatrix
+    has_holes: bool
 
     @staticmethod
     def of(bodies: Sequence[PlaneBody], patch_count: int, vertex_count: int, *, device: wp.DeviceLike) -> PlaneBlockers:
@@ -102,6 +104,7 @@ class PlaneBlockers:
             wp.array(np.repeat(np.concatenate(covered)[:, None], 3, axis=1), dtype=wp.vec3, device=device),
             SparseMatrix.of(vstack(pyramids), device=device) if patch_count else None,
             SparseMatrix.of(vstack(frames), device=device),
+            any(body.blocks and (body.grid.covered < 1).any() for body in bodies),
         )
 
     def frames(self, positions: wp.array) -> wp.array:

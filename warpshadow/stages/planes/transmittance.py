@@ -44,7 +44,7 @@ _PASS_COST = 0.4  # time of a cell that is only multiplied [ns]
 
 
 @wp.struct
-class _Covered:
+class PlaneCover:
     """Coverage of a cell by a side."""
 
     coverage: float
@@ -57,7 +57,7 @@ def cover(
     scene: PlaneArrays, grid: PlaneGrid, place: ReceiverInPlane, is_back: bool, direction: wp.vec3, presence: float
 ):
     """Coverage of a cell by a side of a plane, for the visible part of the cell."""
-    covered = _Covered()
+    covered = PlaneCover()
     cosine = wp.dot(direction, place.normal)
     if presence > 0.0 and wp.where(is_back, cosine, -cosine) > -scene.radius:
         covered.footprint = find_footprint(
@@ -79,7 +79,7 @@ def cover_adjoint(
     is_back: bool,
     direction: wp.vec3,
     presence: float,
-    covered: _Covered,
+    covered: PlaneCover,
     adj: float,
     adj_place: ReceiverInPlane,
 ):
