@@ -44,7 +44,7 @@ def enough_spheres(
     """How many spheres a body needs, a power of two from 8 to 1024.
 
     The error of short fits of 8, 32, 128 and 512 spheres falls with their number. Taken is where it is small enough, or
-    where it falls no longer.
+    where it falls no longer and the shadow is whole.
 
     Args:
         mesh, receivers, seed: The mesh to fit, its receivers, and the seed of random choices.
@@ -68,7 +68,7 @@ def enough_spheres(
         if stalls and before[1] <= RAGGED:
             return count // 2
         before = error, shadow_error
-    return TRIED[-1] if stalls else MOST_SPHERES
+    return TRIED[-1] if stalls and before[1] <= RAGGED else MOST_SPHERES
 
 
 def _errors(judge: Refinement, spheres: np.ndarray) -> tuple[float, float]:

@@ -31,7 +31,7 @@ from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.spheres.refine import Descended, Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
-ALGORITHM_VERSION = 10
+ALGORITHM_VERSION = 11
 """Part of the key of cached fits: raise it whenever a fit would come out differently."""
 
 COVER_STEPS = 200
