@@ -26,6 +26,22 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not names.intersection(HEAVY)
 
 
+METHODS = {f"warpshadow.pipeline.{name}" for name in ("directional", "log_sh", "rays")}
+
+STILL = """
+import warpshadow as ws
+camera = ws.Camera.look_at((0, 0, 5), (0, 0, 0), size=(8, 8))
+ws.render(ws.Scene([ws.Body(ws.icosphere(1.0, 1))], ws.EnvironmentMap.constant(), camera), progress=False)
+""".strip().replace("\n", "; ")
+
+
+@pytest.mark.slow
+def test_a_method_of_visibility_is_imported_when_a_scene_asks_for_it():
+    renderer_and_stages = {"warpshadow.pipeline.renderer", "warpshadow.stages.facade"}
+    assert not modules_after("import warpshadow").intersection(METHODS | renderer_and_stages)
+    assert modules_after(STILL).intersection(METHODS) == {"warpshadow.pipeline.rays"}
+
+
 @pytest.mark.slow
 def test_importing_the_package_does_not_start_warp():
     """Which looks for devices and loads its compiler: half a second that a first kernel pays for."""

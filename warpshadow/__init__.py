@@ -4,6 +4,9 @@ In all functions ``device`` is Warp's device to compute on, and ``progress`` sho
 than a second.
 """
 
+import importlib as _importlib
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 from warpshadow import check as _check
 from warpshadow.assets.basis import CellBasis, HarmonicBasis
 from warpshadow.assets.camera import Camera
@@ -23,18 +26,31 @@ from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.geometry import Geometry
-from warpshadow.pipeline.layers import Layers
 from warpshadow.scene.camera_path import CameraPath, Keyframe
 from warpshadow.scene.files import SceneError, load_scene, write_scene
 from warpshadow.scene.mesh_scene import default_scene
 from warpshadow.scene.scene import Body, Scene, Visibility
 from warpshadow.spheres import Spheres, fit_spheres
-from warpshadow.tuning.insert import insert
-from warpshadow.tuning.renderer import Renderer, render
-from warpshadow.tuning.tune import Tuning, tune
-from warpshadow.viewer import view
+
+if _TYPE_CHECKING:
+    from warpshadow.pipeline.layers import Layers
+    from warpshadow.tuning.insert import insert
+    from warpshadow.tuning.renderer import Renderer, render
+    from warpshadow.tuning.tune import Tuning, tune
+    from warpshadow.viewer import view
 
 __version__ = "0.1.0"
+
+_MODULES = {
+    "Layers": "pipeline.layers",
+    "Renderer": "tuning.renderer",
+    "Tuning": "tuning.tune",
+    "insert": "tuning.insert",
+    "render": "tuning.renderer",
+    "tune": "tuning.tune",
+    "view": "viewer",
+}
+"""Where names are that stand on kernels: each is imported when it is first asked for."""
 
 __all__ = [
     "Body",
@@ -94,3 +110,9 @@ def quiet(*, progress: bool = True) -> None:
     """
     _show_bars(_check.flag("progress", progress))
     _start_quietly()
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'warpshadow' has no attribute {name!r}")
+    return getattr(_importlib.import_module(f"warpshadow.{_MODULES[name]}"), name)
