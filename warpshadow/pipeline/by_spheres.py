@@ -90,7 +90,7 @@ class SphereMethod(Method):
         return ()
 
     def blockers(self, blocking: Blocking, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
-        """What blocks light among bodies, given how they do, their vertices and spheres. Differentiable: arrays."""
+        """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
         owners = self.planes, self.parts, self.self_visibility, self.visibility.merging
         frames = self.planes.frames(blocking.planes, positions) if blocking.planes else None
         placed = self.parts.placed(blocking.convex, positions) if blocking.convex else None

@@ -98,7 +98,7 @@ class Transmittance(NamedTuple):
 
 
 class Blockers(NamedTuple):
-    """What blocks light in a geometry, in the world."""
+    """The blockers of a geometry, where they are in the world."""
 
     merged_scene: MergedScene
     blocking: Blocking
@@ -124,19 +124,19 @@ class Blockers(NamedTuple):
         """All bodies."""
         return range(len(self.merged_scene.scene.bodies))
 
-    def planes_around(self, body: int = -1, among: Iterable[int] | None = None) -> PlanesOfGroup | None:
+    def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PlanesOfGroup | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocking.planes
-        named = planes if among is None else tuple(number for number in planes if number in among)
+        named = planes if of_bodies is None else tuple(number for number in planes if number in of_bodies)
         if self.frames is None or not set(named) - {body}:
             return None
         skip = planes.index(body) if body in planes else None
         return PlanesOfGroup(self.planes.among(planes, named), self.frames, skip)
 
-    def parts_around(self, body: int = -1, among: Iterable[int] | None = None) -> PartsOfGroup | None:
+    def parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> PartsOfGroup | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocking.convex
-        named = bodies if among is None else tuple(number for number in bodies if number in among)
+        named = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
         if self.placed is None or not set(named) - {body}:
             return None
         skip = bodies.index(body) if body in bodies else None
@@ -171,7 +171,7 @@ def find_groups(
         return groups
     assert static_normals is not None
     moving, facing = points.static.moving, points.static.receivers(receivers.on_static, static_normals)
-    planes, parts = blockers.planes_around(among=moving), blockers.parts_around(among=moving)
+    planes, parts = blockers.planes_around(of_bodies=moving), blockers.parts_around(of_bodies=moving)
     group = Group(*facing, *blockers.spheres_of(moving), cached_rows, planes=planes, parts_around=parts)
     return [group, *groups] if receivers.points.shape[1] else [group]
 

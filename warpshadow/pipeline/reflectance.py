@@ -105,14 +105,14 @@ class Materials:
         body = self.merged_scene.scene.bodies[number]
         return not np.any(body.albedo if body.texture is None else body.texture)
 
-    def replaced(self, given: Mapping[str, BodyArrays]) -> "Materials":
+    def replaced(self, replacements: Mapping[str, BodyArrays]) -> "Materials":
         """A copy with other arrays of some bodies, by name, checked; nodes of the others are shared.
 
         An albedo takes the place of a texture, too. Itself where nothing is given.
         """
         values = {name: list(source.value()) for name, source in self._inputs.items()}
-        colored = {number for name, number, _ in _arrays_of(given) if name == "albedo"}
-        for name, number, array in _arrays_of(given):
+        colored = {number for name, number, _ in _arrays_of(replacements) if name == "albedo"}
+        for name, number, array in _arrays_of(replacements):
             self._check(name, number, array)
             if name == "textures" and number in colored:
                 raise ValueError(f"albedo[{number}], textures[{number}]: got both, expected one of them")
@@ -209,9 +209,9 @@ class Materials:
         return Reflection(samples, self.vertex_albedo, *none)
 
 
-def _arrays_of(given: Mapping[str, BodyArrays]) -> Iterator[tuple[str, int, wp.array]]:
-    """Arrays that are given, with their names and bodies."""
-    for name, arrays in given.items():
+def _arrays_of(replacements: Mapping[str, BodyArrays]) -> Iterator[tuple[str, int, wp.array]]:
+    """Arrays in the place of others, with their names and bodies."""
+    for name, arrays in replacements.items():
         for number, array in enumerate(arrays or ()):
             if array is not None:
                 yield name, number, array

@@ -340,8 +340,10 @@ class SceneRenderer:
     ) -> Materials:
         """The scene's materials with others in their place, checked."""
         check.known_keys("gloss", gloss or {}, GLOSS)
-        given = {"albedo": albedo, "textures": textures, **(gloss or {})}
-        return self._materials.replaced({name: self.scene.per_body(values, name) for name, values in given.items()})
+        replacements = {"albedo": albedo, "textures": textures, **(gloss or {})}
+        return self._materials.replaced(
+            {name: self.scene.per_body(values, name) for name, values in replacements.items()}
+        )
 
     # ------------------------------------------------------------------------------------------ image
 

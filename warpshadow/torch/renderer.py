@@ -288,7 +288,7 @@ class TorchRenderer(torch.nn.Module):
     def _of_body(
         self, name: str, number: int, tensor: torch.Tensor
     ) -> tuple[torch.Tensor, type, tuple[int | str, ...], str]:
-        """What is given for a body: rows of items, their dtype, the shape to expect, and a remedy."""
+        """A tensor of a body as rows of items, their dtype, the shape to expect, and a remedy."""
         if name == "textures":
             return tensor, wp.vec3, ("height", "width"), check.channels_last(np.shape(tensor))
         dtype = wp.vec3 if name == "albedo" else wp.float32
