@@ -209,7 +209,7 @@ class View(LitPoints):
 
     def coarsest_level(self, sizes: tuple) -> int | None:
         """Coarsest level that cached footprints in textures of some sizes take; on a GPU it waits for that, once."""
-        known, footprints = self._cached["footprints"]
+        known, footprints = self._cached.get("footprints", (None, None))
         if known != sizes or not footprints.is_cached:
             return None
         level = self.cached("coarsest", footprints, lambda: Node("", Footprints.coarsest_level, footprints))
