@@ -84,7 +84,7 @@ class GlossyPoints(LitPoints):
 
     def _values(self, materials: Materials, name: str) -> Node:
         """Roughness or the like at the receivers, float32 of shape [batch, receiver]."""
-        return Node("", self._interpolate, self.receivers_node, materials.vertex_gloss(name))
+        return Node("", self._interpolate, self.receivers_node, materials.of_vertices(name))
 
     def _interpolate(self, receivers: Receivers, values: wp.array) -> wp.array:
         faces, seen = self.merged_scene.faces, receivers.seen

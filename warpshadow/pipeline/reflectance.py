@@ -46,6 +46,7 @@ class Materials:
             shape [batch, height, width], None without one; and where a body shines, those of GLOSS, float32 of shape
             [batch, 1] or [batch, vertex].
     Attributes:
+        albedo, textures, roughness: These inputs; None where no body shines.
         images: The textures that there are.
         sizes: Heights and widths of the bodies' textures, None without one.
         vertex_albedo: Node of the reflectance of all vertices.
@@ -57,9 +58,11 @@ class Materials:
         self._wire(inputs)
 
     def _wire(self, changed: Collection[str]) -> None:
-        """Make the nodes of what changed."""
+        """Make the nodes of inputs that changed."""
+        self.albedo, self.textures = self._inputs["albedo"], self._inputs["textures"]
+        self.roughness = self._inputs.get("roughness")
         if "albedo" in changed:
-            self.vertex_albedo = self._of_vertices("albedo")
+            self.vertex_albedo = self.of_vertices("albedo")
         if "textures" in changed:
             images = self.textures.value()
             self.images = [image for image in images if image is not None]
@@ -81,21 +84,6 @@ class Materials:
         if merged_scene.is_glossy.any():
             arrays |= {name: _of_bodies(merged_scene, name) for name in GLOSS}
         return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
-
-    @property
-    def albedo(self) -> Input:
-        """Albedo of each body."""
-        return self._inputs["albedo"]
-
-    @property
-    def textures(self) -> Input:
-        """Texture of each body, None without one."""
-        return self._inputs["textures"]
-
-    @property
-    def roughness(self) -> Input | None:
-        """Roughness of each body; None where none shines."""
-        return self._inputs.get("roughness")
 
     def is_black(self, number: int) -> bool:
         """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
@@ -157,11 +145,8 @@ class Materials:
                 "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid",
             )
 
-    def vertex_gloss(self, name: str) -> Node:
-        """Node of the roughness of all vertices, or of their metallic or specular, float32 of shape [batch, vertex]."""
-        return self._of_vertices(name)
-
-    def _of_vertices(self, name: str) -> Node:
+    def of_vertices(self, name: str) -> Node:
+        """Node of an input of all vertices, such as their roughness, of shape [batch, vertex]."""
         counts = np.diff(self.merged_scene.first_vertex).tolist()
         return Node("", lambda arrays: concatenate(arrays, counts), self._inputs[name])
 
