@@ -1,7 +1,7 @@
 """Arguments: check tensors, and pass them as Warp arrays."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,8 +15,18 @@ from warpshadow.pipeline.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_g
 from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
 
 
+class Slot(NamedTuple):
+    """Place of a tensor among the inputs of a function, which its array takes."""
+
+    number: int
+
+
 class Arguments:
-    """Tensors that become arguments of a function of Warp arrays, checked and with a leading batch dimension."""
+    """Tensors that become arrays among the inputs of a function, checked and with a leading batch dimension.
+
+    Inputs are dictionaries, lists and geometries, with the slot of each tensor that was added, and anything else as it
+    is.
+    """
 
     def __init__(self, device: torch.device, *, cameras: Sequence[Camera] | None = None):
         self.device = device
@@ -25,7 +35,6 @@ class Arguments:
         self.names: list[str] = []
         self.tensors: list[torch.Tensor] = []
         self.dtypes: list[type] = []
-        self._bodies: dict[str, dict[str, Any]] = {}  # of geometries: the moving ones and the deformed ones
 
     def add(
         self,
@@ -36,7 +45,7 @@ class Arguments:
         meaning: str = "",
         *,
         messages: str | None = None,
-    ) -> None:
+    ) -> Slot:
         """Add a tensor of items of a Warp dtype, of a shape with or without a batch dimension before it.
 
         Messages about it call it ``messages``, by default its name.
@@ -48,45 +57,44 @@ class Arguments:
         self.names.append(name)
         self.tensors.append(tensor if has_batch else tensor[None])
         self.dtypes.append(dtype)
+        return Slot(len(self.names) - 1)
 
     def expand(self) -> None:
         """Repeat tensors with a batch of 1 for every instance of the others."""
         count = self._common_batch()
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
-    def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> None:
+    def add_geometry(self, name: str, geometry: Geometry[torch.Tensor], like: Geometry[wp.array]) -> Geometry[Slot]:
         """Add the tensors of a geometry, of which arrays there are as many items as of another."""
         geometry, own = as_geometry(name, geometry), like.arrays()
-        self._bodies[name] = {"moving": geometry.moving, "deformed": geometry.deformed}
-        for part, tensor in geometry.arrays().items():
-            self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:], PLACED)
+        slots = {
+            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own[part].shape[1:], PLACED)
+            for part, tensor in geometry.arrays().items()
+        }
+        rotations = None
         if geometry.rotations is not None:
             assert like.rotations is not None
-            self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
+            rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, like.rotations.shape[1:])
+        return Geometry(**slots, rotations=rotations, moving=geometry.moving, deformed=geometry.deformed)
 
-    def geometry(self, name: str, arrays: Mapping[str, wp.array]) -> Geometry[wp.array] | None:
-        """A geometry that was added, of arrays; None if none was."""
-        if name not in self._bodies:
-            return None
-        parts = (arrays[f"{name}.{part}"] for part in GEOMETRY_DTYPES)
-        return Geometry(*parts, rotations=arrays.get(f"{name}.rotations"), **self._bodies[name])
+    def filled(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        """Inputs with arrays in the slots, which require a gradient as the tensors do."""
+        arrays = []
+        for tensor, dtype in zip(self.tensors, self.dtypes, strict=True):
+            arrays.append(as_array(tensor, dtype))
+            arrays[-1].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
+        return _filled(inputs, arrays)
 
-    def arrays(self) -> dict[str, wp.array]:
-        """The tensors as arrays, which require a gradient as they do."""
-        result = {}
-        for name, tensor, dtype in zip(self.names, self.tensors, self.dtypes, strict=True):
-            result[name] = as_array(tensor, dtype)
-            result[name].requires_grad = tensor.requires_grad and torch.is_grad_enabled()
-        return result
-
-    def apply(self, function: Callable[[Mapping[str, wp.array]], Any], *, affine: Collection[str] = ()) -> Any:
-        """Apply a function of arrays by their names, as :func:`~warpshadow.torch.apply` does.
+    def apply(
+        self, function: Callable[[dict[str, Any]], Any], inputs: dict[str, Any], *, affine: Collection[str] = ()
+    ) -> Any:
+        """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does.
 
         Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
         results = apply(
-            lambda *arrays: function(dict(zip(self.names, arrays, strict=True))),
+            lambda *arrays: function(_filled(inputs, arrays)),
             *self.tensors,
             dtypes=self.dtypes,
             device=self.device,
@@ -98,17 +106,17 @@ class Arguments:
         return tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
 
     def apply_geometry(
-        self, function: Callable[[Mapping[str, wp.array]], Geometry[wp.array]]
+        self, function: Callable[[dict[str, Any]], Geometry[wp.array]], inputs: dict[str, Any]
     ) -> Geometry[torch.Tensor]:
         """Apply a function that makes a geometry."""
         made: list[Geometry[wp.array]] = []
 
-        def make(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
-            made.append(function(arrays))
+        def make(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
+            made.append(function(inputs))
             rotations = made[0].rotations
             return (*made[0].arrays().values(), *([] if rotations is None else [rotations]))
 
-        positions, centers, radii, *rotations = self.apply(make)
+        positions, centers, radii, *rotations = self.apply(make, inputs)
         return Geometry(
             positions,
             centers,
@@ -120,6 +128,18 @@ class Arguments:
 
     def _common_batch(self) -> int:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})
+
+
+def _filled(inputs: Any, arrays: Sequence[wp.array]) -> Any:
+    if isinstance(inputs, Slot):
+        return arrays[inputs.number]
+    if isinstance(inputs, dict):
+        return {name: _filled(item, arrays) for name, item in inputs.items()}
+    if isinstance(inputs, list):
+        return [_filled(item, arrays) for item in inputs]
+    if isinstance(inputs, Geometry):
+        return inputs.map(lambda slot: arrays[slot.number])
+    return inputs
 
 
 def _check_tensor(

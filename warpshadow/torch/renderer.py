@@ -20,7 +20,7 @@ from warpshadow.scene.scene import GLOSS, BodyLike, PerBody, Scene
 from warpshadow.stages.deform import DeformationGraph
 from warpshadow.stages.poses import Poses
 from warpshadow.stages.project import compose_clip_matrices
-from warpshadow.torch.arguments import Arguments
+from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import uncompiled
 from warpshadow.tuning.renderer import Renderer
 
@@ -173,15 +173,15 @@ class TorchRenderer(torch.nn.Module):
             and where no light bounces to albedo and textures, may be differentiated again, in all of these;
             others raise NotImplementedError then.
         """
-        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
 
-        def draw(arrays: Mapping[str, wp.array]) -> wp.array:
-            inputs = self._inputs(stored, arrays, light)
+        def draw(inputs: dict[str, Any]) -> wp.array:
             seen = inputs.pop("geometry"), inputs.pop("clip_matrices")
             return self.warp.draw(**inputs, view=self.warp.view(*seen))
 
         is_affine = {"light": True, "albedo": not self.scene.bounces, "textures": not self.scene.bounces}
-        return stored.apply(draw, affine=[name for name in stored.names if is_affine.get(name.partition("[")[0])])
+        affine = [name for name in stored.names if is_affine.get(name.partition("[")[0])]
+        return stored.apply(draw, inputs, affine=affine)
 
     @uncompiled
     @one_at_a_time
@@ -196,14 +196,14 @@ class TorchRenderer(torch.nn.Module):
             have no gradient for another that comes in front of it; masks and coverage have that of silhouettes, as
             images have.
         """
-        stored = self._given(None, geometry, clip_matrices)
+        stored, inputs = self._given(None, geometry, clip_matrices)
 
-        def find(arrays: Mapping[str, wp.array]) -> tuple[wp.array, ...]:
-            view = self.warp.view(stored.geometry("geometry", arrays), arrays.get("clip_matrices"))
+        def find(inputs: dict[str, Any]) -> tuple[wp.array, ...]:
+            view = self.warp.view(inputs["geometry"], inputs["clip_matrices"])
             result = self.warp.layer_arrays(view)
             return (*result[:3], *result.masks)
 
-        depth, normals, bodies, *quartets = stored.apply(find)
+        depth, normals, bodies, *quartets = stored.apply(find, inputs)
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
@@ -234,12 +234,11 @@ class TorchRenderer(torch.nn.Module):
             ValueError: where no body of the scene is a catcher.
         Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
         """
-        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
         camera = self.cameras[0]
-        stored.add("photograph", photograph, wp.vec3, (camera.height, camera.width), "linear RGB")
-        return stored.apply(
-            lambda arrays: self.warp.insert(arrays["photograph"], **self._inputs(stored, arrays, light)),
-        )
+        size = camera.height, camera.width
+        inputs["photograph"] = stored.add("photograph", photograph, wp.vec3, size, "linear RGB")
+        return stored.apply(lambda inputs: self.warp.insert(**inputs), inputs)
 
     @uncompiled
     @one_at_a_time
@@ -256,8 +255,8 @@ class TorchRenderer(torch.nn.Module):
         specular: PerBody[torch.Tensor] | None = None,
     ) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does."""
-        stored = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
-        return self.warp.explain(**self._inputs(stored, stored.arrays(), light))
+        stored, inputs = self._given(light, geometry, clip_matrices, (albedo, textures, roughness, metallic, specular))
+        return self.warp.explain(**stored.filled(inputs))
 
     def _given(
         self,
@@ -265,25 +264,34 @@ class TorchRenderer(torch.nn.Module):
         geometry: Geometry[torch.Tensor] | None = None,
         clip_matrices: torch.Tensor | None = None,
         of_bodies: Sequence[PerBody[torch.Tensor] | None] = (),
-    ) -> Arguments:
-        """The tensors among the arguments of a call, checked; reflectance of bodies in the order of its names."""
+    ) -> tuple[Arguments, dict[str, Any]]:
+        """The tensors among the arguments of a call, checked, and the inputs of the renderer of arrays.
+
+        Args:
+            light, geometry, clip_matrices: Of the call.
+            of_bodies: Of the call, in the order of REFLECTANCE.
+        """
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         stored = Arguments(self.device, cameras=self.cameras if has_cameras else None)
+        inputs: dict[str, Any] = {"light": light, "geometry": None, "clip_matrices": None}
         if isinstance(light, torch.Tensor):
             what = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
-            stored.add("light", light, wp.vec3, (self.basis.size,), what)
+            inputs["light"] = stored.add("light", light, wp.vec3, (self.basis.size,), what)
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            stored.add_geometry("geometry", geometry, self.warp.rest())
+            inputs["geometry"] = stored.add_geometry("geometry", geometry, self.warp.rest())
         if clip_matrices is not None:
-            stored.add("clip_matrices", clip_matrices, wp.mat44, ())
+            inputs["clip_matrices"] = stored.add("clip_matrices", clip_matrices, wp.mat44, ())
         for name, values in zip(REFLECTANCE, of_bodies, strict=False):
+            slots: list[Slot | None] = [None] * len(self.scene.bodies)
             for number, tensor in enumerate(self.scene.per_body(values, name)):
                 if tensor is not None:
                     messages = self._said(name, values, number)
-                    stored.add(f"{name}[{number}]", *self._of_body(name, number, tensor), messages=messages)
-        return stored
+                    of_body = self._of_body(name, number, tensor)
+                    slots[number] = stored.add(f"{name}[{number}]", *of_body, messages=messages)
+            (inputs.setdefault("gloss", {}) if name in GLOSS else inputs)[name] = slots
+        return stored, inputs
 
     def _of_body(
         self, name: str, number: int, tensor: torch.Tensor
@@ -303,24 +311,6 @@ class TorchRenderer(torch.nn.Module):
         """Name of an item for a body in messages: by the name of the body where that was given."""
         keys = stored if isinstance(stored, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
-
-    def _inputs(
-        self,
-        stored: Arguments,
-        arrays: Mapping[str, wp.array],
-        light: torch.Tensor | EnvironmentMap | None,
-    ) -> dict[str, Any]:
-        """The array arguments of the renderer, in place of tensors."""
-        bodies = range(len(self.scene.bodies))
-        albedo, textures, *gloss = ([arrays.get(f"{name}[{body}]") for body in bodies] for name in REFLECTANCE)
-        return {
-            "light": arrays.get("light", light),
-            "albedo": albedo,
-            "textures": textures,
-            "gloss": dict(zip(GLOSS, gloss, strict=True)),
-            "geometry": stored.geometry("geometry", arrays),
-            "clip_matrices": arrays.get("clip_matrices"),
-        }
 
     @uncompiled
     @one_at_a_time
@@ -360,21 +350,23 @@ class TorchRenderer(torch.nn.Module):
         scales = self.scene_poses()[2] if scales is None else scales
         stored = Arguments(self.device)
         remedy = "matrices of all bodies; rotation_matrices(…) makes them of axis-angle vectors and quaternions"
-        stored.add("rotations", rotations, wp.mat33, (count,), remedy)
-        stored.add("translations", translations, wp.vec3, (count,))
-        stored.add("scales", scales, wp.float32, (count,))
+        inputs: dict[str, Any] = {
+            "poses": [
+                stored.add("rotations", rotations, wp.mat33, (count,), remedy),
+                stored.add("translations", translations, wp.vec3, (count,)),
+                stored.add("scales", scales, wp.float32, (count,)),
+            ],
+            "pivot": pivot,
+        }
         if isinstance(pivot, torch.Tensor):
-            stored.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
+            inputs["pivot"] = stored.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
         stored.expand()
-        if rest is not None:
-            stored.add_geometry("rest", rest, self.warp.rest())
+        inputs["rest"] = None if rest is None else stored.add_geometry("rest", rest, self.warp.rest())
 
-        def place(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
-            poses = Poses(arrays["rotations"], arrays["translations"], arrays["scales"])
-            about = arrays.get("pivot", pivot)
-            return self.warp.placed(poses, stored.geometry("rest", arrays), moving=moving, pivot=about)
+        def place(inputs: dict[str, Any]) -> Geometry[wp.array]:
+            return self.warp.placed(Poses(*inputs["poses"]), inputs["rest"], moving=moving, pivot=inputs["pivot"])
 
-        return stored.apply_geometry(place)
+        return stored.apply_geometry(place, inputs)
 
     @uncompiled
     def scene_poses(
@@ -436,17 +428,12 @@ class TorchRenderer(torch.nn.Module):
         """
         parts = {"positions": positions, "centers": centers, "radii": radii}
         stored = Arguments(self.device)
-        for name, tensor in parts.items():
-            if tensor is not None:
-                stored.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
-        if rest is not None:
-            stored.add_geometry("rest", rest, self.warp.rest())
-
-        def exchange(arrays: Mapping[str, wp.array]) -> Geometry[wp.array]:
-            shape = {name: arrays.get(name) for name in parts}
-            return self.warp.deformed(body, **shape, rest=stored.geometry("rest", arrays))
-
-        return stored.apply_geometry(exchange)
+        inputs: dict[str, Any] = {
+            name: None if tensor is None else stored.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
+            for name, tensor in parts.items()
+        }
+        inputs["rest"] = None if rest is None else stored.add_geometry("rest", rest, self.warp.rest())
+        return stored.apply_geometry(lambda inputs: self.warp.deformed(body, **inputs), inputs)
 
     @uncompiled
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
@@ -472,11 +459,10 @@ class TorchRenderer(torch.nn.Module):
         """
         camera = self.cameras[0]
         stored = Arguments(self.device)
-        stored.add("intrinsics", intrinsics, wp.mat33, ())
-        stored.add("rotations", rotations, wp.mat33, ())
-        stored.add("translations", translations, wp.vec3, ())
-
-        def compose(arrays: Mapping[str, wp.array]) -> wp.array:
-            return compose_clip_matrices(*arrays.values(), size=(camera.width, camera.height), near=camera.near)
-
-        return stored.apply(compose)
+        inputs = {
+            "intrinsics": stored.add("intrinsics", intrinsics, wp.mat33, ()),
+            "rotations": stored.add("rotations", rotations, wp.mat33, ()),
+            "translations": stored.add("translations", translations, wp.vec3, ()),
+        }
+        options: dict[str, Any] = {"size": (camera.width, camera.height), "near": camera.near}
+        return stored.apply(lambda inputs: compose_clip_matrices(**inputs, **options), inputs)

@@ -66,7 +66,8 @@ def _normals(merged_scene):
 def test_albedo_of_patches_has_gradients_to_colors_and_textures(merged_scene):
     color = wp.array(RANDOM.uniform(size=(1, 162, 3)), dtype=wp.vec3, requires_grad=True)
     image = wp.array(RANDOM.uniform(size=(1, 16, 16, 3)), dtype=wp.vec3, requires_grad=True)
-    materials = Materials.of_scene(merged_scene).replaced({"albedo": [color, None, None], "textures": [None, image, None]})
+    replacements = {"albedo": [color, None, None], "textures": [None, image, None]}
+    materials = Materials.of_scene(merged_scene).replaced(replacements)
     patches = ScenePatches(merged_scene)
     senders = patches.senders(materials)
     with recorded() as tape:
