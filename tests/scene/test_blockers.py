@@ -198,3 +198,19 @@ def test_fits_that_take_long_are_announced_with_the_way_around_them(tmp_path, mo
     blockers.scene_blockers(scene, progress=True)  # reads them
     blockers.scene_blockers(scene_of(ws.Body(ws.icosphere(1.0, 2), blockers=1)), progress=False)
     assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("method", "body_options", "expected"),
+    [
+        ("directional", {}, blockers.STAND_INS),
+        ("directional", {"blockers": 24}, 24),
+        ("directional", {"self_shadows": "spheres"}, "auto"),
+        ("log-sh", {}, "auto"),
+    ],
+)
+def test_a_body_that_blocks_as_convex_parts_takes_few_spheres(method, body_options, expected):
+    import trimesh
+
+    scene = scene_of(ws.Body(trimesh.creation.box(), **body_options), method=method)
+    assert blockers.fitted_counts(scene) == {0: expected}

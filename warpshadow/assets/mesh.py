@@ -28,6 +28,7 @@ from warpshadow.assets.topology import (
     rounds_edges,
 )
 from warpshadow.check import AnyPath
+from warpshadow.maths.convex import ConvexPart, find_convex_parts
 from warpshadow.maths.plane import plane_normal
 
 
@@ -159,6 +160,11 @@ class Mesh:
     def is_flat(self) -> bool:
         """Whether it lies in a plane."""
         return plane_normal(self.positions[self.surface.faces].astype(np.float64)) is not None
+
+    @functools.cached_property
+    def convex_parts(self) -> list[ConvexPart]:
+        """Its closed convex pieces and panels of cloth; empty where it has anything else."""
+        return find_convex_parts(self.positions, self.surface.faces) or []
 
     def transformed(
         self,

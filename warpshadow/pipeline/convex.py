@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.maths.convex import ConvexPart, find_convex_parts
+from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.stages.convex.prepared import ConvexBlockers, ConvexBody, PlacedParts
 from warpshadow.stages.convex.transmittance import transmittance_past_parts
@@ -48,17 +48,11 @@ class SceneParts:
     @functools.cached_property
     def parts(self) -> dict[int, list[ConvexPart]]:
         """The parts of each body that consists of some and casts shadows, unless spheres of the user's own block."""
-        of_mesh: dict[int, list[ConvexPart] | None] = {}
-        result = {}
-        for number, body in enumerate(self._merged_scene.scene.bodies):
-            mesh = body.mesh
-            if body.casts_shadow and isinstance(body.blockers, str) and not self._merged_scene.is_flat[number]:
-                if id(mesh) not in of_mesh:
-                    of_mesh[id(mesh)] = find_convex_parts(mesh.positions, mesh.surface.faces)
-                parts = of_mesh[id(mesh)]
-                if parts:
-                    result[number] = parts
-        return result
+        return {
+            number: body.mesh.convex_parts
+            for number, body in enumerate(self._merged_scene.scene.bodies)
+            if body.blocks_as_parts and not self._merged_scene.is_flat[number]
+        }
 
     def among(self, bodies: tuple[int, ...], blocking: tuple[int, ...]) -> ConvexBlockers:
         """Some of these bodies, of which some block light."""

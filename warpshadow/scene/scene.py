@@ -330,6 +330,11 @@ class Body:
         """Whether the body blocks light."""
         return bool(len(self.blockers) if isinstance(self.blockers, Spheres) else self.blockers)
 
+    @property
+    def blocks_as_parts(self) -> bool:
+        """Whether a method that knows convex parts takes these for what blocks the light of others."""
+        return isinstance(self.blockers, str) and bool(self.mesh.convex_parts)
+
     def _read_mesh(self) -> None:
         """Load the mesh from its file or from trimesh, and its surface where none is given."""
         mesh, material = self.mesh, Material()
