@@ -24,6 +24,7 @@ from warpshadow.assets.video import write_video
 from warpshadow.device.parallel import set_thread_count, thread_count
 from warpshadow.device.progress import show_bars as _show_bars
 from warpshadow.device.startup import start_quietly as _start_quietly
+from warpshadow.device.threads import one_call as _one_call
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.geometry import Geometry
 from warpshadow.scene.camera_path import CameraPath, Keyframe
@@ -115,4 +116,5 @@ def quiet(*, progress: bool = True) -> None:
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module 'warpshadow' has no attribute {name!r}")
-    return getattr(_importlib.import_module(f"warpshadow.{_MODULES[name]}"), name)
+    with _one_call:  # kernels must not be made while another thread loads some
+        return getattr(_importlib.import_module(f"warpshadow.{_MODULES[name]}"), name)

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from warpshadow.assets.basis import Basis
+from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.lighting import Method
 from warpshadow.pipeline.merged_scene import MergedScene
 
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
     from warpshadow.pipeline.by_spheres import SphereMethod
 
 
+@one_at_a_time  # kernels must not be made while another thread loads some
 def make_method(merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False) -> Method:
     """Make the method of a scene, with light that bounces if the scene asks for it.
 
