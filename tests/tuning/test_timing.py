@@ -9,7 +9,6 @@ from test_point_sample import make_scene
 
 import warpshadow as ws
 from warpshadow.pipeline import directional
-from warpshadow.pipeline.merged_scene import MergedScene
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning import timing
 from warpshadow.tuning.timing import image_times, median_times, whole_image
@@ -30,14 +29,14 @@ def test_a_slow_first_call_does_not_count():
 
 def test_each_image_is_of_bodies_that_have_moved_by_nothing_to_speak_of(monkeypatch):
     scene = make_scene()
-    placed, geometries = MergedScene.placed, []
+    placed, geometries = ws.Renderer.placed, []
 
-    def noted(merged_scene, poses=None, rest=None, **options):
-        geometry = placed(merged_scene, poses, rest, **options)
+    def noted(renderer, poses=None, rest=None, **options):
+        geometry = placed(renderer, poses, rest, **options)
         geometries.extend([geometry] * (poses is not None))  # or the bodies are where the scene has them
         return geometry
 
-    monkeypatch.setattr(MergedScene, "placed", noted)
+    monkeypatch.setattr(ws.Renderer, "placed", noted)
     draw = whole_image(ws.Renderer(scene))
     images = [draw().numpy()[0].copy() for _ in range(3)]
     first, second, third = (geometry.positions.numpy() for geometry in geometries)
