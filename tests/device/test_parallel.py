@@ -126,7 +126,7 @@ def test_launches_from_several_python_threads_do_not_meet():
 def test_threads_that_get_no_core_are_not_waited_for():
     parallel.set_thread_count(2)
     is_over = threading.Event()
-    blocked = [parallel._pool(2).submit(is_over.wait) for _ in range(2)]  # all threads of the pool
+    parallel._pool(2).put(is_over.wait)  # to the only thread of the pool
     try:
         found = []
         launch = threading.Thread(target=lambda: found.append(spread(np.arange(1000))), daemon=True)
@@ -137,8 +137,6 @@ def test_threads_that_get_no_core_are_not_waited_for():
         assert set(found[0][1]) == {0}
     finally:
         is_over.set()
-        for other in blocked:
-            other.result()
 
 
 def shaded_with_gradients(method, forward=None, backward=None):
@@ -199,9 +197,9 @@ def image_with_gradients():
 
 def test_kernels_that_warp_differentiates_are_divided_both_ways(monkeypatch):
     parallel.set_thread_count(2)
-    monkeypatch.setattr(parallel, "_LEAST_WORK", 1e18)
+    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e18)
     whole = image_with_gradients()
-    monkeypatch.setattr(parallel, "_LEAST_WORK", 1e4)
+    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e4)
     results = []
     for count in (1, 2, 5):
         parallel.set_thread_count(count)
@@ -236,6 +234,7 @@ def moved_balls():
 def test_images_of_a_batch_that_threads_share_are_the_same(monkeypatch):
     whole = moved_balls()
     monkeypatch.setattr(parallel, "_LEAST_WORK", 1e3)
+    monkeypatch.setattr(parallel, "_LEAST_SUMMED_WORK", 1e3)
     for count in (2, 5):
         parallel.set_thread_count(count)
         assert moved_balls() == whole
@@ -285,3 +284,19 @@ if child == 0:
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_a_failure_of_a_thread_reaches_the_caller():
+    parallel.set_thread_count(2)
+    others_began = threading.Event()
+
+    def run(number, worker):
+        if worker:
+            others_began.set()
+            raise RuntimeError("no such luck")
+        others_began.wait(60)
+
+    for _ in range(2):  # the pool goes on
+        others_began.clear()
+        with pytest.raises(RuntimeError, match="no such luck"):
+            parallel._share(run, 2, 2)

@@ -89,7 +89,7 @@ def kernels_take_their_arguments_as_warp_passes_them():
     def directly(arguments, gradients):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(wp, "launch", None)
-            warp_internals.run_kernel(_fill, (3, 2), arguments, device, gradients=gradients)
+            warp_internals.bound_kernel(_fill, arguments, device, gradients=gradients)((3, 2))
 
     expected, found = _filled(by_warp), _filled(directly)
     assert expected[0].tolist() == [[17.5, 27.5], [18, 28], [19, 29]] and expected[1].tolist() == [0.5, 2.5, 4.5]
@@ -99,7 +99,7 @@ def kernels_take_their_arguments_as_warp_passes_them():
 def a_module_that_was_unloaded_is_loaded_again():
     values = wp.zeros(4, dtype=wp.int32, device="cpu")
     for first in (1, 2):
-        warp_internals.run_kernel(_count_up, (2,), [first, values], wp.get_device("cpu"))
+        warp_internals.bound_kernel(_count_up, [first, values], wp.get_device("cpu"))((2,))
         _count_up.module.unload()
     assert values.numpy().tolist() == [0, 1, 2, 2]
 
@@ -108,7 +108,7 @@ def arguments_of_a_wrong_type_are_refused():
     values = wp.zeros(3, dtype=wp.float32, device="cpu")
     for arguments in ([0, values], [0, wp.zeros((3, 1), dtype=wp.int32, device="cpu")], [0.5, "text"], [0]):
         with pytest.raises(RuntimeError, match="Error launching kernel"):
-            warp_internals.run_kernel(_count_up, (3,), arguments, wp.get_device("cpu"))
+            warp_internals.bound_kernel(_count_up, arguments, wp.get_device("cpu"))((3,))
     assert not values.numpy().any()
 
 

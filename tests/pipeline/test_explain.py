@@ -110,7 +110,7 @@ def test_a_geometry_that_is_given_again_is_not_seen_again(method, monkeypatch):
     view = fresh.view(geometry)
     np.testing.assert_array_equal(known, fresh.draw(view=view).numpy())
     np.testing.assert_array_equal(free, fresh.draw(light, view=view).numpy())
-    monkeypatch.setattr(warp_internals, "run_kernel", None)
+    monkeypatch.setattr(warp_internals, "bound_kernel", None)
     assert renderer.shade(view=renderer.view(geometry)) is renderer.shade(view=renderer.view(geometry))
 
 
@@ -123,7 +123,7 @@ def test_known_light_that_is_given_again_is_not_shaded_again(method, monkeypatch
         scenes = renderer.shade()
         np.testing.assert_array_equal(first.numpy(), SceneRenderer(scene_of(method)).shade(light).numpy())
         with monkeypatch.context() as patch:
-            patch.setattr(warp_internals, "run_kernel", None)
+            patch.setattr(warp_internals, "bound_kernel", None)
             assert renderer.shade(light) is first and renderer.shade() is scenes
     coefficients *= 2
     assert_near(renderer.shade(coefficients).numpy(), 2 * first.numpy())
@@ -502,13 +502,13 @@ class Launches:
 
     def __init__(self, monkeypatch):
         self.counts: Counter = Counter()
-        run = warp_internals.run_kernel
+        bound_kernel = warp_internals.bound_kernel
 
-        def counted(kernel, dim, arguments, device, **options):
+        def counted(kernel, arguments, device, **options):
             self.counts[stage_of(kernel, arguments)] += 1
-            run(kernel, dim, arguments, device, **options)
+            return bound_kernel(kernel, arguments, device, **options)
 
-        monkeypatch.setattr(warp_internals, "run_kernel", counted)
+        monkeypatch.setattr(warp_internals, "bound_kernel", counted)
 
     def of(self, call, variables) -> tuple[set, set]:
         """Stages that a call launches, and those of its adjoint, which is asked for gradients to variables."""
@@ -673,7 +673,7 @@ def test_an_explanation_computes_nothing(monkeypatch):
     scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
     renderer = SceneRenderer(scene)
     monkeypatch.setattr(merged_scene, "scene_blockers", None)
-    monkeypatch.setattr(warp_internals, "run_kernel", None)
+    monkeypatch.setattr(warp_internals, "bound_kernel", None)
     assert "up to 902 receivers × 14 spheres" in str(renderer.explain())
 
 

@@ -331,14 +331,19 @@ def test_gradients_of_backs_are_central_differences_of_the_image(method, receive
 def launches_of(monkeypatch, call) -> Counter:
     """Kernels that a call launches, with their numbers of threads."""
     counts: Counter = Counter()
-    run = warp_internals.run_kernel
+    bound_kernel = warp_internals.bound_kernel
 
-    def counted(kernel, dim, *arguments, **options):
-        counts[kernel.key, str(dim)] += 1
-        run(kernel, dim, *arguments, **options)
+    def counted(kernel, *arguments, **options):
+        launch = bound_kernel(kernel, *arguments, **options)
+
+        def run(dim, *first):
+            counts[kernel.key, str(dim)] += 1
+            launch(dim, *first)
+
+        return run
 
     with monkeypatch.context() as patch:
-        patch.setattr(warp_internals, "run_kernel", counted)
+        patch.setattr(warp_internals, "bound_kernel", counted)
         call()
     return counts
 

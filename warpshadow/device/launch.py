@@ -53,7 +53,7 @@ def launch(
                 _require_gradient(in_huge_pages(output), kernel)
     if cost is None:
         shape, arguments = (dim,) if isinstance(dim, int) else dim, [*inputs, *outputs, *sums]
-        warp_internals.run_kernel(kernel, shape, arguments, device)
+        warp_internals.bound_kernel(kernel, arguments, device)(shape)
         if is_wanted:
             record_kernel(kernel, shape, arguments, device)
         return

@@ -51,7 +51,7 @@ def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any
     gradients_of(arguments, tape)  # which the tape zeroes
 
     def play_back() -> None:
-        warp_internals.run_kernel(kernel, dim, arguments, device, gradients=gradients_of(arguments))
+        warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients_of(arguments))(dim)
 
     tape.record_func(play_back, [])
     verify_access(tape, kernel, arguments)

@@ -132,40 +132,51 @@ def _cpu_bounds(dim: tuple[int, ...], kernel_dimensions: int) -> Any:
     return ctypes.byref(wp._src.context._build_launch_bounds_from_tuple(dim, kernel_dimensions))
 
 
-def run_kernel(
-    kernel: wp.Kernel,
-    dim: Sequence[int],
-    arguments: Sequence[Any],
-    device: wp.Device,
-    *,
-    gradients: Sequence[Any] | None = None,
-) -> None:
-    """Launch a kernel off the tape, or its adjoint where gradients of its arguments are given.
+def _cpu_hooks(kernel: wp.Kernel, loaded: dict[str, Any], device: wp.Device) -> Any:
+    """Entry points of a kernel, of its module as it was loaded or is loaded now."""
+    module = kernel.module
+    hasher = module.hashers.get(1)  # another one if anything of the module changed
+    if hasher is None or loaded.get("hasher") is not hasher or module.execs.get((None, 1)) is not loaded["module"]:
+        executable = module.load(device, 1)
+        hooks = executable.get_kernel_hooks(kernel)
+        loaded.update(module=executable, hooks=hooks, hasher=module.hashers.get(1))
+    return loaded["hooks"]
+
+
+def bound_kernel(
+    kernel: wp.Kernel, arguments: Sequence[Any], device: wp.Device, *, gradients: Sequence[Any] | None = None
+) -> Callable[..., None]:
+    """Make the function that launches a kernel with arguments off the tape, or its adjoint where gradients are given.
+
+    It takes the dimensions of a launch, and then values in place of the first arguments, if they are others each time.
 
     On a CPU arguments go straight to the compiled function: ``wp.launch`` takes ten times as long to look at them as
     small kernels run. Warp launches what is unusual, such as an argument of a wrong type, of which it tells.
     """
-    context, config = wp._src.context, wp.config
     signature = _cpu_signature(kernel) if device.is_cpu else None
-    is_plain = context.runtime._apic_capture is None and not config.print_launches
+    is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
     if signature is not None and is_plain and (fields := _fields(signature, arguments, gradients)) is not None:
-        dim = tuple(dim)
-        if 0 in dim:
-            return
-        module, loaded = kernel.module, signature[3]
-        hasher = module.hashers.get(1)  # another one if anything of the module changed
-        if hasher is None or loaded.get("hasher") is not hasher or module.execs.get((None, 1)) is not loaded["module"]:
-            executable = module.load(device, 1)
-            hooks = executable.get_kernel_hooks(kernel)
-            loaded.update(module=executable, hooks=hooks, hasher=module.hashers.get(1))
-        hooks, bounds = loaded["hooks"], _cpu_bounds(dim, kernel.adj.kernel_dim)
-        if gradients is None:
-            hooks.forward(bounds, ctypes.byref(fields[0]))
-        else:
-            hooks.backward(bounds, *map(ctypes.byref, fields))
-        return
-    options = {} if gradients is None else {"adj_inputs": gradients, "adjoint": True}
-    wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False, **options)
+        (values, *others), (_, _, _, loaded), names = fields, signature, signature[0]._fields_
+        adjoints = [ctypes.byref(other) for other in others]
+
+        def run_plainly(dim: Sequence[int], *first: Any, holds: Any = (arguments, gradients)) -> None:
+            own = values
+            if first:
+                own = type(values).from_buffer_copy(values)
+                for (name, _), value in zip(names, first, strict=False):
+                    setattr(own, name, value)
+            if 0 not in dim:
+                hooks, bounds = _cpu_hooks(kernel, loaded, device), _cpu_bounds(tuple(dim), kernel.adj.kernel_dim)
+                (hooks.backward if adjoints else hooks.forward)(bounds, ctypes.byref(own), *adjoints)
+
+        return run_plainly
+
+    def run_by_warp(dim: Sequence[int], *first: Any) -> None:
+        options = {} if gradients is None else {"adj_inputs": gradients, "adjoint": True}
+        inputs = [*first, *arguments[len(first) :]]
+        wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_tape=False, **options)
+
+    return run_by_warp
 
 
 def _fields(signature: tuple, arguments: Sequence[Any], gradients: Sequence[Any] | None) -> list[Any] | None:

@@ -17,7 +17,7 @@ from warpshadow import check
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.parallel import strip_count
+from warpshadow.device.parallel import run_length, split_row, strip_count, thread_count
 from warpshadow.stages.barycentrics import find_barycentrics
 
 MAX_SIZE = 1 << 15  # largest image width or height [samples]: beyond, fixed-point edge functions could overflow
@@ -33,8 +33,11 @@ _CLIPPED = -(1 << 31)  # the x of a vertex that has no fixed-point position: beh
 # In boxes wider than this each row is trimmed to the span inside the edges; else testing samples is faster.
 _TRIM_WIDTH = 8
 
-_VERTEX_COST, _FACE_COST = 15.0, 30.0
-"""Nanoseconds that a vertex and a face take, if faces are small. Images are shared by threads."""
+_VERTEX_COST, _FACE_COST, _SAMPLE_COST = 15.0, 70.0, 1.0
+"""Nanoseconds that a vertex and a face take, if faces are small, and a sample of one layer. Vertices of an image are not
+shared by threads."""
+
+_LEAST_FACES_COST = 4.0  # of a layer, for one of its samples: less than that is not worth another layer
 
 _INT32_MASK = (1 << 32) - 1
 _DEPTH_ONE = 0x3F800000
@@ -237,22 +240,29 @@ def _cover(
     width: int,
     height: int,
     strips: int,
+    layers: int,
     # out
     keys: wp.array3d(dtype=wp.int64),
     faults: wp.array2d(dtype=int),
 ):
-    """One thread owns every ``strips``-th row of one face and offers the face to the samples there.
+    """One thread owns every ``strips``-th row of one face and offers the face to the samples of a layer there.
 
-    A sample keeps the largest key: nearest depth above, lowest face below. Zero is the background.
+    A sample keeps the largest key: nearest depth above, lowest face below. Zero is the background. An image has several
+    layers, each with a part of the faces, so that threads can share it.
     """
-    image, face, strip = wp.tid()
-    instance = first_row + image
+    row_of_layer, number, strip = wp.tid()
+    at = first_row + row_of_layer
+    instance, layer = split_row(at, layers)
+    face_count = faces.shape[0]
+    face = layer * face_count / layers + number
+    if face >= (layer + 1) * face_count / layers:
+        return
     i = faces[face][0]
     j = faces[face][1]
     k = faces[face][2]
     if wp.min(i, wp.min(j, k)) < 0 or wp.max(i, wp.max(j, k)) >= corners.shape[1]:
         if strip == 0:
-            wp.atomic_add(faults, instance, 1, 1)
+            wp.atomic_add(faults, at, 1, 1)
         return
     a = corners[instance, i]
     b = corners[instance, j]
@@ -336,8 +346,8 @@ def _cover(
                 bits = wp.clamp(wp.cast(depth, wp.int32), farthest, nearest)
                 if bits > 0 and bits <= _DEPTH_ONE:
                     key = (wp.int64(bits) << wp.int64(32)) | low
-                    if key > keys[instance, row, column]:
-                        wp.atomic_max(keys, instance, row, column, key)
+                    if key > keys[at, row, column]:
+                        wp.atomic_max(keys, at, row, column, key)
             in_a += edge_a[0]
             in_b += edge_b[0]
             in_c += edge_c[0]
@@ -347,14 +357,23 @@ def _cover(
 
 @wp.kernel(enable_backward=False)
 def _resolve(
+    first_row: int,
+    worker: int,
     # in
-    keys: wp.array(dtype=wp.int64),
+    keys: wp.array3d(dtype=wp.int64),
+    run: int,
     # out
-    face_ids: wp.array(dtype=wp.int32),
+    face_ids: wp.array2d(dtype=wp.int32),
 ):
-    """One thread owns one sample: the face in its key, and -1 for the key zero."""
-    sample = wp.tid()
-    face_ids[sample] = ~wp.int32(keys[sample])
+    """One thread owns a run of samples: the face in the largest key of all layers, and -1 for the key zero."""
+    instance, thread = split_row(first_row + wp.tid(), keys.shape[2] // run)
+    first_layer = keys[instance, 0]
+    own = face_ids[instance]
+    for sample in range(thread * run, (thread + 1) * run):
+        key = first_layer[sample]
+        for layer in range(1, keys.shape[1]):
+            key = wp.max(key, keys[instance, layer, sample])
+        own[sample] = ~wp.int32(key)
 
 
 def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:
@@ -389,12 +408,15 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     """Nearest face over each sample, -1 where there is none, int32, shape [batch, height, width]."""
     device = clip_positions.device
     batch_count, vertex_count = clip_positions.shape
+    layers, strips, run = 1, strip_count(device), run_length(device, width)
+    if device.is_cpu and batch_count:  # layers for threads that have no image of their own
+        worth = _FACE_COST * faces.shape[0] / (_LEAST_FACES_COST * width * height)
+        layers = max(1, min(thread_count() // batch_count, int(worth)))
     corners = empty((batch_count, vertex_count), dtype=wp.vec2i, device=device)
     depths = empty((batch_count, vertex_count), dtype=float, device=device)
-    keys = zeros((batch_count, height, width), dtype=wp.int64, device=device)
+    keys = zeros((batch_count * layers, height, width), dtype=wp.int64, device=device)
     face_ids = empty((batch_count, height, width), dtype=wp.int32, device=device)
-    faults = wp.zeros((batch_count, 2), dtype=int, device=device)
-    strips = strip_count(device)
+    faults = zeros((batch_count * layers, 2), dtype=int, device=device)
     launch(
         _snap,
         clip_positions.shape,
@@ -404,12 +426,18 @@ def _visible_faces(clip_positions: wp.array, faces: wp.array, width: int, height
     )
     launch(
         _cover,
-        (batch_count, faces.shape[0], strips),
+        (batch_count * layers, -(-faces.shape[0] // layers), strips),
         cost=_FACE_COST,
-        inputs=[clip_positions, corners, depths, faces, width, height, strips],
+        inputs=[clip_positions, corners, depths, faces, width, height, strips, layers],
         outputs=[keys, faults],
     )
-    launch(_resolve, keys.size, inputs=[keys.flatten()], outputs=[face_ids.flatten()])
+    launch(
+        _resolve,
+        face_ids.size // run,
+        cost=_SAMPLE_COST * layers * run,
+        inputs=[keys.reshape((batch_count, layers, height * width)), run],
+        outputs=[rows(face_ids)],
+    )
     if not device.is_capturing:
         bad_vertex_count, bad_face_count = faults.numpy().sum(axis=0).tolist()
         if bad_vertex_count:
