@@ -441,24 +441,6 @@ def test_without_reading_the_count_back_the_result_is_the_same(device, monkeypat
     np.testing.assert_array_equal(got, expected)
 
 
-def test_crossings_of_late_images_are_found_where_there_is_room_for_a_billion_of_each(device):
-    """A place in the lists of all images would not fit int32: all but one crossing share a place here."""
-    crossings, count = find._Crossings(), 2**29
-    crossing = wp.array([[5, 0, 7, 8, 7, 8]], dtype=find._Crossing, device=device)
-    size = wp.types.type_size_in_bytes(find._Crossing)
-    options = {"dtype": find._Crossing, "shape": (5, count), "strides": (0, 0), "device": device}
-    crossings.items = wp.array(ptr=crossing.ptr, capacity=size, **options)
-    crossings.counts = wp.array([0, 0, 0, 0, 1], dtype=int, device=device)
-    crossings.claims = wp.array([0, 0, 0, 0, 0, 0, 1, 0], dtype=int, device=device)
-    first_entries = wp.zeros(5, dtype=int, device=device)
-    samples, edges = wp.full(2, -1, dtype=int, device=device), wp.zeros((2, 4), dtype=wp.vec2i, device=device)
-    entries = wp.full(8, -1, dtype=int, device=device)
-    inputs, outputs = [crossings, first_entries, 4, False], [samples, edges, entries]
-    wp.launch(find._make_entries, (5, 1), inputs=inputs, outputs=outputs, device=device)
-    assert samples.numpy().tolist() == [5, 6] and entries.numpy().tolist() == [-1] * 5 + [0, 1, -1]
-    assert edges.numpy()[0, 0].tolist() == edges.numpy()[1, 1].tolist() == [7, 8]
-
-
 def test_more_samples_than_int32_counts_are_refused(device, monkeypatch):
     monkeypatch.setattr(find, "MOST_SAMPLES", 81 * 97 - 1)
     mesh = ws.icosphere(1.0, 1)

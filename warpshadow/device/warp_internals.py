@@ -71,7 +71,7 @@ _NO_ARRAY = _types.array_t()
 
 
 @functools.cache
-def _cpu_signature(kernel: wp.Kernel) -> tuple[type, type, list[Any], dict] | None:
+def _cpu_signature(kernel: wp.Kernel) -> tuple[Any, Any, list[Any], dict] | None:
     """How a CPU kernel takes its arguments.
 
     Returns:

@@ -20,9 +20,11 @@ from warpshadow.device.batch import rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, from_numpy
+from warpshadow.device.parallel import split_row
 
 LARGEST = 4  # pixels of the side of the largest squares
 PROBE = 2  # pixels between probes
+_SQUARE_COST = 50.0  # nanoseconds that one of the largest squares takes
 TOLERANCE = 0.02  # error of interpolation at which a square is cut, as a part of the light where nothing blocks any
 
 
@@ -105,6 +107,8 @@ def _gap(
 
 @wp.kernel(enable_backward=False)
 def _cut_squares(
+    first_row: int,
+    worker: int,
     # in
     sides: wp.array2d(dtype=wp.int32),
     keys: wp.array(dtype=wp.int32),
@@ -118,7 +122,7 @@ def _cut_squares(
     sizes: wp.array3d(dtype=wp.int32),
 ):
     """A thread owns a row of the largest squares: pixels get the side of the square that holds there, 0 for none."""
-    view, i = wp.tid()
+    view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / 2)
     seen = sides[view]
     near = probe_keys[view]
     shares = probe_shares[view]
@@ -199,7 +203,8 @@ def find_quadtree(
     ]
     launch(
         _cut_squares,
-        (view_count, probe_keys.shape[1] // 2),
+        view_count * (probe_keys.shape[1] // 2),
+        cost=_SQUARE_COST * (probe_keys.shape[2] // 2),
         inputs=[*inputs, supersampling, height, width, tolerance],
         outputs=[sizes],
     )

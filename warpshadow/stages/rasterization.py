@@ -34,8 +34,8 @@ _CLIPPED = -(1 << 31)  # the x of a vertex that has no fixed-point position: beh
 _TRIM_WIDTH = 8
 
 _VERTEX_COST, _FACE_COST, _SAMPLE_COST = 15.0, 70.0, 1.0
-"""Nanoseconds that a vertex and a face take, if faces are small, and a sample of one layer. Vertices of an image are not
-shared by threads."""
+"""Nanoseconds that a vertex and a face take, if faces are small, and a sample of one layer. Vertices of an image are
+not shared by threads."""
 
 _LEAST_FACES_COST = 4.0  # of a layer, for one of its samples: less than that is not worth another layer
 

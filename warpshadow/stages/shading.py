@@ -16,7 +16,7 @@ from warpshadow.maths.directions import CHUNK
 from warpshadow.stages.transfer import CellInputs, are_up, cell_inputs, cosines
 
 _SLAB = 256  # receivers whose gradients to light a thread sums before it adds them to the others'
-_COEFFICIENT_COST = 0.4  # nanoseconds that a coefficient of a receiver takes
+_COEFFICIENT_COST, _RECEIVER_COST = 0.4, 30.0  # nanoseconds that a coefficient of a receiver takes, and a receiver
 
 
 wp.set_module_options({"max_unroll": 1})
@@ -190,7 +190,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     use_vector_registers(__name__, device)
     channels = _channels(light)
     seen, lit = [transfer, as_chunks(transfer)], [channels, as_chunks(channels)]
-    cost = _COEFFICIENT_COST * count
+    cost = _RECEIVER_COST + _COEFFICIENT_COST * count
 
     def adjoint(adj_shading: wp.array) -> None:
         if transfer.requires_grad:
@@ -311,7 +311,8 @@ def shade_cells(
     check.shape("light", light.shape, ("batch", len(directions)))
     check.finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)
-    inputs, cost = [cells, as_chunks(_channels(light))], _COEFFICIENT_COST * len(directions)
+    inputs = [cells, as_chunks(_channels(light))]
+    cost = _RECEIVER_COST + _COEFFICIENT_COST * len(directions)
     return differentiable(
         lambda shading: launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost),
         lambda adj_shading: launch(

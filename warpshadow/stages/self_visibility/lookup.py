@@ -19,12 +19,13 @@ import warp as wp
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
+from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.stages.self_visibility.trace import RUN
 
 _LEAST_REACH = 2.2  # least h, in radii of the coarse cells
 _MOST_RAYS = 32  # rays that a cell looks up on average at most; a wider one looks up coarse cells
-_CELL_COST = 1000.0  # nanoseconds that a cell takes. Instances are shared by threads
+_CELL_COST = 1500.0  # nanoseconds that a cell takes
 
 
 class ResamplingKernels(NamedTuple):
@@ -134,8 +135,7 @@ def _find_lookups(
     weights: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a cell of directions of an instance."""
-    row, direction = wp.tid()
-    batch = first_row + row
+    batch, direction = split_row(first_row + wp.tid(), kernels.directions.shape[0])
     _turned, toward, reach, candidates = _look_from(kernels, rotations[batch, body], direction)
     count = int(0)
     total = float(0.0)
@@ -208,7 +208,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
     inputs = [rotations, body, arrays]
     weights = differentiable(
         lambda weights: launch(
-            _find_lookups, shape, inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
+            _find_lookups, shape[0] * shape[1], inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
         ),
         lambda adj_weights: launch(
             _find_lookups_adjoint,

@@ -9,13 +9,12 @@ samples from one row (or column) to the next.
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy, zeros
-from warpshadow.device.parallel import run_length, strip_count
+from warpshadow.device.memory import empty
+from warpshadow.device.parallel import run_length, split_row, strip_count
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.screen import (
     ends_before,
@@ -52,12 +51,10 @@ LEAST_OPENING = 1e-4
 # Rasterization moves vertices by up to 1/8192 sample: an edge may be this far on the wrong side of a center [samples].
 _SNAP = 1.0 / 2048.0
 
-_FACE_COST = 40.0  # nanoseconds that a face takes, if it is small
+_FACE_COST, _SAMPLE_COST, _ENTRY_COST = 50.0, 4.0, 2.0
+"""Nanoseconds that a face takes, if it is small, a sample that is looked at for an intersection, and for an entry."""
 
-_MOST_CROSSINGS = 1 << 30
-"""Of an image: a claim is twice the number of one, in int32. No image has a line beside each of so many samples."""
-
-# In place of the silhouette between two samples, which may be none (−1).
+# In place of the edge between two samples, which may be none (−1).
 _UNKNOWN = -2
 
 
@@ -88,20 +85,6 @@ class Silhouettes:
         """Shape of the images that the silhouettes serve, one after another: [images of each, sample of all]."""
         batch_count, height, width = self.fragments.face_ids.shape
         return images.shape[0] // batch_count, batch_count * height * width
-
-
-_Crossing = wp.types.vector(length=6, dtype=wp.int32)
-
-
-@wp.struct
-class _Crossings:
-    """Crossings between neighboring samples, a list for each image, in no order: threads share images, not lists."""
-
-    counts: wp.array(dtype=wp.int32)  # of each image
-    # of each image: sample, way to its neighbor, and vertices of the edge as each of them has it
-    items: wp.array2d(dtype=_Crossing)
-    # one item of its image that each sample has a part in: 2 item, or 2 item + 1 for the neighbor
-    claims: wp.array(dtype=wp.int32)
 
 
 # ---------------------------------------------------------------------------------------------------- edges
@@ -246,18 +229,34 @@ def _edge_of(
 
 
 @wp.func
-def _add_crossing(
-    seen: FragmentArrays, sample: int, way: int, edge: wp.vec2i, its_edge: wp.vec2i, crossings: _Crossings
+def _edge_at(
+    seen: FragmentArrays,
+    neighbors: wp.array(dtype=wp.vec3i),
+    creases: wp.array(dtype=wp.int32),
+    crossings: wp.array2d(dtype=wp.int32),
+    sample: int,
+    way: int,
+    is_neighbor: bool,
 ):
-    """Add the crossing between a sample and its neighbor, which may have an edge of its own.
-
-    Of the crossings beside a sample one claims it, any.
-    """
-    image = image_of(seen, sample)
-    crossing = wp.atomic_add(crossings.counts, image, 1)
-    crossings.items[image, crossing] = _Crossing(sample, way, edge[0], edge[1], its_edge[0], its_edge[1])
-    crossings.claims[sample] = 2 * crossing
-    crossings.claims[neighbor(sample, way, seen.width)] = 2 * crossing + 1
+    """The edge between a sample and its neighbor, if there is any, as the one or the other has it."""
+    crossing = crossings[way / 2, sample]
+    if crossing < 0:
+        return wp.vec2i(crossing, crossing)  # nothing, or where faces intersect
+    face = crossing / 3
+    corner = crossing - 3 * face
+    clip = seen.clip_positions[image_of(seen, sample)]
+    edge = _edge_of(face, corner, seen.faces, clip)
+    if creases:
+        other = neighbors[face][corner]
+        corners = seen.faces[face]
+        a = clip[corners[(corner + 1) % 3]]
+        b = clip[corners[(corner + 2) % 3]]
+        volume = orientation(clip[corners[0]], clip[corners[1]], clip[corners[2]])
+        is_crease = not _is_silhouette(face, other, a, b, volume, seen.faces, neighbors, clip)
+        # of the two samples that which the edge's line does not bound has the edge of the face beyond
+        if is_crease and ends_before(line_between(seen, sample, way, edge), way) == is_neighbor:
+            edge = _edge_of(other, _corner_before(face, other, neighbors), seen.faces, clip)
+    return edge
 
 
 @wp.func
@@ -287,15 +286,16 @@ def _find_edges(
     strips: int,
     # out
     between: wp.array2d(dtype=wp.int32),
-    crossings: _Crossings,
+    crossings: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns every ``strips``-th row and column that silhouette edges and creases of a face of an instance cut.
 
-    Both faces of an edge follow it; the one over which the surface comes to the edge adds its crossings. Several edges
-    pass between two samples, so which of them the samples see is kept, in ``between``.
+    Both faces of an edge follow it; the one over which the surface comes to the edge has its crossings. Several edges
+    pass between two samples, so which of them the samples see is kept, in ``between``: whoever writes there writes the
+    same.
     """
-    image, face, strip = wp.tid()
-    batch = first_row + image
+    row_of_faces, strip = wp.tid()
+    batch, face = split_row(first_row + row_of_faces, seen.faces.shape[0])
     clip = seen.clip_positions[batch]
     corners = seen.faces[face]
     surrounding = neighbors[face]
@@ -304,13 +304,10 @@ def _find_edges(
     for k in range(3):
         a = clip[corners[(k + 1) % 3]]
         b = clip[corners[(k + 2) % 3]]
-        is_crease = bool(False)
         is_line = a[3] > a[2] or b[3] > b[2]  # else it lies behind the near plane
         if is_line and not _is_silhouette(face, surrounding[k], a, b, volume, seen.faces, neighbors, clip):
-            is_crease = _is_crease(face, k, creases)
-            is_line = is_crease
+            is_line = _is_crease(face, k, creases)
         if is_line:
-            edge = _edge_of(face, k, seen.faces, clip)
             p = _end_on_screen(a, b, half)
             q = _end_on_screen(b, a, half)
             for axis in range(2):
@@ -336,15 +333,7 @@ def _find_edges(
                                 edge_found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
                                 between[axis, sample] = edge_found
                             if edge_found == 3 * face + k:
-                                here = edge
-                                there = edge
-                                if is_crease:
-                                    opposite_corner = _corner_before(face, surrounding[k], neighbors)
-                                    if ends_before(line_between(seen, sample, 2 * axis, edge), 2 * axis):
-                                        there = _edge_of(surrounding[k], opposite_corner, seen.faces, clip)
-                                    else:
-                                        here = _edge_of(surrounding[k], opposite_corner, seen.faces, clip)
-                                _add_crossing(seen, sample, 2 * axis, here, there, crossings)
+                                crossings[axis, sample] = edge_found
                         column += 1
                     row += strips
 
@@ -366,6 +355,8 @@ def _approach(seen: FragmentArrays, sample: int, way: int):
 
 @wp.kernel(enable_backward=False)
 def _find_intersections(
+    first_row: int,
+    worker: int,
     # in
     seen: FragmentArrays,
     neighbors: wp.array(dtype=wp.vec3i),
@@ -373,10 +364,10 @@ def _find_intersections(
     creases: wp.array(dtype=wp.int32),
     run: int,
     # out
-    crossings: _Crossings,
+    crossings: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns ``run`` samples after one another: the crossings to their right and their lower neighbors."""
-    first = wp.tid() * run
+    first = (first_row + wp.tid()) * run
     count = seen.face_ids.shape[0]
     for sample in range(first, wp.min(first + run, count)):
         here = seen.face_ids[sample]
@@ -394,40 +385,82 @@ def _find_intersections(
                         if is_face and _approach(seen, sample, way):
                             edge_found = _edge_between(seen, neighbors, creases, sample, way)
                             if edge_found < 0:
-                                edge = wp.vec2i(INTERSECTION, INTERSECTION)
-                                _add_crossing(seen, sample, way, edge, edge, crossings)
+                                crossings[axis, sample] = INTERSECTION
 
 
 # ---------------------------------------------------------------------------------------------------- entries
 
 
+@wp.func
+def _has_crossing(crossings: wp.array2d(dtype=wp.int32), sample: int, width: int):
+    """Whether a line crosses between a sample and any of its neighbors; NOTHING has all bits."""
+    before = crossings[0, wp.max(sample - 1, 0)] & crossings[1, wp.max(sample - width, 0)]
+    if sample < width:
+        before = crossings[0, wp.max(sample - 1, 0)]
+    return (before & crossings[0, sample] & crossings[1, sample]) != NOTHING
+
+
+@wp.kernel(enable_backward=False)
+def _count_entries(
+    first_row: int,
+    worker: int,
+    # in
+    crossings: wp.array2d(dtype=wp.int32),
+    width: int,
+    run: int,
+    # out
+    entries: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+):
+    """A thread owns ``run`` samples after one another: the number of each among those that have an entry, else −1."""
+    thread = first_row + wp.tid()
+    count = int(0)
+    for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
+        has_entry = _has_crossing(crossings, sample, width)
+        entries[sample] = wp.where(has_entry, count, -1)
+        count += wp.where(has_entry, 1, 0)
+    if counts:
+        counts[thread] = count
+
+
 @wp.kernel(enable_backward=False)
 def _make_entries(
+    first_row: int,
+    worker: int,
     # in
-    crossings: _Crossings,
-    first_entries: wp.array(dtype=wp.int32),
-    width: int,
-    has_all: bool,
+    crossings: wp.array2d(dtype=wp.int32),
+    seen: FragmentArrays,
+    neighbors: wp.array(dtype=wp.vec3i),
+    creases: wp.array(dtype=wp.int32),
+    ends: wp.array(dtype=wp.int32),
+    run: int,
     # out
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     entries: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a crossing: it goes to the entries of its two samples; all outputs are −1 before.
+    """A thread owns ``run`` samples after one another, whose entries begin where those of the run before end.
 
-    An image's entries begin at its first one. If there is an entry for all samples, it is the sample's own.
+    If that is not known, the number of the sample is the number of its entry.
     """
-    image, number = wp.tid()
-    if number < crossings.counts[image]:
-        crossing = crossings.items[image, number]
-        for end in range(2):
-            sample = crossing[0]
-            if end == 1:
-                sample = neighbor(sample, crossing[1], width)
-            entry = wp.where(has_all, sample, first_entries[image] + crossings.claims[sample])
-            samples[entry] = sample
-            entries[sample] = entry
-            edges[entry, crossing[1] + end] = wp.vec2i(crossing[2 + 2 * end], crossing[3 + 2 * end])
+    thread = first_row + wp.tid()
+    first_entry = int(0)
+    if ends and thread > 0:
+        first_entry = ends[thread - 1]
+    for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
+        number = entries[sample]
+        if number >= 0 or not ends:
+            entry = wp.where(number >= 0, first_entry + number, -1)
+            if not ends:
+                entry = sample
+            samples[entry] = wp.where(number >= 0, sample, -1)
+            for way in range(4):
+                edge = wp.vec2i(NOTHING, NOTHING)
+                first = wp.where(way % 2 == 0, sample, neighbor(sample, way, seen.width))
+                if number >= 0 and first >= 0:
+                    edge = _edge_at(seen, neighbors, creases, crossings, first, way - way % 2, way % 2 == 1)
+                edges[entry, way] = edge
+            entries[sample] = wp.where(number >= 0, entry, -1)
 
 
 def find_silhouettes(
@@ -459,37 +492,33 @@ def find_silhouettes(
     device, sample_count = faces.device, fragments.face_ids.size
     if sample_count > MOST_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MOST_SAMPLES}")
-    seen, crossings, strips = make_fragment_arrays(fragments, faces, clip_positions), _Crossings(), strip_count(device)
-    image_count = len(clip_positions)
-    crossings.counts = zeros(image_count, dtype=wp.int32, device=device)
-    room = min(2 * sample_count // image_count, _MOST_CROSSINGS)
-    crossings.items = empty((image_count, room), dtype=_Crossing, device=device)
-    crossings.claims = empty(sample_count, dtype=wp.int32, device=device)
-    between = wp.full((2, sample_count), _UNKNOWN, dtype=wp.int32, device=device)
+    seen, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
+    between, crossings = empty((2, sample_count), wp.int32, device), empty((2, sample_count), wp.int32, device)
+    between.fill_(_UNKNOWN)
+    crossings.fill_(NOTHING)  # else 3 face + corner of the edge, or INTERSECTION
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)
     launch(
         _find_edges,
-        (image_count, faces.shape[0], strips),
+        (len(clip_positions) * faces.shape[0], strips),
         cost=_FACE_COST,
         inputs=[seen, neighbors, creases, strips],
         outputs=[between, crossings],
     )
+    run = run_length(device, seen.width)
+    dim = -(-sample_count // run)
     if bodies is not None:
         check.shape("bodies", bodies.shape, faces.shape)
-        run = run_length(device, seen.width)
-        dim = -(-sample_count // run)
-        launch(_find_intersections, dim, inputs=[seen, neighbors, bodies, creases, run], outputs=[crossings])
-    has_all = bool(device.is_capturing)
-    if has_all:
-        maximum, entry_count, first_entries = room, sample_count, crossings.counts  # the last do not matter
-    else:
-        counts = crossings.counts.numpy()
-        maximum, entry_count = int(counts.max()), 2 * int(counts.sum())
-        first_entries = from_numpy(2 * (np.cumsum(counts) - counts), dtype=wp.int32, device=device)
-    samples = wp.full(entry_count, -1, dtype=wp.int32, device=device)
-    edges = wp.full((entry_count, 4), wp.vec2i(NOTHING, NOTHING), dtype=wp.vec2i, device=device)
-    entries = wp.full(sample_count, -1, dtype=wp.int32, device=device)
-    inputs = [crossings, first_entries, seen.width, has_all]
-    launch(_make_entries, (image_count, maximum), inputs=inputs, outputs=[samples, edges, entries])
+        inputs = [seen, neighbors, bodies, creases, run]
+        launch(_find_intersections, dim, cost=_SAMPLE_COST * run, inputs=inputs, outputs=[crossings])
+    entries, ends = empty(sample_count, wp.int32, device), None if device.is_capturing else empty(dim, wp.int32, device)
+    inputs = [crossings, seen.width, run]
+    launch(_count_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[entries, ends])
+    entry_count = sample_count
+    if ends is not None:
+        wp.utils.array_scan(ends, ends)
+        entry_count = int(ends[-1:].numpy()[0]) if dim else 0
+    samples, edges = empty(entry_count, wp.int32, device), empty((entry_count, 4), wp.vec2i, device)
+    inputs = [crossings, seen, neighbors, creases, ends, run]
+    launch(_make_entries, dim, cost=_ENTRY_COST * run, inputs=inputs, outputs=[samples, edges, entries])
     return Silhouettes(samples, edges, measure_areas(samples, edges, entries, seen), entries, fragments, faces)
