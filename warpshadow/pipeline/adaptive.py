@@ -13,7 +13,7 @@ from warpshadow.device.launch import detached
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.by_spheres import SphereMethod
 from warpshadow.pipeline.lighting import LitPoints
-from warpshadow.stages.quadtree import Quadtree, find_quadtree, probe_grid
+from warpshadow.stages.quadtree import Quadtree, find_quadtree, keys_of, probe_grid
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.receivers import points_seen
 from warpshadow.stages.sample_receivers import see_samples
@@ -44,7 +44,7 @@ def find_squares(
     row, column = probe_grid(sides.shape[1:], supersampling)
     places = _by_tiles(len(row), len(column))
     probes = (row[:, None] * sides.shape[2] + column).ravel()[places]
-    probe_keys = np.append(keys, -1)[sides.numpy().reshape(len(sides), -1)[:, probes]]
+    probe_keys = keys_of(sides, keys, supersampling).reshape(len(sides), -1)[:, places]
     body_of_probe = np.where(probe_keys < 0, -1, probe_keys % len(is_adaptive))
     shares = np.zeros(probe_keys.shape, np.float32)
     with unrecorded():
@@ -70,8 +70,8 @@ def find_squares(
 def _keys(is_adaptive: bytes, first_face: bytes) -> np.ndarray:
     """For each side of the bodies' faces, from the front and then from behind, which body's it is; −1 for others."""
     adaptive, starts = np.frombuffer(is_adaptive, bool), np.frombuffer(first_face, int)
-    bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive)), -1), np.diff(starts))
-    return np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)])
+    bodies = np.repeat(np.where(adaptive, np.arange(len(adaptive), dtype=np.int32), -1), np.diff(starts))
+    return np.concatenate([bodies, np.where(bodies < 0, -1, len(adaptive) + bodies)]).astype(np.int32)
 
 
 @functools.lru_cache(maxsize=16)

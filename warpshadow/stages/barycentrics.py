@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import rows
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import zeros
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.screen import center, relative, relative_adjoint, volumes
 
@@ -84,17 +84,19 @@ def _find_barycentrics(
     # out
     barycentrics: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a run of samples; barycentrics are zero before."""
+    """A thread owns a run of samples."""
     instance, thread = split_row(first_row + wp.tid(), face_ids.shape[1] // run)
     clip = clip_positions[instance]
     height = face_ids.shape[1] // width
     row = thread * run / width
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[instance, sample]
+        weights = wp.vec3()
         if face >= 0:
             corners = faces[face]
             ray = center(sample - row * width, row, width, height)
-            barycentrics[instance, sample] = _weights(clip[corners[0]], clip[corners[1]], clip[corners[2]], ray)
+            weights = _weights(clip[corners[0]], clip[corners[1]], clip[corners[2]], ray)
+        barycentrics[instance, sample] = weights
 
 
 @wp.kernel(enable_backward=False)
@@ -160,6 +162,6 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
             inputs=[*inputs, rows(adj_barycentrics)],
             sums=[clip_positions.grad],
         ),
-        result=zeros(face_ids.shape, dtype=wp.vec3, device=device),
+        result=empty(face_ids.shape, dtype=wp.vec3, device=device),
         variables=[clip_positions],
     )

@@ -5,7 +5,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.interpolation import at_point
 from warpshadow.stages.rasterization import Fragments
@@ -27,7 +27,7 @@ def _radiance(
     # out
     samples: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a run of samples of an instance; they are zero before."""
+    """A thread owns a run of samples of an instance."""
     row, column = wp.tid()
     batch, thread = find_run(worker, first_row + row, column)
     view = instance_in(batch, face_ids.shape[0])
@@ -39,6 +39,8 @@ def _radiance(
             received = at_point(of_receivers, faces[face], barycentrics[view, sample])
             color = wp.cw_mul(received, of_samples[sample])
             samples[batch, sample] = wp.vec4(color[0], color[1], color[2], 1.0)
+        else:
+            samples[batch, sample] = wp.vec4()
 
 
 def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
@@ -59,7 +61,7 @@ def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, al
     check.shape("albedo", albedo.shape, ("batch", height, width))
     count = common_batch({"fragments": fragments.face_ids, "shading": shading, "albedo": albedo})
     run = run_length(shading.device, width)
-    samples = zeros((count, height * width), dtype=wp.vec4, device=shading.device)
+    samples = empty((count, height * width), dtype=wp.vec4, device=shading.device)
     launch(
         _radiance,
         run_dimensions(shading.device, height * width // run, count),

@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import zeros
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.rasterization import Fragments
@@ -69,7 +69,7 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
         # out
         image: wp.array2d(dtype=dtype),
     ):
-        """A thread owns a run of samples of an instance; the image is zero before."""
+        """A thread owns a run of samples of an instance."""
         row, column = wp.tid()
         instance, thread = find_run(worker, first_row + row, column)
         view = instance_in(instance, face_ids.shape[0])
@@ -78,6 +78,8 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
             face = face_ids[view, sample]
             if face >= 0:
                 image[instance, sample] = at_point(values, faces[face], barycentrics[view, sample])
+            else:
+                image[instance, sample] = dtype(0.0)
 
     return interpolate
 
@@ -101,7 +103,7 @@ def interpolate(fragments: Fragments, faces: wp.array, attributes: wp.array) -> 
         raise ValueError(f"attributes: got dtype {attributes.dtype.__name__}, expected float32 or a vector of them")
     device, width = face_ids.device, face_ids.shape[2]
     run = run_length(device, width)
-    image = zeros((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
+    image = empty((instances, face_ids[0].size), dtype=attributes.dtype, device=device)
     launch(
         _make_interpolate(attributes.dtype),
         run_dimensions(device, face_ids[0].size // run, instances),

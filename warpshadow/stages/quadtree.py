@@ -228,4 +228,5 @@ def find_quadtree(
 def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
     """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
     row, column = probe_grid(sides.shape[1:], supersampling)
-    return np.append(keys, -1)[sides.numpy()[:, row[:, None], column]]
+    seen = sides.numpy()[:, row[:, None], column]
+    return np.where(seen < 0, -1, keys[seen]) if len(keys) else np.full(seen.shape, -1)

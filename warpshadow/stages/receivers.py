@@ -13,13 +13,16 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy
+from warpshadow.device.memory import empty, from_numpy, zeros
+from warpshadow.device.parallel import run_length
 from warpshadow.stages.interpolation import at_point
 from warpshadow.stages.quadtree import Quadtree
 from warpshadow.stages.rasterization import Fragments
 from warpshadow.stages.sample_receivers import SeenSurface, Span, find_sample_receivers, spans_of
 from warpshadow.stages.sides import split_side, split_sides
 from warpshadow.stages.silhouettes.find import Silhouettes
+
+_MARK_COST = 5.0  # nanoseconds that a sample takes, to mark the corners of its face
 
 
 class Receivers(NamedTuple):
@@ -276,6 +279,30 @@ def points_seen(positions: wp.array, normals: wp.array, faces: wp.array, seen: F
     return _points(count, positions, normals, faces, none, seen)
 
 
+@wp.kernel(enable_backward=False)
+def _mark_corners(
+    first_row: int,
+    worker: int,
+    # in
+    sides: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    run: int,
+    # out
+    takes_part: wp.array2d(dtype=wp.bool),
+):
+    """A thread owns a run of samples: it marks the corners of the sides that they see."""
+    thread = first_row + wp.tid()
+    last = int(-1)
+    for sample in range(thread * run, (thread + 1) * run):
+        side = sides[sample]
+        if side != last and side >= 0:
+            face, is_back = split_side(side, faces.shape[0])
+            corners = faces[face]
+            for k in range(3):
+                takes_part[wp.where(is_back, 1, 0), corners[k]] = True
+        last = side
+
+
 def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
     """Find the vertices that have a part in an image: corners of visible faces, and of edges at silhouettes.
 
@@ -288,17 +315,23 @@ def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: 
         bool of shape [1, vertex], or [2, vertex] where fragments have sides: the union over all instances, so that all
         have as many receivers.
     """
-    faces, edges, face_count = silhouettes.faces.numpy(), silhouettes.edges.numpy(), len(silhouettes.faces)
     sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
-    is_seen = np.zeros(side_count * face_count + 1, bool)
-    is_seen[sides.numpy()] = True  # the last item is for samples that see none
-    takes_part = np.zeros((side_count, vertex_count), bool)
+    device, face_count = sides.device, len(silhouettes.faces)
+    corners = zeros((side_count, vertex_count), dtype=wp.bool, device=device)
+    run = run_length(device, sides.shape[2])
+    launch(
+        _mark_corners,
+        sides.size // run,
+        cost=_MARK_COST * run,
+        inputs=[sides.flatten(), silhouettes.faces, run],
+        outputs=[corners],
+    )
+    takes_part, edges = corners.numpy(), silhouettes.edges.numpy()
+    is_edge = edges >= 0
     side_of_edge = np.zeros(edges.shape, int)
     if side_count == 2:
         # an edge is seen from the side that one of the samples beside it sees, each of which has an entry for it
         _, is_back = split_sides(sides.numpy().ravel()[silhouettes.samples.numpy()], face_count)
         side_of_edge[:] = is_back[:, None, None]
-    for side in range(side_count):
-        takes_part[side, faces[is_seen[side * face_count : (side + 1) * face_count]]] = True
-    takes_part[side_of_edge[edges >= 0], edges[edges >= 0]] = True
+    takes_part[side_of_edge[is_edge], edges[is_edge]] = True
     return takes_part

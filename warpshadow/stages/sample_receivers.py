@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import rows
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.parallel import run_length, split_row
@@ -372,8 +372,7 @@ def find_sample_receivers(
         ],
         outputs=[firsts, weights, is_first],
     )
-    names = np.unique(bodies[wants_samples])
-    rooms = np.searchsorted(names, bodies)
+    names, rooms, rooms_there = _rooms(bodies, wants_samples, device)
     triangles = np.empty((0, 3), np.int32)
     numbers, ends = None, sample_count * np.arange(len(names) + 1)
     if not device.is_capturing:
@@ -396,7 +395,7 @@ def find_sample_receivers(
         _see_fragments,
         view_count * (sample_count // run),
         cost=_SAMPLE_COST * run,
-        inputs=[sides, firsts, is_first, numbers, constant(rooms, wp.int32, device), side_count, run],
+        inputs=[sides, firsts, is_first, numbers, rooms_there, side_count, run],
         outputs=[own_sides, samples],
     )
     seen_sides, counts = (empty(samples.shape, dtype=wp.int32, device=device) for _ in range(2))
@@ -423,6 +422,16 @@ def find_sample_receivers(
             if end > first
         ),
     )
+
+
+@cached_by_values
+def _rooms(
+    bodies: np.ndarray, wants_samples: np.ndarray, device: wp.DeviceLike
+) -> tuple[np.ndarray, np.ndarray, wp.array]:
+    """The bodies whose samples have receivers, and for each face which of them it is of; that for the device, too."""
+    names = np.unique(bodies[wants_samples])
+    rooms = np.searchsorted(names, bodies)
+    return names, rooms, constant(rooms, wp.int32, device)
 
 
 def _in_rooms(view: np.ndarray, room: np.ndarray, view_count: int, room_count: int) -> tuple[np.ndarray, np.ndarray]:

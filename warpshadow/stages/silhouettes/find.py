@@ -54,8 +54,8 @@ _SNAP = 1.0 / 2048.0
 _FACE_COST, _SAMPLE_COST, _ENTRY_COST = 50.0, 4.0, 2.0
 """Nanoseconds that a face takes, if it is small, a sample that is looked at for an intersection, and for an entry."""
 
-# In place of the edge between two samples, which may be none (−1).
-_UNKNOWN = -2
+# In place of the edge between two samples: it was not looked for yet, or there is none.
+_UNKNOWN, _NO_EDGE = NOTHING, -2
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +331,7 @@ def _find_edges(
                             edge_found = between[axis, sample]
                             if edge_found == _UNKNOWN:
                                 edge_found = _edge_between(seen, neighbors, creases, sample, 2 * axis)
-                                between[axis, sample] = edge_found
+                                between[axis, sample] = wp.where(edge_found < 0, _NO_EDGE, edge_found)
                             if edge_found == 3 * face + k:
                                 crossings[axis, sample] = edge_found
                         column += 1
@@ -493,9 +493,8 @@ def find_silhouettes(
     if sample_count > MOST_SAMPLES:
         raise ValueError(f"fragments: got {sample_count} samples in all, expected at most {MOST_SAMPLES}")
     seen, strips = make_fragment_arrays(fragments, faces, clip_positions), strip_count(device)
-    between, crossings = empty((2, sample_count), wp.int32, device), empty((2, sample_count), wp.int32, device)
-    between.fill_(_UNKNOWN)
-    crossings.fill_(NOTHING)  # else 3 face + corner of the edge, or INTERSECTION
+    found = wp.full((4, sample_count), NOTHING, dtype=wp.int32, device=device)
+    between, crossings = found[:2], found[2:]  # in the latter 3 face + corner of an edge, or INTERSECTION
     if creases is not None:
         check.shape("creases", creases.shape, faces.shape)
     launch(
