@@ -1,6 +1,7 @@
 """Picture files: what each format gives, what is refused and how, and that writing is all or nothing."""
 
 import struct
+import sys
 import zlib
 
 import numpy as np
@@ -162,13 +163,38 @@ def test_an_absurd_size_is_refused_by_the_header(tmp_path, window, message):
 
 
 def png16(samples):
-    """A PNG file of 16 bits per channel, which Pillow writes only in gray."""
+    """A PNG file of 16 bits per channel, which Pillow writes only in gray; the second row is filtered."""
     height, width, channels = samples.shape
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in samples)
+    rows = [row.astype(">u2").tobytes() for row in samples]
+    left = bytes(2 * channels) + rows[1][: -2 * channels]
+    rows[1] = bytes((here - before) % 256 for here, before in zip(rows[1], left, strict=True))
+    data = zlib.compress(b"".join(bytes([number == 1]) + row for number, row in enumerate(rows)))
     header = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
-    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    chunks = [(b"IHDR", header), (b"IDAT", data), (b"IEND", b"")]
     packed = (struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in chunks)
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def tiff(samples, *, order="<", packed=False, tags=None):
+    """A TIFF file of one strip, packed as ZIP or not; tags are numbers or bytes, in place of the usual ones."""
+    height, width, channels = samples.shape
+    data = samples.astype(samples.dtype.newbyteorder(order)).tobytes()
+    data = zlib.compress(data) if packed else data
+    entries = {256: width, 257: height, 258: (8 * samples.itemsize,) * channels, 259: 8 if packed else 1}
+    entries |= {262: 1 if channels == 1 else 2, 273: 8, 277: channels, 278: height, 279: len(data)}
+    entries |= {338: 2} if channels == 4 else {}
+    entries = dict(sorted((entries | (tags or {})).items()))
+    start = 8 + len(data) + len(data) % 2
+    after, directory, more = start + 2 + 12 * len(entries) + 4, b"", b""
+    for tag, value in entries.items():
+        kind, values = (1, value) if isinstance(value, bytes) else (4, value if isinstance(value, tuple) else (value,))
+        content = bytes(values) if kind == 1 else struct.pack(f"{order}{len(values)}I", *values)
+        if len(content) > 4:
+            content, more = struct.pack(f"{order}I", after + len(more)), more + content
+        directory += struct.pack(f"{order}HHI", tag, kind, len(values)) + content.ljust(4, b"\0")
+    magic = (b"II" if order == "<" else b"MM") + struct.pack(f"{order}HI", 42, start)
+    directory = struct.pack(f"{order}H", len(entries)) + directory + bytes(4)
+    return magic + data.ljust(start - 8, b"\0") + directory + more
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA"])
@@ -192,15 +218,52 @@ def test_16_bit_gray_is_decoded_in_full(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "a.png").ravel(), expected, rtol=2e-7)
 
 
-@pytest.mark.parametrize("channels", [2, 3, 4])
-def test_16_bit_color_warns_that_it_is_read_at_8_bits(tmp_path, channels):
-    codes = RANDOM.integers(0, 65536, (4, 6, channels))
+def decoded_16(codes):
+    """Linear values of 16-bit codes, whose fourth channel is alpha."""
+    decoded = np.vectorize(srgb_twin)(codes / 65535)
+    decoded[..., 3:] = codes[..., 3:] / 65535
+    return decoded
+
+
+FILES_16 = {
+    "a.png": png16,
+    "a.tif": tiff,
+    "big.tiff": lambda codes: tiff(codes, order=">"),
+    "zip.tif": lambda codes: tiff(codes, packed=True),
+}
+
+
+@pytest.mark.parametrize("name", FILES_16)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_16_bit_color_is_decoded_in_full(tmp_path, name, channels):
+    codes = RANDOM.integers(0, 65536, (4, 6, channels)).astype(np.uint16)
+    (tmp_path / name).write_bytes(FILES_16[name](codes))
+    np.testing.assert_allclose(read_image(tmp_path / name), decoded_16(codes), rtol=2e-7)
+
+
+def test_16_bit_gray_with_alpha_warns_that_it_is_read_at_8_bits(tmp_path):
+    codes = RANDOM.integers(0, 65536, (4, 6, 2))
     (tmp_path / "a.png").write_bytes(png16(codes))
     with pytest.warns(UserWarning, match="16-bit color is read at 8 bits") as caught:
         read = read_image(tmp_path / "a.png")
     assert caught[0].filename == __file__
     expected = [srgb_twin(code / 255) for code in (codes[..., 0] // 256).ravel()]
     np.testing.assert_allclose(read[..., 0].ravel(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_tiff_is_turned_upright(tmp_path, dtype, channels):
+    codes = RANDOM.integers(0, np.iinfo(dtype).max, (4, 6, channels)).astype(dtype)
+    (tmp_path / "a.tif").write_bytes(tiff(codes, tags={274: 6}))
+    expected = np.vectorize(srgb_twin)(np.rot90(codes, -1) / np.iinfo(dtype).max)
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif"), expected, rtol=2e-7)
+
+
+def test_a_tiff_of_other_numbers_is_refused(tmp_path):
+    (tmp_path / "a.tif").write_bytes(tiff(np.ones((4, 6, 1), np.float32), tags={339: 3}))
+    with pytest.raises(ImageError, match="a.tif: got 32 bits for each color, expected 8 or 16"):
+        read_image(tmp_path / "a.tif")
 
 
 def test_palettes_become_colors(tmp_path):
@@ -284,6 +347,47 @@ def test_a_truncated_png_or_jpeg_is_refused(tmp_path, suffix, keep, message):
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ImageError, match=message):
         read_image(path)
+
+
+# ------------------------------------------------------------------------------------------------ raw files
+
+
+WHITE = 4000  # of the sensor below
+
+
+def write_dng(path, color, **tags):
+    """A DNG file of a camera that sees one color, in the primaries of XYZ, in a mosaic of red, green, green, blue."""
+    mosaic = np.tile(np.array([[color[0], color[1]], [color[1], color[2]]]), (16, 16))
+    codes = np.round(mosaic * WHITE).astype(np.uint16)[..., None]
+    camera = {254: 0, 262: 32803, 271: b"maker", 272: b"model", 33421: (2, 2), 33422: bytes([0, 1, 1, 2])}
+    camera |= {50706: bytes([1, 4, 0, 0]), 50717: WHITE, 50721: (1, 0, 0, 0, 1, 0, 0, 0, 1), 50728: (1, 1, 1)}
+    path.write_bytes(tiff(codes, tags=camera | tags))
+    return path
+
+
+def test_a_raw_file_is_linear_and_1_where_the_sensor_saturates(tmp_path):
+    pytest.importorskip("rawpy")
+    dim, bright = (read_image(write_dng(tmp_path / "a.dng", value * np.ones(3))) for value in (0.1, 0.4))
+    assert dim.shape == (32, 32, 3) and dim.dtype == np.float32
+    np.testing.assert_allclose(bright, 4 * dim, rtol=2e-3)  # of codes of the sensor
+    np.testing.assert_allclose(read_image(write_dng(tmp_path / "a.dng", np.ones(3))), 1, rtol=1e-3)
+    np.testing.assert_allclose(dim, 0.1, rtol=5e-3)
+
+
+def test_a_raw_file_that_is_none_is_refused(tmp_path):
+    pytest.importorskip("rawpy")
+    (tmp_path / "a.cr2").write_bytes(b"something else entirely\n" * 9)
+    with pytest.raises(ImageError, match="a.cr2: not a raw file that LibRaw reads"):
+        read_image(tmp_path / "a.cr2")
+    with pytest.raises(ImageError, match="got 32 x 32 pixels, expected 1 to 99"):
+        read_image(write_dng(tmp_path / "a.dng", np.ones(3)), max_pixels=99)
+
+
+def test_a_raw_file_without_rawpy_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    (tmp_path / "a.nef").write_bytes(b"II")
+    with pytest.raises(ImportError, match=r'.nef needs the package rawpy: pip install "warpshadow\[raw\]"'):
+        read_image(tmp_path / "a.nef")
 
 
 # ------------------------------------------------------------------------------------------------ all formats

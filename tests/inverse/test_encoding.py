@@ -10,7 +10,7 @@ from PIL import Image, ImageCms, PngImagePlugin
 import warpshadow as ws
 from warpshadow.assets.lens import distorted, undistorted
 from warpshadow.inverse import Exposure, Problem, Target, load_fit
-from warpshadow.inverse.encoding import guess_encoding
+from warpshadow.inverse.encoding import guess_encoding, noted
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import Stage
 from warpshadow.scene.files import parse_camera
@@ -62,6 +62,9 @@ def test_sixteen_bits_without_a_word_are_linear(tmp_path):
     with pytest.warns(UserWarning, match='taken for encoding = "linear", since it has 16 bits'):
         target = Target(tmp_path / "gray.png")
     np.testing.assert_allclose(target.image[..., 0], codes / 65535, atol=1e-5)
+    Image.fromarray(codes).save(tmp_path / "gray.tif")
+    with pytest.warns(UserWarning, match='taken for encoding = "linear", since it has 16 bits'):
+        np.testing.assert_allclose(Target(tmp_path / "gray.tif").image, target.image)
     assert Target(tmp_path / "gray.png", encoding="srgb").image[0, 1, 0] < 0.6 * target.image[0, 1, 0]
 
 
@@ -71,6 +74,65 @@ def test_other_files_are_as_their_formats_are(tmp_path):
     np.testing.assert_allclose(Target(tmp_path / "a.exr", encoding=2.2).image, (CODES / 255) ** 2.2, atol=1e-6)
     ws.write_image(tmp_path / "a.jpg", CODES / 255.0)
     assert guess_encoding(tmp_path / "a.jpg") == "srgb"
+
+
+def camera_response(radiance):
+    """A tone curve of no known form, from 0 to 2 in radiance."""
+    return np.log1p(9 * radiance / 2) / np.log(10)
+
+
+def test_a_response_curve_is_undone(tmp_path):
+    radiance = np.linspace(0, 2, 4000)
+    samples = np.stack([radiance, camera_response(radiance)], axis=1)
+    truth = 2 * np.random.default_rng(0).random((4, 6, 3))
+    Image.fromarray(np.round(255 * camera_response(truth)).astype(np.uint8)).save(tmp_path / "photo.png")
+    target = Target(tmp_path / "photo.png", encoding=samples, saturation=0.9)
+    np.testing.assert_allclose(target.image, truth, atol=0.012)  # half a code at a slope of up to 4.6 / 255
+    np.testing.assert_array_equal(target.saturated, target.image >= 2 * (10**0.9 - 1) / 9 - 1e-4)
+    np.savetxt(tmp_path / "curve.csv", samples, delimiter=",", header="radiance,value", comments="")
+    np.testing.assert_allclose(Target(tmp_path / "photo.png", encoding=tmp_path / "curve.csv").image, target.image)
+    ws.write_image(tmp_path / "photo.exr", camera_response(truth))  # of a linear file, too
+    np.testing.assert_allclose(Target(tmp_path / "photo.exr", encoding=samples).image, truth, atol=1e-5)
+
+
+def test_a_response_curve_may_differ_by_color(tmp_path):
+    codes = CODES / 255
+    Image.fromarray(CODES).save(tmp_path / "photo.png")
+    value = np.linspace(0, 1, 256)[:, None]
+    target = Target(tmp_path / "photo.png", encoding=np.concatenate([value * (3.0, 2.0, 1.0), value], axis=1))
+    np.testing.assert_allclose(target.image, codes * (3.0, 2.0, 1.0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        ([[0, 0], [1, 255]], "got a curve of values from 0 to 255, expected all from 0 to 1; of codes of 8 bits"),
+        ([[0, 0], [0.5, 0.6], [0.4, 1]], r"got \[0.5, 0.6\] and then \[0.4, 1.0\] in a curve"),
+        ([[0, 0, 0], [1, 1, 1]], r"got a curve of shape \(2, 3\), expected rows of radiance and value"),
+        ([[0, 0], [np.nan, 1]], "got 1 NaN or Inf values"),
+    ],
+)
+def test_curves_that_are_none_are_refused(tmp_path, samples, message):
+    Image.fromarray(CODES).save(tmp_path / "photo.png")
+    with pytest.raises(ValueError, match=message):
+        Target(tmp_path / "photo.png", encoding=samples)
+    np.savetxt(tmp_path / "curve.csv", samples, delimiter=",")
+    with pytest.raises(ValueError, match=f"curve.csv: .*{message}"):
+        Target(tmp_path / "photo.png", encoding=tmp_path / "curve.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("value,radiance\n0,0\n1,1", 'got columns value, radiance, expected the last to be "value"'),
+        ("0,0\n1,one", "could not convert string to float: 'one'"),
+        ("", r"got a curve of shape \(0,\)"),
+    ],
+)
+def test_files_that_hold_no_curve_are_refused(tmp_path, text, message):
+    (tmp_path / "curve.csv").write_text(text)
+    with pytest.raises(ValueError, match=f"curve.csv: encoding: {message}"):
+        Target(tmp_path / "photo.png", encoding=tmp_path / "curve.csv")
 
 
 def test_exposure_and_white_balance_are_divided_out():
@@ -168,6 +230,20 @@ def test_a_fit_file_has_the_same_keys(tmp_path):
     assert target.camera.intrinsics[0, 2] == 2.5 and problem.free == (Exposure(white_balance=True),)
     plain = CODES / 255 / np.array([2.0, 4.0, 2.0])
     np.testing.assert_allclose(target.image[1, 2], plain[1, 2], atol=0.02)
+
+
+def test_a_fit_file_names_a_response_curve(tmp_path):
+    ws.write_scene(one_ball(), tmp_path)
+    lines = 'scene = "scene.toml"\n[[target]]\nimage = "photo.png"\nencoding = "curve.csv"\n[free]\nlight = true\n'
+    (tmp_path / "fit.toml").write_text(lines)
+    codes = CODES.repeat(3, axis=0).repeat(2, axis=1)
+    Image.fromarray(codes).save(tmp_path / "photo.png")
+    with pytest.raises(FileNotFoundError, match="encoding: .*curve.csv"):
+        load_fit(tmp_path / "fit.toml")
+    (tmp_path / "curve.csv").write_text("# of the camera\nradiance,value\n0,0\n0.2,0.5\n1,1\n")
+    (target,) = load_fit(tmp_path / "fit.toml").problem.targets
+    np.testing.assert_allclose(target.image, np.interp(codes / 255, (0, 0.5, 1), (0, 0.2, 1)), atol=1e-5)
+    assert noted(target.encoding) == "curve.csv"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -1,15 +1,17 @@
-"""Pixel files: OpenEXR, Radiance, PNG and JPEG, as linear float32 arrays. Nothing here knows about light.
+"""Pixel files: OpenEXR, Radiance, PNG, JPEG, TIFF and raw, as linear float32 arrays. Nothing here knows about light.
 
-Row 0 is the top. PNG and JPEG hold sRGB, which is decoded and encoded exactly; alpha is linear everywhere.
+Row 0 is the top. PNG, JPEG and TIFF hold sRGB, which is decoded and encoded exactly; alpha is linear everywhere.
 """
 
 from __future__ import annotations
 
 import functools
 import io
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,10 @@ from warpshadow.assets import files
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.picture import SUFFIXES, Picture
 from warpshadow.assets.radiance import read_radiance
+from warpshadow.assets.raw import RAW_SUFFIXES, read_raw
 from warpshadow.check import AnyPath
+
+INTEGER_SUFFIXES = (*SUFFIXES, ".tif", ".tiff")  # suffixes of files of integers, which are taken for sRGB
 
 
 class ImageError(ValueError):
@@ -29,11 +34,13 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
     """Read a picture as linear values.
 
     OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
-    that has them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG, JPEG:
-    gray or RGB, with or without alpha, taken for sRGB; turned upright as their EXIF orientation says.
+    that has them ("layer.R", …); the data window alone. Radiance: RGBE, its exposure divided out. PNG, JPEG, TIFF:
+    gray or RGB of 8 or 16 bits, with or without alpha, taken for sRGB; turned upright as their EXIF orientation says.
+    Raw files of cameras (.dng, .nef, .cr2, …), by LibRaw: linear, white balance as the camera has it, 1 where the
+    sensor saturates.
 
     Args:
-        path: A .exr, .hdr, .pic, .png, .jpg or .jpeg file.
+        path: An .exr, .hdr, .pic, .png, .jpg, .jpeg, .tif or .tiff file, or a raw file, which needs the extra ``raw``.
         part: Name or index of the part of a multi-part OpenEXR file; the first by default.
         max_pixels: Refuse larger pictures, judged by the header before any pixel is read.
     Returns:
@@ -41,6 +48,7 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
     Raises:
         ImageError: for a file of another format, truncated, deep or too large, or with other channels.
         FileNotFoundError: when the file does not exist.
+        ImportError: for a raw file when rawpy, the extra ``raw``, is not installed.
     """
     path = check.path("path", path)
     reader = _READERS.get(path.suffix.lower())
@@ -246,42 +254,96 @@ def _write_exr(path: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray])
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels, **layers}).write(str(path))
 
 
-# ----------------------------------------------------------------------------------------------- PNG and JPEG
+# ----------------------------------------------------------------------------------------- PNG, JPEG and TIFF
 
 
 def _read_pillow(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
-    from PIL import Image, ImageOps
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # max_pixels is the limit here
-            picture = Image.open(path, formats=["PNG", "JPEG"])
-    except Image.DecompressionBombError as error:
-        raise ImageError(str(error)) from error
-    except Image.UnidentifiedImageError as error:
-        raise ImageError("not a PNG or JPEG file, or its header is damaged") from error
-    with picture:
-        _check_size(*picture.size, max_pixels)
-        has_alpha = picture.has_transparency_data
-        is_16_bit = "16B" in str(picture.tile)  # how its pixels are stored; loading them forgets it
-        _load(picture)
-        ImageOps.exif_transpose(picture, in_place=True)
-        if picture.mode.startswith("I"):  # 16-bit gray
-            codes = np.asarray(picture).astype(np.uint16)
-        else:
-            if is_16_bit:
-                check.warn(f"{path}: 16-bit color is read at 8 bits")
-            color = "L" if picture.mode in ("1", "L", "LA") else "RGB"
-            codes = np.asarray(picture.convert({"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color))
-    codes = codes.reshape(*codes.shape[:2], -1)
+    with _open(path) as picture:
+        width, height = picture.size
+        _check_size(width, height, max_pixels)
+        codes, has_alpha = _codes(path, picture)
     code_max = np.iinfo(codes.dtype).max
     pixels = srgb_to_linear(np.arange(code_max + 1) / code_max).astype(np.float32)[codes]
-    if codes.shape[2] in (2, 4):
+    if has_alpha:
         pixels[..., -1] = codes[..., -1] / np.float32(code_max)
     return pixels
 
 
-def _load(picture) -> None:
+def _open(path: Path) -> Any:
+    from PIL import Image
+
+    formats = ["PNG", "JPEG"] if path.suffix.lower() in SUFFIXES else ["TIFF"]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # max_pixels is the limit here
+            picture: Any = Image.open(path, formats=formats)
+    except Image.DecompressionBombError as error:
+        raise ImageError(str(error)) from error
+    except Image.UnidentifiedImageError as error:
+        raise ImageError(f"not a {' or '.join(formats)} file, or its header is damaged") from error
+    bits = set(picture.tag_v2.get(_BITS_PER_SAMPLE, ())) if picture.format == "TIFF" else set()
+    if bits - {1, 8, 16}:
+        raise ImageError(f"got {max(bits)} bits for each color, expected 8 or 16")
+    picture.filename = ""  # else Pillow maps gray TIFF files into memory, and garbles those that are to be turned
+    return picture
+
+
+def _codes(path: Path, picture: Any) -> tuple[np.ndarray, bool]:
+    """Codes of 8 or 16 bits, [height, width, channel], upright; and whether the last channel is alpha."""
+    has_alpha = picture.has_transparency_data
+    is_16_bit, low_tiles = is_wide(picture), _low_tiles(picture)  # which loading forgets
+    upper = _loaded(picture)
+    if upper.mode.startswith("I"):  # 16-bit gray
+        return np.asarray(upper).astype(np.uint16)[..., None], False
+    color = "L" if upper.mode in ("1", "L", "LA") else "RGB"
+    mode = {"L": "LA", "RGB": "RGBA"}[color] if has_alpha else color
+    codes = np.asarray(upper.convert(mode))
+    if low_tiles is not None and has_alpha == (upper.mode == "RGBA"):
+        with _open(path) as picture:
+            picture.tile = low_tiles
+            codes = codes.astype(np.uint16) << 8 | np.asarray(_loaded(picture).convert(mode))
+    elif is_16_bit:
+        check.warn(f"{path}: 16-bit color is read at 8 bits")
+    return codes.reshape(*codes.shape[:2], -1), has_alpha
+
+
+def is_wide(picture: Any) -> bool:
+    """Whether a picture that Pillow has opened, and not loaded, has 16 bits for each color."""
+    return ";16" in str(picture.tile)
+
+
+def _low_tiles(picture: Any) -> list | None:
+    """Where and how a picture's lower bytes are stored, if it has 16 bits for each of three or four colors, else None.
+
+    Pillow's colors have 8 bits, the upper bytes. Read in the other order, the lower ones are in their place.
+    """
+    low_tiles = []
+    for tile in picture.tile:
+        *place, arguments = tile
+        layout, *rest = arguments if isinstance(arguments, tuple) else (arguments,)
+        color, _, order = str(layout).partition(";")
+        if color not in ("RGB", "RGBX", "RGBA") or order not in _OTHER_ORDER:
+            return None
+        layout = f"{color};{_OTHER_ORDER[order]}"
+        arguments = (layout, *rest) if isinstance(arguments, tuple) else layout
+        low_tiles.append(getattr(tile, "_make", tuple)([*place, arguments]))  # a plain tuple before Pillow 11
+    return low_tiles
+
+
+def _loaded(picture: Any) -> Any:
+    """A picture's pixels, upright."""
+    from PIL import ImageOps
+
+    _load(picture)
+    ImageOps.exif_transpose(picture, in_place=True)
+    return picture
+
+
+_BITS_PER_SAMPLE = 258  # TIFF's tag
+_OTHER_ORDER = {"16B": "16L", "16L": "16B", "16N": "16B" if sys.byteorder == "little" else "16L"}
+
+
+def _load(picture: Any) -> None:
     """Decode the pixels; Pillow raises any of these on a damaged file."""
     try:
         picture.load()
@@ -293,8 +355,13 @@ def _read_radiance(path: Path, part: str | int | None, max_pixels: int) -> np.nd
     return read_radiance(path, functools.partial(_check_size, max_pixels=max_pixels))
 
 
+def _read_raw(path: Path, part: str | int | None, max_pixels: int) -> np.ndarray:
+    return read_raw(path, functools.partial(_check_size, max_pixels=max_pixels))
+
+
 _READERS: dict[str, Callable[[Path, str | int | None, int], np.ndarray]] = {
     ".exr": _read_exr,
     **dict.fromkeys([".hdr", ".pic"], _read_radiance),
-    **dict.fromkeys(SUFFIXES, _read_pillow),
+    **dict.fromkeys(INTEGER_SUFFIXES, _read_pillow),
+    **dict.fromkeys(RAW_SUFFIXES, _read_raw),
 }

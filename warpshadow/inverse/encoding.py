@@ -2,40 +2,127 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from warpshadow import check
 from warpshadow.assets.color import linear_to_srgb, srgb_to_linear, unfilmic
-from warpshadow.assets.image import read_image
+from warpshadow.assets.image import INTEGER_SUFFIXES, is_wide, read_image
 from warpshadow.check import AnyPath
 
 ENCODINGS = ("srgb", "linear")
-_INTEGER_FILES = (".png", ".jpg", ".jpeg")  # which read_image decodes from sRGB
 _SRGB_GAMMA = 0.01  # relative distance from 2.2 within which a gamma stands for sRGB, as the PNG specification has it
+_ROUNDING = 1e-6  # of values in text
 
 
-def checked_encoding(value: object) -> str | float:
-    """An encoding: "srgb", "linear", or a number γ, such as 2.2, of codes that are radiance^(1/γ)."""
+@dataclass(frozen=True, eq=False)
+class ResponseCurve:
+    """The response curve of a camera, as a calibration measures it [Debevec and Malik 1997].
+
+    Args:
+        samples: Rows of radiance, in any unit, and the value that the file has for it, 0 to 1: shape [sample, 2]; or of
+            the radiance of red, green and blue that have that value, [sample, 4]. Values go from 0 to 1, and both rise
+            from row to row; between rows the curve is straight.
+        name: Of its file.
+    """
+
+    samples: np.ndarray = field(repr=False)
+    name: str = "a response curve"
+
+    def __post_init__(self) -> None:
+        expected = "rows of radiance and value, [sample, 2], or of red, green, blue and value, [sample, 4]"
+        samples = check.numbers("encoding", self.samples, expected=expected, dtype=np.float64)
+        if samples.ndim != 2 or samples.shape[1] not in (2, 4) or len(samples) < 2:
+            raise ValueError(f"encoding: got a curve of shape {samples.shape}, expected {expected}")
+        check.finite("encoding", samples, minimum=0.0)
+        values = samples[:, -1]
+        if abs(values[0]) > _ROUNDING or abs(values[-1] - 1) > _ROUNDING:
+            raise ValueError(
+                f"encoding: got a curve of values from {values[0]:g} to {values[-1]:g}, expected all from 0 to 1; of "
+                "codes of 8 bits: codes / 255"
+            )
+        falls = (np.diff(samples, axis=0) <= 0).any(axis=1)
+        if falls.any():
+            row = int(falls.argmax())
+            raise ValueError(
+                f"encoding: got {samples[row].tolist()} and then {samples[row + 1].tolist()} in a curve, expected "
+                "radiance and value to rise from row to row"
+            )
+        object.__setattr__(self, "samples", samples)
+
+    def radiance(self, values: np.ndarray) -> np.ndarray:
+        """Radiance of values from 0 to 1 as they are stored, [..., 3] of red, green and blue; or of a value, [3]."""
+        *radiances, knots = self.samples.T
+        channels = np.broadcast_to(values, np.broadcast_shapes(np.shape(values), (3,)))
+        decoded = [np.interp(channels[..., k], knots, radiances[k % len(radiances)]) for k in range(3)]
+        return np.stack(decoded, axis=-1)
+
+    @staticmethod
+    def read(path: AnyPath) -> ResponseCurve:
+        """Read the samples from a .csv file; a first line may name the columns, of which the last is "value"."""
+        path = check.file("encoding", path)
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        rows = [[cell.strip() for cell in line.split(",")] for line in lines if line.strip() and line[0] != "#"]
+        with check.located(str(path)):
+            if rows and rows[0][0].isalpha():
+                names = rows.pop(0)
+                if names[-1] != "value":
+                    raise ValueError(f'encoding: got columns {", ".join(names)}, expected the last to be "value"')
+            try:
+                samples = np.array(rows, np.float64)
+            except ValueError as error:
+                raise ValueError(f"encoding: {error}, expected as many numbers in each row") from error
+            return ResponseCurve(samples, path.name)
+
+
+Encoding = str | float | ResponseCurve
+
+
+def checked_encoding(value: object) -> Encoding:
+    """An encoding.
+
+    "srgb", "linear", a number γ, such as 2.2, of codes that are radiance^(1/γ), or a :class:`ResponseCurve`: its
+    samples, or the path of a .csv file of them.
+    """
+    if isinstance(value, ResponseCurve):
+        return value
     if check.is_number(value) and value > 0:
         return float(value)
+    if is_curve_file(value):
+        return ResponseCurve.read(value)
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return ResponseCurve(np.asarray(value))
     if value not in ENCODINGS:
         got = check.described(value)
-        raise ValueError(f'encoding: got {got}, expected "srgb", "linear" or a gamma above 0, such as 2.2')
+        raise ValueError(
+            f'encoding: got {got}, expected "srgb", "linear", a gamma above 0, such as 2.2, or a response curve: its '
+            "samples [sample, 2], or a .csv file of them"
+        )
     return str(value)
+
+
+def is_curve_file(value: object) -> TypeGuard[AnyPath]:
+    """Whether an encoding names a file of a response curve."""
+    return check.is_path(value) and Path(value).suffix.lower() == ".csv"
+
+
+def noted(encoding: Encoding) -> str | float:
+    """An encoding as a TOML file has it."""
+    return encoding.name if isinstance(encoding, ResponseCurve) else encoding
 
 
 def guess_encoding(path: AnyPath) -> str | float:
     """The encoding that a file's metadata tell of; says so where that is not the usual one of its format.
 
-    OpenEXR and Radiance are linear. PNG, the first that it has, as its specification ranks them: sRGB with an ICC
-    profile, whatever that is, or an sRGB chunk; as its gAMA chunk says; linear with 16 bits and none of these, as raw
-    converters write it. All others are sRGB.
+    OpenEXR, Radiance and raw files are linear. PNG and TIFF, the first that they have, as PNG's specification ranks
+    them: sRGB with an ICC profile, whatever that is, or an sRGB chunk; as the gAMA chunk says; linear with 16 bits and
+    none of these, as raw converters write it. All others are sRGB.
     """
     path = Path(path)
-    if path.suffix.lower() not in _INTEGER_FILES:
+    if path.suffix.lower() not in INTEGER_SUFFIXES:
         return "linear"
     info, is_16_bit = _metadata(path)
     guess: str | float = "linear" if is_16_bit else "srgb"
@@ -53,25 +140,25 @@ def guess_encoding(path: AnyPath) -> str | float:
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], bool]:
-    """Metadata of a PNG or JPEG file, and whether it has 16 bits for each color."""
+    """Metadata of a PNG, JPEG or TIFF file, and whether it has 16 bits for each color."""
     from PIL import Image
 
     try:
-        with Image.open(path, formats=["PNG", "JPEG"]) as picture:
-            return {str(key): value for key, value in picture.info.items()}, "16B" in str(picture.tile)
+        with Image.open(path, formats=["PNG", "JPEG", "TIFF"]) as picture:
+            return {str(key): value for key, value in picture.info.items()}, is_wide(picture)
     except (OSError, SyntaxError, Image.DecompressionBombError):
         return {}, False  # which read_image refuses
 
 
-def read_linear(path: AnyPath, encoding: str | float, tone: str = "clip") -> np.ndarray:
+def read_linear(path: AnyPath, encoding: Encoding, tone: str = "clip") -> np.ndarray:
     """Read a picture of an encoding and a tone curve as linear RGB, premultiplied with coverage if the file has alpha.
 
-    Alpha is straight in PNG alone.
+    Alpha is straight in PNG and TIFF alone.
     """
     pixels = read_image(path)
     if pixels.shape[2] < 3:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
-    is_integer = Path(path).suffix.lower() in _INTEGER_FILES
+    is_integer = Path(path).suffix.lower() in INTEGER_SUFFIXES
     stored = "srgb" if is_integer else "linear"  # as read_image takes them
     if encoding != stored or tone != "clip":
         codes = linear_to_srgb(pixels[..., :3]) if is_integer else pixels[..., :3]
@@ -81,9 +168,11 @@ def read_linear(path: AnyPath, encoding: str | float, tone: str = "clip") -> np.
     return pixels
 
 
-def decoded(codes: np.ndarray, encoding: str | float, tone: str = "clip") -> np.ndarray:
+def decoded(codes: np.ndarray, encoding: Encoding, tone: str = "clip") -> np.ndarray:
     """Linear radiance of codes from 0 to 1."""
-    if encoding == "linear":
+    if isinstance(encoding, ResponseCurve):
+        bent = encoding.radiance(codes)
+    elif encoding == "linear":
         bent = codes
     else:
         bent = srgb_to_linear(codes) if encoding == "srgb" else np.maximum(codes, 0) ** float(encoding)
@@ -98,4 +187,4 @@ def read_mask(path: AnyPath) -> np.ndarray:
     if (colors != colors[..., :1]).any() or (has_alpha and (pixels[..., -1] != 1).any()):
         raise ValueError(f"got colors or transparency in {path}, expected gray")
     gray = colors[..., 0]
-    return linear_to_srgb(gray) if Path(path).suffix.lower() in _INTEGER_FILES else gray
+    return linear_to_srgb(gray) if Path(path).suffix.lower() in INTEGER_SUFFIXES else gray

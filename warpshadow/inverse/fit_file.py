@@ -14,6 +14,7 @@ from warpshadow import check
 from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import default_optimizer, fit, short_adam
+from warpshadow.inverse.encoding import is_curve_file
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
@@ -133,6 +134,8 @@ def _target(table: Table, folder: Path) -> Target:
     check.known_keys("key", table, _TARGET_KEYS)
     path = toml_tables.file(table, "image", folder)
     options: Table = {key: table[key] for key in _PHOTOGRAPH_KEYS if key in table}
+    if is_curve_file(options.get("encoding")):
+        options["encoding"] = toml_tables.file(table, "encoding", folder)
     if "mask" in table:
         options["mask"] = toml_tables.file(table, "mask", folder)
     if "outlines" in table:

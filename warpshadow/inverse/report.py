@@ -17,6 +17,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.diagnostics import DiagnosticWarning
+from warpshadow.inverse.encoding import noted
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.one_thread import torch_on_one_thread
@@ -95,7 +96,7 @@ class Report:
             for camera, factor in zip(fitted.cameras, fitted.exposures, strict=True)
         ]
         images: list[toml_tables.Table] = [
-            {"encoding": target.encoding, "stops": math.log2(factor)}
+            {"encoding": noted(target.encoding), "stops": math.log2(factor)}
             for target, factor in zip(self.result.problem.targets, fitted.exposures, strict=True)
         ]
         for image, gains in zip(images, fitted.white_balances, strict=False):  # none unless they were free

@@ -15,7 +15,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.assets.picture import development
 from warpshadow.check import AnyPath
-from warpshadow.inverse.encoding import checked_encoding, decoded, guess_encoding, read_linear, read_mask
+from warpshadow.inverse.encoding import Encoding, checked_encoding, decoded, guess_encoding, read_linear, read_mask
 from warpshadow.scene.scene import BodyLike
 
 
@@ -31,8 +31,9 @@ class Target:
         mask: How much each pixel counts, 0 to 1, shape [height, width]; by default all do. Mask out pixels that the
             scene does not model: the background of a photograph, say. Or a file of gray.
         camera: Where the image was taken; by default the scene's camera, made as large as the image.
-        encoding: Of a file: "srgb", "linear", or a gamma, such as 2.2; by default as its metadata say, see
-            :func:`~warpshadow.inverse.encoding.guess_encoding`.
+        encoding: Of a file: "srgb", "linear", a gamma, such as 2.2, or the camera's response curve: a .csv file, or
+            rows of radiance and value, see :class:`~warpshadow.inverse.encoding.ResponseCurve`; by default as its
+            metadata say, see :func:`~warpshadow.inverse.encoding.guess_encoding`.
         exposure: At which the image was taken [stops]: its values are divided by 2^exposure. By default 0; and of a
             picture that :class:`warpshadow.Picture` wrote, as ``warpshadow render -o x.png`` does, as the file says,
             whose tone curve is undone, too.
@@ -48,7 +49,7 @@ class Target:
     image: np.ndarray = field(repr=False)
     mask: np.ndarray | None = field(repr=False)
     camera: Camera | None
-    encoding: str | float
+    encoding: Encoding
     saturated: np.ndarray | None = field(repr=False)
     outlines: dict[BodyLike, np.ndarray] = field(repr=False)
 
@@ -58,16 +59,15 @@ class Target:
         mask: npt.ArrayLike | AnyPath | None = None,
         camera: Camera | None = None,
         *,
-        encoding: str | float | None = None,
+        encoding: Encoding | npt.ArrayLike | AnyPath | None = None,
         exposure: float | None = None,
         white_balance: npt.ArrayLike | None = None,
         saturation: float | None = None,
         outlines: Mapping[BodyLike, npt.ArrayLike | AnyPath] | None = None,
         distortion: npt.ArrayLike | None = None,
     ):
-        if encoding is not None:
-            encoding = checked_encoding(encoding)
-        vars(self).update(image=image, mask=mask, camera=camera, encoding=encoding or "linear")
+        told = None if encoding is None else checked_encoding(encoding)
+        vars(self).update(image=image, mask=mask, camera=camera, encoding=told or "linear")
         stops, tone = 0.0 if exposure is None else check.number("exposure", exposure), "clip"
         if check.is_path(image):
             path = check.file("image", image)
@@ -77,10 +77,10 @@ class Target:
                 stops = developed.exposure if exposure is None else stops
                 saturation = 1.0 if saturation is None else saturation
             with check.located("image"):
-                object.__setattr__(self, "encoding", encoding or guess_encoding(path))
+                object.__setattr__(self, "encoding", told or guess_encoding(path))
                 object.__setattr__(self, "image", read_linear(path, self.encoding, tone))
-        elif encoding not in (None, "linear"):
-            raise ValueError(f"encoding: got {encoding!r} for an array, expected a file, or linear values")
+        elif told not in (None, "linear"):
+            raise ValueError(f"encoding: got {told!r} for an array, expected a file, or linear values")
         if check.is_path(mask):
             path = check.file("mask", mask)
             with check.located("mask"):
