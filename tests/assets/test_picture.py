@@ -1,6 +1,7 @@
 """Pictures: exposure, tone, background and alpha against sRGB by hand; what notebooks and Pillow get."""
 
 import io
+import warnings
 
 import numpy as np
 import pytest
@@ -98,6 +99,25 @@ def test_without_alpha_what_is_transparent_is_white():
     expected = encoded(alpha * color / 4 + 1 - alpha)
     assert np.abs(picture.opaque() - expected).max() <= 2  # rounded twice
     assert picture.opaque().shape == (6, 8, 3)
+
+
+@pytest.mark.parametrize("tone", ["clip", "filmic"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_written_picture_reads_as_radiance_again(tmp_path, tone, channels):
+    path = tmp_path / "x.png"
+    linear = np.geomspace(0.1, 6, 6 * 8).reshape(6, 8, 1).repeat(channels, axis=2).astype(np.float32)
+    linear[..., 3:] = 1
+    ws.Picture(linear, exposure=-3.0, tone=tone).write(path)
+    np.testing.assert_allclose(ws.read_image(path, undo_exposure=True), linear, rtol=0.06)
+    message = rf"exposed by -3.00 stops, tone {tone}, .* undo_exposure=True reads the radiance"
+    with pytest.warns(UserWarning, match=message) as caught:
+        shown = ws.read_image(path)
+    assert caught[0].filename == __file__ and shown[..., 0].max() < 0.9
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(ws.read_image(path, undo_exposure=False), shown)
+        ws.write_image(path, linear[..., :1])  # as it is
+        ws.read_image(path)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import numpy as np
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.assets.color import srgb_to_linear
-from warpshadow.assets.picture import SUFFIXES, Picture
+from warpshadow.assets.picture import SUFFIXES, Picture, development
 from warpshadow.assets.radiance import read_radiance
 from warpshadow.assets.raw import RAW_SUFFIXES, read_raw
 from warpshadow.check import AnyPath
@@ -30,7 +30,13 @@ class ImageError(ValueError):
     """A picture, or an image file, that cannot be used; the message says what was found and what is accepted."""
 
 
-def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int = 2**28) -> np.ndarray:
+def read_image(
+    path: AnyPath,
+    *,
+    part: str | int | None = None,
+    max_pixels: int = 2**28,
+    undo_exposure: bool | None = None,
+) -> np.ndarray:
     """Read a picture as linear values.
 
     OpenEXR: scanline or tiled, half, float or uint; the channels R, G, B[, A], or Y[, A], or the only layer
@@ -43,6 +49,9 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
         path: An .exr, .hdr, .pic, .png, .jpg, .jpeg, .tif or .tiff file, or a raw file, which needs the extra ``raw``.
         part: Name or index of the part of a multi-part OpenEXR file; the first by default.
         max_pixels: Refuse larger pictures, judged by the header before any pixel is read.
+        undo_exposure: Whether a .png or .jpg that warpshadow wrote, as ``warpshadow render -o x.png`` does, becomes
+            the radiance that was rendered: its exposure and tone curve, which a comment in the file says, are undone.
+            Of other files nothing is. By default it stays as it is shown, and a warning says so where that differs.
     Returns:
         float32 [height, width, channel] with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGB, alpha) channels.
     Raises:
@@ -59,14 +68,26 @@ def read_image(path: AnyPath, *, part: str | int | None = None, max_pixels: int 
     if part is not None and reader is not _read_exr:
         raise ImageError(f"{path}: got part {part!r}, but only .exr files have parts")
     try:
-        return reader(path, part, max_pixels)
+        pixels = reader(path, part, max_pixels)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error
+    developed = None if undo_exposure is False else development(path)
+    if developed is None or developed.is_plain:
+        return pixels
+    if undo_exposure is None:
+        check.warn(
+            f"{path}: warpshadow wrote it, exposed by {developed.exposure:+.2f} stops, tone {developed.tone}, and reads "
+            "it as it is shown; undo_exposure=True reads the radiance, undo_exposure=False the same without this line"
+        )
+        return pixels
+    colors = pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1]
+    colors[...] = developed.radiance(colors)
+    return pixels
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:
     """Width and height of a picture [pixels], upright as :func:`read_image` turns it."""
-    height, width = read_image(path).shape[:2]
+    height, width = read_image(path, undo_exposure=False).shape[:2]
     return width, height
 
 

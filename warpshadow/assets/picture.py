@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.color import auto_exposure, filmic, linear_to_srgb, srgb_to_linear
+from warpshadow.assets.color import auto_exposure, filmic, linear_to_srgb, srgb_to_linear, unfilmic
 from warpshadow.check import AnyPath
 
 SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of picture files
@@ -130,6 +130,15 @@ class Development(NamedTuple):
 
     tone: str
     """Tone curve."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the picture has the linear values themselves."""
+        return self.exposure == 0 and self.tone == "clip"
+
+    def radiance(self, colors: np.ndarray) -> np.ndarray:
+        """Linear values of the picture's colors, which are linear from 0 to 1."""
+        return (unfilmic(colors) if self.tone == "filmic" else colors) / np.float32(2**self.exposure)
 
 
 def development(path: AnyPath) -> Development | None:

@@ -155,7 +155,7 @@ def read_linear(path: AnyPath, encoding: Encoding, tone: str = "clip") -> np.nda
 
     Alpha is straight in PNG and TIFF alone.
     """
-    pixels = read_image(path)
+    pixels = read_image(path, undo_exposure=False)
     if pixels.shape[2] < 3:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
     is_integer = Path(path).suffix.lower() in INTEGER_SUFFIXES
@@ -181,7 +181,7 @@ def decoded(codes: np.ndarray, encoding: Encoding, tone: str = "clip") -> np.nda
 
 def read_mask(path: AnyPath) -> np.ndarray:
     """Gray as it is stored, 0 to 1: a mask is no light, so that half gray is half."""
-    pixels = read_image(path)
+    pixels = read_image(path, undo_exposure=False)
     has_alpha = pixels.shape[2] in (2, 4)
     colors = pixels[..., :-1] if has_alpha else pixels
     if (colors != colors[..., :1]).any() or (has_alpha and (pixels[..., -1] != 1).any()):
