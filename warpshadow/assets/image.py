@@ -76,8 +76,8 @@ def read_image(
         return pixels
     if undo_exposure is None:
         check.warn(
-            f"{path}: warpshadow wrote it, exposed by {developed.exposure:+.2f} stops, tone {developed.tone}, and reads "
-            "it as it is shown; undo_exposure=True reads the radiance, undo_exposure=False the same without this line"
+            f"{path}: warpshadow wrote it, exposed by {developed.exposure:+.2f} stops, tone {developed.tone}, and "
+            "reads it as it is shown; undo_exposure=True reads the radiance, and False the same without this warning"
         )
         return pixels
     colors = pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1]
