@@ -18,6 +18,7 @@ from warpshadow.inverse.encoding import is_curve_file
 from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
@@ -38,7 +39,7 @@ _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "dist
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
 _FREE_OF_SCENE: dict[str, type[Free]] = {kind.key: kind for kind in (Light, Exposure, CameraPose, OutlineOffset)}
 _FREE_OF_BODIES: dict[str, type[Free]] = {
-    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Pose, Deformation, Radii)
+    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Pose, Plane, Deformation, Radii)
 }
 
 

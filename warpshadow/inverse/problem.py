@@ -15,6 +15,7 @@ from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.plane import with_planes_last
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.loss import Loss
@@ -69,7 +70,7 @@ class Problem:
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it")
         for number, item in enumerate(self.free):
             check.instance(f"free[{number}]", item, Free, "what is free, such as Pose(0) or Light()")
-        object.__setattr__(self, "free", tuple(self._numbered()))
+        object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
         shapes = {target.image.shape for target in self.targets}
         if len(shapes) > 1:
             raise ValueError(f"targets: got images of shapes {sorted(shapes)}, expected one shape")

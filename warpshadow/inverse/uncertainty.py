@@ -21,6 +21,7 @@ import torch
 from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.free.base import PRIOR, Values
 from warpshadow.inverse.free.light import Light
+from warpshadow.inverse.free.plane import Plane
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.views import OutlineOffset
 from warpshadow.inverse.loss import bounded
@@ -149,15 +150,29 @@ class NormalMatrix:
             values[name][key].view(-1)[number] += part
         return values
 
+    def plane(self, free: Pose) -> Plane | None:
+        """The free plane that a body stands on."""
+        planes = (item for item in self.problem.free if isinstance(item, Plane))
+        return next((plane for plane in planes if free.number in plane.carries), None)
+
+    def posed(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rotation, middle in the world, and scale of a body, its plane moved."""
+        rotation, middle, scale = free.moved(self.values[free.name], self.setting)
+        plane = self.plane(free)
+        if plane is not None:
+            rotation, middle = plane.moved(self.values[plane.name], self.setting, rotation, middle)
+        return rotation, middle, scale
+
     def slopes(self, free: Pose, rows: Sequence[int]) -> np.ndarray:
         """Derivatives of a body's middle [scene units] and turn [radians] by some of the numbers, [6, row]."""
-        own, slopes = self.values[free.name], np.zeros((6, len(rows)))
+        slopes = np.zeros((6, len(rows)))
         for column, index in enumerate(rows):
-            _, key, number = self.places[index]
+            name, key, number = self.places[index]
+            own = self.values[name]
             ends = []
             for step in (_STEP, -_STEP):
                 own[key].view(-1)[number] += step
-                rotation, middle, _ = free.moved(own, self.setting)
+                rotation, middle, _ = self.posed(free)
                 ends.append((rotation.double().numpy(force=True), middle.double().numpy(force=True)))
                 own[key].view(-1)[number] -= step
             turn = (ends[0][0] @ ends[1][0].T - ends[1][0] @ ends[0][0].T) / 2  # of small turns
@@ -222,7 +237,7 @@ class NormalMatrix:
         return float(np.sqrt(variance) / total) if total > 0 else 0.0
 
     def _prior(self) -> np.ndarray:
-        """Precision that priors have, [number, number]: the curvature of the regularizers of poses and offsets."""
+        """Precision that priors have, [number, number]: the curvature of regularizers of poses, planes and offsets."""
         rows = []
         for name, key, number in self.places:
             ends = []
@@ -234,13 +249,13 @@ class NormalMatrix:
         return np.reshape(rows, (len(rows), len(rows))) / (2 * PRIOR)
 
     def _prior_slopes(self) -> np.ndarray:
-        """Derivatives of the regularizers of poses and offsets by the numbers, [number]."""
+        """Derivatives of the regularizers of poses, planes and offsets by the numbers, [number]."""
         leaves = {
             name: {key: t.clone().requires_grad_() for key, t in own.items()} for name, own in self.values.items()
         }
         total = torch.zeros(())
         for free in self.problem.free:
-            if isinstance(free, (Pose, OutlineOffset)):
+            if isinstance(free, (Pose, Plane, OutlineOffset)):
                 term = free.regularizer(leaves[free.name], self.setting)
                 total = total if term is None else total + term
         if total.requires_grad:
@@ -285,8 +300,10 @@ def uncertainty(
 def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) -> PoseUncertainty:
     """The uncertainty of a pose in scene units and degrees."""
     setting = normal.setting
-    rows = [index for index, (name, _, _) in enumerate(normal.places) if name == free.name]
-    _, middle, scale = free.moved(normal.values[free.name], setting)
+    plane = normal.plane(free)
+    names = {free.name} if plane is None else {free.name, plane.name}
+    rows = [index for index, (name, _, _) in enumerate(normal.places) if name in names]
+    _, middle, scale = normal.posed(free)
     half = setting.extent(free.number) * float(scale)
     both = normal.slopes(free, rows)
     cov = both @ covariance[np.ix_(rows, rows)] @ both.T

@@ -1,0 +1,175 @@
+"""A free plane: height and tilt of the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from warpshadow import check
+from warpshadow.inverse import constraints
+from warpshadow.inverse.free.base import PRIOR, Free, FreeOfBody, Values
+from warpshadow.inverse.free.pose import Pose
+from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.scene.scene import BodyLike, Scene
+from warpshadow.torch import rotation_matrices
+
+
+@dataclass(frozen=True)
+class Plane(FreeOfBody):
+    """The height and the tilt of a flat body, such as the ground; bodies that stand on it move along.
+
+    It moves as a rigid body that neither slides nor turns about its normal, so all that stands on it stays there, and
+    its poses are relative to it.
+
+    Args:
+        body: The flat body, its number or name.
+        height: Prior: standard deviation of its height along the normal from where the scene has it, below the middle
+            of the other bodies [scene units]; None for none.
+        tilt: Prior: standard deviation of its tilt about each of two axes [radians]; None for none.
+        points: Points that lie on it, such as of a calibration pattern or a depth camera, [point, 3], three or more:
+            it starts at the nearest plane.
+        deviation: Standard deviation of their distances from it [scene units].
+        carries: Further bodies that move with it, beside those that a free pose stands on it: numbers or names.
+    """
+
+    key: ClassVar[str] = "plane"
+    moves: ClassVar[bool] = True
+
+    height: float | None = None
+    tilt: float | None = None
+    points: ArrayLike | None = None
+    deviation: float | None = None
+    carries: Sequence[BodyLike] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("height", "tilt", "deviation"):
+            if getattr(self, name) is not None:
+                check.positive(name, getattr(self, name))
+        if (self.points is None) != (self.deviation is None):
+            raise ValueError("points, deviation: got one of them, expected both: points and how far they are off")
+        if self.points is not None:
+            points = check.numbers("points", self.points, expected="points [point, 3]", dtype=np.float64)
+            check.shape("points", points.shape, ("point", 3))
+            check.finite("points", points)
+            if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6 * float(np.ptp(points, axis=0).max())) < 2:
+                raise ValueError(f"points: got {len(points)} in a line, expected three or more that span a plane")
+            object.__setattr__(self, "points", tuple(map(tuple, points.tolist())))
+        if isinstance(self.carries, str) or not isinstance(self.carries, Sequence):
+            raise ValueError(f"carries: got {check.described(self.carries)}, expected a list of bodies")
+        object.__setattr__(self, "carries", tuple(self.carries))
+
+    def numbered(self, scene: Scene) -> Plane:
+        """The same of the bodies' numbers."""
+        carries = tuple(scene.body_number(body, "carries") for body in self.carries)
+        return replace(self, body=scene.body_number(self.body), carries=carries)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise ValueError for a body that is not flat, or carries itself."""
+        constraints.plane_below(scene.bodies[self.number], np.zeros(3), "body")
+        if self.number in self.carries:
+            raise ValueError(f"carries: got {self.number}, the plane itself; expected bodies that stand on it")
+
+    def _moving(self) -> list[int]:
+        """The bodies that move: itself, and those that it carries."""
+        return [self.number, *(body for body in self.carries if isinstance(body, int))]
+
+    def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
+        """The normal at the start, the point about which it tilts, and the unit of its height."""
+        return setting.cached(self, lambda: self._find_start(setting))
+
+    def _find_start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
+        bodies = setting.scene.bodies
+        others = [number for number in range(len(bodies)) if number != self.number] or [self.number]
+        middles = [np.mean(bodies[number].world_mesh().bounds, axis=0) for number in others]
+        plane = constraints.plane_below(bodies[self.number], setting.cameras[0].eye, "body")
+        above = np.mean(middles, axis=0)
+        foot = above - plane.normal * (plane.normal @ above - plane.offset)
+        return plane.normal, foot, float(np.mean([bodies[n].scale * setting.extent(n) for n in others]))
+
+    def start(self, setting: Setting) -> Values:
+        """Where the scene has it, or the plane nearest to the points."""
+        tilt, height = np.zeros(2), 0.0
+        if self.points is not None:
+            from scipy.spatial.transform import Rotation
+
+            normal, foot, unit = self._start(setting)
+            points = np.asarray(self.points)
+            middle = points.mean(axis=0)
+            nearest = np.linalg.svd(points - middle)[2][-1]
+            nearest = nearest * np.sign(nearest @ normal)
+            turn = Rotation.from_matrix(constraints.turn_onto(normal, nearest)).as_rotvec()
+            tilt = constraints.remaining([normal]) @ turn
+            height = (nearest @ (middle - foot)) / (nearest @ normal) / unit
+        return {"tilt": setting.tensor(tilt), "height": setting.tensor(height)}
+
+    def moved(
+        self, values: Values, setting: Setting, rotation: torch.Tensor, point: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where a rotation and a point of the start are when the plane has moved. Differentiable: all but setting."""
+        normal, foot, unit = self._start(setting)
+        about = setting.tensor(constraints.remaining([normal]))
+        turn = rotation_matrices(about.T @ values["tilt"])
+        pivot = setting.tensor(foot)
+        return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * setting.tensor(normal)
+
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        """Squared distances from the priors and of the points, in standard deviations."""
+        normal, foot, unit = self._start(setting)
+        squares = []
+        if self.height is not None:
+            squares.append((unit * values["height"] / self.height).square())
+        if self.tilt is not None:
+            squares.append((values["tilt"] / self.tilt).square().sum())
+        if self.points is not None and self.deviation is not None:
+            turn, moved_foot = self.moved(values, setting, setting.tensor(np.eye(3)), setting.tensor(foot))
+            gaps = (setting.tensor(np.asarray(self.points)) - moved_foot) @ (turn @ setting.tensor(normal))
+            squares.append((gaps / self.deviation).square().sum())
+        return PRIOR * torch.stack(squares).sum() if squares else None
+
+    def apply(self, values: Values, setting: Setting, world: World) -> None:
+        """Move it, and the bodies that it carries."""
+        for number in self._moving():
+            world.rotations[number], world.translations[number] = self.moved(
+                values, setting, world.rotations[number], world.translations[number]
+            )
+            world.moving.add(number)
+
+    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+        """Move it, and the bodies that it carries."""
+        for number in self._moving():
+            body = fitted.scene.bodies[number]
+            start = setting.tensor(body.rotation_matrix()), setting.tensor(body.translation)
+            rotation, translation = (part.cpu().numpy() for part in self.moved(values, setting, *start))
+            fitted.change_body(number, rotation=rotation, translation=translation)
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        """Its pose."""
+        body = fitted.scene.bodies[self.number]
+        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("rotation", "translation")}
+
+
+def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
+    """Free parameters of bodies' numbers in the order in which they move bodies; planes carry those that stand on them.
+
+    Raises:
+        ValueError: for a prior of a pose in the world whose plane moves, and for a plane whose pose is free, too.
+    """
+    planes = []
+    for plane in (item for item in free if isinstance(item, Plane)):
+        standing = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
+        for pose in standing:
+            if pose.distance is not None or pose.covariance is not None:
+                raise ValueError(
+                    f"{pose.name}: got a prior in the world, expected one of the {plane.name} it stands on"
+                )
+        if any(isinstance(pose, Pose) and pose.number == plane.number for pose in free):
+            raise ValueError(f"{plane.name}: got a free pose of the same body, expected one of them")
+        carried = {*plane._moving()[1:], *(pose.number for pose in standing)}
+        planes.append(replace(plane, carries=tuple(sorted(carried))))
+    return (*(item for item in free if not isinstance(item, Plane)), *planes)
