@@ -20,6 +20,16 @@ def test_painted_outlines_are_those_of_the_truth_to_a_pixel_or_so(case):
     assert 0.3 < (target.mask > 0).mean() < 0.95
 
 
+def test_near_lamps_are_as_far_as_they_are_called_and_light_the_bodies_as_much():
+    for case in CASES[-2:]:
+        away = np.array(case.lamp) - (0, 0.75, 0)
+        assert np.linalg.norm(away) * 0.3 / 2 == pytest.approx(float(case.name[-2]), rel=1e-6)  # bodies of 0.3 m
+        first = np.array(CASES[0].lamp) - (0, 0.75, 0)
+        np.testing.assert_allclose(case.wattage / (away @ away), 1 / (first @ first), rtol=1e-6)
+        colors = [photograph.target().image[photograph.target().mask > 0] for photograph in (case, CASES[0])]
+        np.testing.assert_allclose(*(color.mean(axis=0) for color in colors), rtol=0.2)
+
+
 def test_starts_are_away_and_light_is_measured_from_the_lamp():
     case = CASES[0]
     start = problem(case, 0).scene.bodies[0]

@@ -1,4 +1,4 @@
-"""Three photographs whose truth is known: path traced by another renderer, and all that a user is given of them.
+"""Five photographs whose truth is known: path traced by another renderer, and all that a user is given of them.
 
 Each has something that the fits do not model: a lamp that is near, gloss, a grain of the table; blur, noise and JPEG;
 and one a lens with distortion. ``take.py`` made the pictures beside this file.
@@ -23,6 +23,17 @@ TABLE_SIZE = 6.0  # what is modelled of the table [bodies are 2 units large]
 BODY, TABLE = "body", "table"
 
 
+LAMP = (2.2, 3.4, 0.6)  # of the first case
+METRE = 2 / 0.3  # scene units, of bodies 30 cm large
+MIDDLE = np.array([0, 0.75, 0])  # of the bodies
+LAMP_DISTANCE = float(np.linalg.norm(LAMP - MIDDLE)) / METRE
+
+
+def lamp_at(metres: float) -> tuple[float, float, float]:
+    """The first lamp, moved to a distance from the bodies."""
+    return tuple((MIDDLE + metres / LAMP_DISTANCE * (LAMP - MIDDLE)).tolist())
+
+
 @dataclass(frozen=True)
 class Case:
     """A photograph.
@@ -32,6 +43,7 @@ class Case:
         mesh: That ships with Warp.
         albedo: Of the body.
         lamp: Middle of a spherical lamp [scene units].
+        wattage: Factor of the lamp's radiance.
         gloss: Whether body and table have a coat.
         turn: Of the body about the vertical [degrees].
         lens: OpenCV's k1, k2, p1, p2, k3.
@@ -41,6 +53,7 @@ class Case:
     mesh: str
     albedo: tuple[float, float, float]
     lamp: tuple[float, float, float]
+    wattage: float = 1.0
     gloss: bool = False
     turn: float = 0.0
     lens: tuple[float, ...] = (0.0,) * 5
@@ -80,10 +93,15 @@ class Case:
 
 
 CASES = (
-    Case("lamp", "bunny", (0.6, 0.45, 0.3), (2.2, 3.4, 0.6)),
+    Case("lamp", "bunny", (0.6, 0.45, 0.3), LAMP),
     Case("gloss", "bear", (0.35, 0.15, 0.1), (-2.0, 3.6, 1.4), gloss=True, turn=25),
     Case("lens", "rocks", (0.5, 0.5, 0.45), (1.5, 4.0, -2.0), lens=(-0.18, 0.06, 0.002, -0.003, 0.0)),
+    *(
+        Case(f"lamp_{metres}m", "bunny", (0.6, 0.45, 0.3), lamp_at(metres), wattage=(metres / LAMP_DISTANCE) ** 2)
+        for metres in (1, 2)
+    ),
 )
+"""The lamps of the last two are in the direction of the first, and light the body as much: see :func:`lamp_at`."""
 
 
 def alone(scene: ws.Scene, number: int) -> ws.Scene:

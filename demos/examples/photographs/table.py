@@ -1,6 +1,7 @@
 """Poses and light in photographs whose truth is known: fifteen starts, 15° and 10% of the diagonal away.
 
     python demos/examples/photographs/table.py
+    python demos/examples/photographs/table.py lamp_1m lamp_2m  # these alone
 
 Each start is fitted by ``stages = "photograph"``, once as painted, and with ``--masks`` with masks that are a pixel too
 large and too small.
@@ -65,13 +66,13 @@ def fitted(case: Case, seed: int, **options: object) -> tuple[float, float, floa
     )
 
 
-def main(starts: int, grown: list[int], *, shadows: bool) -> None:
+def main(names: list[str], starts: int, grown: list[int], *, shadows: bool) -> None:
     ws.quiet(progress=False)
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     for pixels in grown:
         errors, seconds = [], []
-        for case in CASES:
+        for case in (case for case in CASES if not names or case.name in names):
             for seed in range(starts):
                 began = time.process_time()
                 before, after, angle, result = fitted(case, seed, grown=pixels, shadows=shadows)
@@ -92,8 +93,9 @@ def main(starts: int, grown: list[int], *, shadows: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--starts", type=int, default=5, help="of each of the three photographs")
+    parser.add_argument("names", nargs="*", metavar="PHOTOGRAPH", help="by default all")
+    parser.add_argument("--starts", type=int, default=5, help="of each photograph")
     parser.add_argument("--masks", action="store_true", help="masks a pixel too large and too small, too")
     parser.add_argument("--no-shadows", action="store_true", help="fit without shadows")
     arguments = parser.parse_args()
-    main(arguments.starts, [0, 1, -1] if arguments.masks else [0], shadows=not arguments.no_shadows)
+    main(arguments.names, arguments.starts, [0, 1, -1] if arguments.masks else [0], shadows=not arguments.no_shadows)

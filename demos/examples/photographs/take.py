@@ -2,6 +2,7 @@
 
     pip install mitsuba
     python demos/examples/photographs/take.py
+    python demos/examples/photographs/take.py lamp_1m lamp_2m  # these alone
 
 The pictures lie beside this file, so that ``table.py`` needs no Mitsuba.
 """
@@ -56,7 +57,10 @@ def path_traced(case: Case, folder: Path) -> np.ndarray:
             "type": "sphere",
             "center": list(case.lamp),
             "radius": 0.35,
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [34.0, 30.0, 24.0]}},
+            "emitter": {
+                "type": "area",
+                "radiance": {"type": "rgb", "value": [case.wattage * value for value in (34, 30, 24)]},
+            },
         },
         "body": {"type": "obj", "filename": str(folder / "body.obj"), "bsdf": material(case, list(case.albedo))},
         "table": {
@@ -117,8 +121,10 @@ def masks(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     ws.quiet()
-    rng = np.random.default_rng(0)
-    for case in CASES:
+    for number, case in enumerate(CASES):
+        if sys.argv[1:] and case.name not in sys.argv[1:]:
+            continue
+        rng = np.random.default_rng(number)
         with tempfile.TemporaryDirectory() as folder:
             fine = path_traced(case, Path(folder))
         light = through_the_lens(case, fine)
