@@ -1,6 +1,7 @@
 """Fit files: every key, its default, and the message for everything that can be wrong with it."""
 
 import functools
+import warnings
 
 import numpy as np
 import pytest
@@ -57,6 +58,25 @@ def refused(load):
 
 
 # ---------------------------------------------------------------------------------------------- what is right
+
+
+def test_a_camera_that_is_framed_on_a_free_body_draws_a_warning_with_the_lines_to_write(load, tmp_path):
+    placed = "eye = [0, 1, 4]\ntarget = [0, 0, 0]"
+    framed = SCENE.replace(placed, 'framing = "auto"\ndirection = [1, 1, 2]').replace("blockers = 0", "blockers = 8")
+    (tmp_path / "scene.toml").write_text(framed)
+    free_pose = MINIMAL + "[[free.pose]]\nbody = 0\n"
+    with pytest.warns(UserWarning, match="framed on the start .*but icosphere may have been elsewhere") as caught:
+        camera = load(free_pose).problem.scene.camera
+    lines = str(caught[0].message).partition("\n")[2]
+    (tmp_path / "scene.toml").write_text(framed.replace('framing = "auto"\ndirection = [1, 1, 2]', lines))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        written = load(free_pose).problem.scene.camera
+        (tmp_path / "scene.toml").write_text(framed)
+        load(MINIMAL)  # no pose is free
+        load(free_pose.replace("[free]", "[target.camera]\neye = [0, 1, 4]\ntarget = [0, 0, 0]\n[free]"))
+    np.testing.assert_allclose(written.eye, camera.eye, atol=1e-4)
+    np.testing.assert_allclose(written.rotation, camera.rotation, atol=1e-4)
 
 
 def test_all_but_a_scene_a_target_and_what_is_free_has_the_defaults_of_python(load):

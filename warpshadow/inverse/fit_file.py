@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from warpshadow import check
+from warpshadow.assets.camera import framed_points
 from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import default_optimizer, fit, short_adam
@@ -122,6 +124,7 @@ def _fit(table: Table, folder: Path) -> Fit:
         toml_tables.check_table(table.get("still", {}))
         still = toml_tables.make(Visibility, {"method": "ray-traced"} | table.get("still", {}))
     problem = Problem(scene, targets, _free(table["free"], scene), loss, still)
+    _check_framing(toml_tables.file(table, "scene", folder), problem)
     with check.located("[optimizer]"):
         optimizer = _optimizer(table.get("optimizer", {}))
     return Fit(problem, _stages(table, problem), optimizer, tolerance, seed)
@@ -154,6 +157,25 @@ def _target(table: Table, folder: Path) -> Target:
 def _body(key: str) -> BodyLike:
     """A body's number, where a key is one; or its name."""
     return int(key) if key.isdecimal() else key
+
+
+def _check_framing(path: Path, problem: Problem) -> None:
+    """Warn of a camera that stands where the start is framed: images of other poses are framed otherwise."""
+    moving = [item for item in problem.free if isinstance(item, (Pose, Deformation))]
+    is_framed = "framing" in toml_tables.read(path, "scene file")["camera"]
+    if not (is_framed and moving and any(target.camera is None for target in problem.targets)):
+        return
+    names = dict.fromkeys(problem.scene.bodies[item.number].called for item in moving)
+    camera, points = problem.scene.camera, framed_points(problem.scene)
+    forward = camera.rotation[2]
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    target = camera.eye + forward @ (middle - camera.eye) * forward
+    eye, target = (np.round(point, 4).tolist() for point in (camera.eye, target))
+    check.warn(
+        f'{path}: the camera is framed on the start (framing = "auto"), but {" and ".join(names)} may have been '
+        "elsewhere, and framed otherwise, when the images were made. In place of framing, direction and margin write "
+        f"eye and target, the same as of the images; of this file they are\neye = {eye}\ntarget = {target}"
+    )
 
 
 # ---------------------------------------------------------------------------------------------- free parameters
